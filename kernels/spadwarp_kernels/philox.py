@@ -1,0 +1,70 @@
+"""Counter-based random numbers: Philox4x32-10 (Salmon et al. 2011).
+
+A draw is a pure function of (seed, 64-bit id, event, stream): it does not depend on launch size, thread or history, so one id
+gives the same numbers however a launch is cut up.
+"""
+
+import warp as wp
+
+_M0 = wp.constant(wp.uint64(0xD2511F53))
+_M1 = wp.constant(wp.uint64(0xCD9E8D57))
+_W0 = wp.constant(wp.uint32(0x9E3779B9))
+_W1 = wp.constant(wp.uint32(0xBB67AE85))
+_LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
+
+# Streams: one block of four numbers per purpose and event.
+STREAM_EMISSION = wp.constant(wp.uint32(0))
+STREAM_TRANSPORT = wp.constant(wp.uint32(1))
+STREAM_FLIGHT_SAMPLE = wp.constant(wp.uint32(2))
+STREAM_ROULETTE = wp.constant(wp.uint32(3))
+STREAM_LENS = wp.constant(wp.uint32(4))
+STREAM_DETECTOR = wp.constant(wp.uint32(5))
+STREAM_ANALYTIC = wp.constant(wp.uint32(6))
+
+
+@wp.func
+def philox4x32(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: wp.uint32, k1: wp.uint32) -> wp.vec4ui:
+    """Philox4x32 with ten rounds: four 32-bit words from a 128-bit counter and a 64-bit key."""
+    a = c0
+    b = c1
+    c = c2
+    d = c3
+    x = k0
+    y = k1
+    for _ in range(10):
+        p0 = _M0 * wp.uint64(a)
+        p1 = _M1 * wp.uint64(c)
+        hi0 = wp.uint32(p0 >> wp.uint64(32))
+        hi1 = wp.uint32(p1 >> wp.uint64(32))
+        a = hi1 ^ b ^ x
+        b = wp.uint32(p1 & _LOW32)
+        c = hi0 ^ d ^ y
+        d = wp.uint32(p0 & _LOW32)
+        x = x + _W0
+        y = y + _W1
+    return wp.vec4ui(a, b, c, d)
+
+
+@wp.func
+def random_block(seed: wp.uint64, id: wp.uint64, event: wp.uint32, stream: wp.uint32) -> wp.vec4ui:
+    """The four 32-bit random words of (seed, id, event, stream); id is 64-bit (a photon, a pixel, ...)."""
+    return philox4x32(
+        wp.uint32(id & _LOW32),
+        wp.uint32(id >> wp.uint64(32)),
+        event,
+        stream,
+        wp.uint32(seed & _LOW32),
+        wp.uint32(seed >> wp.uint64(32)),
+    )
+
+
+@wp.func
+def u01(word: wp.uint32) -> float:
+    """Uniform float32 in [0, 1) on the grid k / 2^24: never 1, so log(1 - u01) is finite."""
+    return float(word >> wp.uint32(8)) * 5.9604644775390625e-08
+
+
+@wp.func
+def u01_fine(word: wp.uint32) -> float:
+    """Uniform float32 in [0, 1 - 2^-24] with the full 32-bit resolution near 0, for densities that peak at 0."""
+    return wp.min(float(word) * 2.3283064365386963e-10, 0.99999994)

@@ -1,0 +1,60 @@
+"""Philox4x32-10 against the known answers of its authors' Random123 library."""
+
+import numpy as np
+import pytest
+import warp as wp
+from spadwarp_kernels.philox import philox4x32, random_block, u01, u01_fine
+
+
+@wp.kernel(enable_backward=False)
+def _philox(words: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.vec4ui)):
+    out[0] = philox4x32(words[0], words[1], words[2], words[3], words[4], words[5])
+
+
+@wp.kernel(enable_backward=False)
+def _uniforms(words: wp.array(dtype=wp.uint32), coarse: wp.array(dtype=float), fine: wp.array(dtype=float)):
+    i = wp.tid()
+    coarse[i] = u01(words[i])
+    fine[i] = u01_fine(words[i])
+
+
+@wp.kernel(enable_backward=False)
+def _blocks(seed: wp.uint64, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
+    i = wp.tid()
+    out[i] = random_block(seed, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
+
+
+@pytest.mark.parametrize(
+    ("counter_key", "expected"),
+    [
+        ([0] * 6, [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]),
+        ([0xFFFFFFFF] * 6, [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]),
+        (
+            [0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344, 0xA4093822, 0x299F31D0],
+            [0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1],
+        ),
+    ],
+)
+def test_known_answers(counter_key, expected):
+    words = wp.array(np.array(counter_key, np.uint32), dtype=wp.uint32, device="cpu")
+    out = wp.zeros(1, dtype=wp.vec4ui, device="cpu")
+    wp.launch(_philox, 1, [words, out], device="cpu")
+    assert out.numpy()[0].tolist() == expected
+
+
+def test_uniforms_stay_below_one_and_reach_their_grid():
+    words = np.array([0, 1, 255, 256, 0x7FFFFFFF, 0xFFFFFF00, 0xFFFFFFFF], np.uint32)
+    device_words = wp.array(words, dtype=wp.uint32, device="cpu")
+    coarse = wp.zeros(words.size, dtype=float, device="cpu")
+    fine = wp.zeros(words.size, dtype=float, device="cpu")
+    wp.launch(_uniforms, words.size, [device_words, coarse, fine], device="cpu")
+    assert coarse.numpy().max() < 1.0 and fine.numpy().max() < 1.0
+    np.testing.assert_array_equal(coarse.numpy(), (words >> 8).astype(np.float64) / 2.0**24)
+    assert fine.numpy()[1] == np.float32(2.0**-32)
+
+
+def test_ids_beyond_32_bits_have_streams_of_their_own():
+    low, high = (wp.zeros(1000, dtype=wp.vec4ui, device="cpu") for _ in range(2))
+    wp.launch(_blocks, 1000, [7, 0, low], device="cpu")
+    wp.launch(_blocks, 1000, [7, 1 << 32, high], device="cpu")
+    assert len(np.unique(np.concatenate([low.numpy(), high.numpy()]), axis=0)) == 2000
