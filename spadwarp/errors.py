@@ -19,7 +19,7 @@ class ConfigError(SpadwarpError):
     """
 
     def __init__(self, problems: str | Iterable[str], *, source: str | None = None) -> None:
-        """`problems`: one line each, without the file; `source`: the file they are in, or None for a scene made in Python."""
+        """`problems`: one line each, without the file; `source`: the file they are in (None: made in Python)."""
         lines = [problems] if isinstance(problems, str) else list(problems)
         self.problems: tuple[str, ...] = tuple(lines)
         self.source = source
