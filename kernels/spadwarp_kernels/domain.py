@@ -1,0 +1,60 @@
+"""Where photons may be: the water's box and the limits that end a history."""
+
+import warp as wp
+
+from .tally import EXIT, LATERAL_LIMIT
+
+
+@wp.struct
+class Limits:
+    """Limits of a history; 1e30 stands for none.
+
+    Attributes:
+        lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face.
+        lateral: A history ends where |x| or |y| reaches this [m].
+        max_path: Geometric path [m].
+        weight_cutoff: A history ends after an event that leaves its analog weight below this.
+        max_collisions: A history ends after this many events, surfaces included.
+    """
+
+    lower: wp.vec3
+    upper: wp.vec3
+    lateral: float
+    max_path: float
+    weight_cutoff: float
+    max_collisions: int
+
+
+@wp.func
+def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
+    if u > 0.0:
+        return wp.max((upper - x) / u, 0.0)
+    if u < 0.0:
+        return wp.max((lower - x) / u, 0.0)
+    return 1.0e30
+
+
+@wp.func
+def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
+    lateral = wp.min(_to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral))
+    box = wp.min(
+        _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
+        wp.min(
+            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]), _to_plane(x[2], u[2], limits.lower[2], limits.upper[2])
+        ),
+    )
+    return wp.min(lateral, box)
+
+
+@wp.func
+def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """Ledger entry of the limit that a ray from x along u meets first: a face of the domain, else the lateral limit."""
+    best = wp.min(_to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral))
+    entry = LATERAL_LIMIT
+    for i in range(3):
+        distance = _to_plane(x[i], u[i], limits.lower[i], limits.upper[i])
+        if distance <= best:
+            best = distance
+            entry = EXIT + 2 * i + wp.where(u[i] > 0.0, 1, 0)
+    return entry

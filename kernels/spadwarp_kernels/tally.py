@@ -1,0 +1,89 @@
+"""Tallies: 64-bit fixed point, so that a sum does not depend on the order of its terms."""
+
+import warp as wp
+
+# Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63 and the paper's cut-off of 2e-4 is 839 units.
+LEDGER_ONE = wp.constant(4194304.0)
+LEDGER_UNIT = 1.0 / 4194304.0
+
+# Largest single contribution, in tally units; what is above it is clipped and counted.
+_DEPOSIT_LIMIT = wp.constant(9.007199254740992e15)
+
+LEDGER_SLOTS = 256
+
+LEDGER_ENTRIES = (
+    "absorbed_water",
+    "absorbed_surface",
+    "weight_cutoff",
+    "max_collisions",
+    "max_path",
+    "lateral_limit",
+    "exit_x_low",
+    "exit_x_high",
+    "exit_y_low",
+    "exit_y_high",
+    "exit_z_low",
+    "exit_z_high",
+    "roulette",
+    "directed",
+)
+COUNTERS = (
+    "water_collisions",
+    "surface_events",
+    "surface_queries",
+    "shadow_queries",
+    "contributions",
+    "before_gate",
+    "after_gate",
+    "clipped",
+    "invalid",
+)
+LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS)
+
+ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, LATERAL_LIMIT = (
+    wp.constant(LEDGER_ENTRIES.index(name))
+    for name in ("absorbed_water", "absorbed_surface", "weight_cutoff", "max_collisions", "max_path", "lateral_limit")
+)
+EXIT = wp.constant(LEDGER_ENTRIES.index("exit_x_low"))
+ROULETTE = wp.constant(LEDGER_ENTRIES.index("roulette"))
+DIRECTED = wp.constant(LEDGER_ENTRIES.index("directed"))
+WATER_COLLISIONS, SURFACE_EVENTS, SURFACE_QUERIES, SHADOW_QUERIES = (
+    wp.constant(len(LEDGER_ENTRIES) + COUNTERS.index(name))
+    for name in ("water_collisions", "surface_events", "surface_queries", "shadow_queries")
+)
+CONTRIBUTIONS, BEFORE_GATE, AFTER_GATE, CLIPPED, INVALID = (
+    wp.constant(len(LEDGER_ENTRIES) + COUNTERS.index(name))
+    for name in ("contributions", "before_gate", "after_gate", "clipped", "invalid")
+)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
+#else
+    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value), __ATOMIC_RELAXED);
+#endif
+""")
+def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: wp.int64, value: wp.int64):
+    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the CPU)."""
+    ...
+
+
+@wp.func
+def to_ledger(weight: float) -> wp.int64:
+    """A weight >= 0 in ledger units, rounded to nearest."""
+    return wp.int64(weight * LEDGER_ONE + 0.5)
+
+
+@wp.func
+def to_fixed_point(value: float, scale: float, dither: float) -> wp.int64:
+    """value * scale >= 0, rounded up with probability equal to its fraction (dither uniform in [0, 1)): no value is too small to count.
+
+    Returns -1 for what is clipped and -2 for what is not a number.
+    """
+    units = value * scale
+    if units <= _DEPOSIT_LIMIT:
+        return wp.int64(wp.floor(units + dither))
+    if units > _DEPOSIT_LIMIT:
+        return wp.int64(-1)
+    return wp.int64(-2)
