@@ -1,7 +1,7 @@
 """Depth frames: one arrival time per pixel from a histogram of counts, tallies or rates.
 
-Times are fractional bins from the start of the first bin: bin k covers [k, k + 1), so its centre is k + 0.5. One thread a pixel.
-Histograms are rows `[pixel, bin]` of int32, int64, float32 or float64.
+Times are fractional bins from the start of the first bin: bin k covers [k, k + 1), so its centre is k + 0.5.
+Histograms are rows `[pixel, bin]` of int32, int64, float32 or float64; one thread a pixel.
 """
 
 import os
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 _PHASE_BITS = wp.constant(4)
 PHASES = wp.constant(16)
-"""Sub-bin shifts of the response at which the matched filter and the likelihood are tabulated; a parabola goes between them."""
+"""Sub-bin shifts at which the response is tabulated; a parabola goes between them."""
 
 RESPONSE_FLOOR = 1e-6
 """Smallest response, relative to its peak, that the logarithm sees: one stray count must not exclude every delay."""
@@ -27,7 +27,7 @@ _NEWTON_STEPS = wp.constant(6)
 
 @wp.func
 def _offer(position: float, score: float, best: wp.vec3) -> wp.vec3:
-    """Keep (score, first position, last position) of the largest score; the last position tells a plateau from a peak."""
+    """Keep (score, first position, last position) of the largest score: two positions tell a plateau from a peak."""
     if score > best[0]:
         return wp.vec3(score, position, position)
     if score == best[0]:
@@ -74,7 +74,7 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
             weight = float(0.0)
             moment = float(0.0)
             for k in range(wp.max(first, peak_bin - half_width), wp.min(stop, peak_bin + half_width + 1)):
-                # Relative to the peak, so that rates of any size keep their digits; below the background counts as negative.
+                # Relative to the peak, so that rates of any size keep their digits.
                 excess = (float(histogram[pixel, k]) - background[level, wp.min(k, bins - 1)]) / highest
                 weight += excess
                 moment += excess * float(k - peak_bin)
@@ -180,7 +180,7 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
         bound = counts * (wp.log(slope / seen) - 1.0 + seen / slope)
         if bound < beat:
             return -1.0
-        # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean), so Newton from S = 0 rises to the root and never passes it.
+        # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean): Newton from S = 0 rises to the root, never past it.
         signal = float(0.0)
         for _ in range(_NEWTON_STEPS):
             slope = float(0.0)
@@ -225,7 +225,17 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
         if total > 0.0:
             for step in range(first * PHASES / coarse_step, stop * PHASES / coarse_step):
                 score = profile_likelihood(
-                    histogram, background, response, pixel, level, first, stop, lowest_tap, step * coarse_step, least, best[0]
+                    histogram,
+                    background,
+                    response,
+                    pixel,
+                    level,
+                    first,
+                    stop,
+                    lowest_tap,
+                    step * coarse_step,
+                    least,
+                    best[0],
                 )
                 if score > 0.0:
                     best = _offer(float(step * coarse_step), score, best)
@@ -316,13 +326,14 @@ def arrival_bins(
 
     Args:
         histogram: `[pixel, bin]`, int32, int64, float32 or float64, not negative.
-        method: `"peak"`: centre of the largest bin. `"centroid"`: mean over the peak ± `half_width` bins. `"matched"`: the delay μ
-            that maximises Σ n_k ln h_k(μ), the log-matched filter, which is maximum likelihood without background. `"likelihood"`:
-            the maximum over delay and signal of Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), with known background B.
-        background: expected background per bin, in the histogram's unit, float32 `[1 or pixel, 1 or bin]`; row = pixel modulo rows.
-            Peak and centroid subtract it, the likelihood models it, the matched filter ignores it.
-        response: `[PHASES, tap]`: row p is the fraction of a return at time m + p / PHASES (m an integer) that falls in bin
-            m + lowest_tap + tap. Needed by matched and likelihood.
+        method: `"peak"`: centre of the largest bin. `"centroid"`: mean over the peak ± `half_width` bins.
+            `"matched"`: the delay μ that maximises Σ n_k ln h_k(μ), the log-matched filter, which is maximum
+            likelihood without background. `"likelihood"`: the maximum over delay and signal of
+            Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), with known background B.
+        background: expected background per bin, in the histogram's unit, float32 `[1 or pixel, 1 or bin]`; the row is
+            the pixel modulo the rows. Peak and centroid subtract it, the matched filter ignores it.
+        response: `[PHASES, tap]`: row p is the fraction of a return at time m + p / PHASES (m an integer) that falls in
+            bin m + lowest_tap + tap. Needed by matched and likelihood.
         lowest_tap: bin of the first tap, relative to the bin of the return.
         first, stop: the bins looked at, [first, stop).
         half_width: of the centroid's window [bins].
