@@ -1,0 +1,167 @@
+"""Radiative transfer in a plane-parallel, index-matched slab by doubling (van de Hulst 1980, chapter 4), in float64.
+
+Everything is averaged over azimuth, which is all that normal incidence asks for. Kernels R(μ, μ') are reflection
+functions: the radiance that leaves along μ is R(μ, μ')·μ'·F for a beam of irradiance πF normal to itself, so that a
+diffuse kernel acts on another by (A∘B)(μ, μ'') = 2∫A(μ, μ')·B(μ', μ'')·μ' dμ'. The undeviated beam is kept apart from
+the diffuse kernels, which lets the start be a layer so thin (τ·2⁻⁴⁰) that single scattering is exact for it.
+
+Nodes of weight zero (the beam's cosine 1, and any cosine where the exit density is wanted) take part as rows and
+columns and carry no flux, so the result at them is as exact as the quadrature and needs no interpolation.
+
+Henyey–Greenstein's azimuthal average is its Legendre series, summed until its terms vanish, with so many Gauss nodes
+that the quadrature still resolves it (g^{2N} < 1e-12): the forward peak needs no truncation (delta-M) then.
+
+The same equations hold for complex optical depth and albedo. With a = s, R(s) is the Laplace transform over path
+length of the time-resolved reflectance; `cumulative_reflectance` inverts it numerically.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_START = 40  # doublings from the single-scattering layer to the slab
+
+
+@dataclass(frozen=True)
+class Slab:
+    """What a pencil or plane beam at normal incidence leaves through: fractions of the incident power.
+
+    reflected, transmitted (diffuse and direct together), direct: floats (complex for a complex medium).
+    mu [M]: the cosines asked for; reflection [M], transmission [M]: R(μ), diffuse T(μ) with R = 2∫R(μ)μ dμ.
+    """
+
+    reflected: complex
+    transmitted: complex
+    direct: complex
+    mu: NDArray[np.float64]
+    reflection: NDArray[np.complex128]
+    transmission: NDArray[np.complex128]
+
+
+def slab(
+    *, anisotropy: float, albedo: complex, optical_depth: complex, mu: ArrayLike = (), nodes: int | None = None
+) -> Slab:
+    """Solve a slab, or with optical_depth = math.inf the half-space, with `nodes` Gauss nodes per hemisphere (None: by
+    g)."""
+    if nodes is None:
+        needed = 0 if abs(anisotropy) < 1e-3 else math.log(1e-12) / (2 * math.log(abs(anisotropy)))
+        nodes = max(48, math.ceil(needed))
+    x, gauss = np.polynomial.legendre.leggauss(nodes)
+    asked = np.maximum(np.atleast_1d(np.asarray(mu, np.float64)), 1e-14)
+    cosines = np.concatenate([(x + 1) / 2, [1.0], asked])
+    flux = np.zeros(cosines.size)
+    flux[:nodes] = gauss * (x + 1) / 2  # 2 μ dμ, with dμ = gauss/2
+    beam = nodes
+
+    half_space = optical_depth == math.inf
+    target = 64.0 if half_space else optical_depth
+    depth = target * 2.0**-_START
+    same, opposite = _redistribution(cosines, anisotropy)
+    reflect, transmit = _single_scattering(cosines, same, opposite, albedo, depth)
+    doublings = 0
+    while doublings < _START or (half_space and np.abs(transmit).max() > 1e-14):
+        # not by squaring: forty squarings of 1 - 1e-12 would leave an error of 1e-6 in the energy
+        reflect, transmit = _double(reflect, transmit, np.exp(-depth * 2.0**doublings / cosines), flux)
+        doublings += 1
+    direct = 0.0 if half_space else np.exp(-optical_depth)
+
+    return Slab(
+        reflected=_real(flux @ reflect[:, beam]),
+        transmitted=_real(flux @ transmit[:, beam] + direct),
+        direct=_real(direct),
+        mu=asked,
+        reflection=_real(reflect[beam + 1 :, beam]),
+        transmission=_real(transmit[beam + 1 :, beam]),
+    )
+
+
+def exit_cosine_fractions(
+    *, anisotropy: float, albedo: float, optical_depth: float, edges: ArrayLike
+) -> tuple[NDArray, NDArray]:
+    """Diffuse power out of (the lit face, the far face) with an exit cosine in each [edges[i], edges[i + 1])."""
+    edges = np.asarray(edges, np.float64)
+    x, gauss = np.polynomial.legendre.leggauss(12)
+    width = np.diff(edges)[:, None]
+    mu = edges[:-1, None] + width * (x + 1) / 2
+    solved = slab(anisotropy=anisotropy, albedo=albedo, optical_depth=optical_depth, mu=mu.ravel())
+    weight = 2 * mu * width * gauss / 2
+    return (solved.reflection.reshape(mu.shape) * weight).sum(1), (solved.transmission.reshape(mu.shape) * weight).sum(
+        1
+    )
+
+
+def cumulative_reflectance(
+    path: float,
+    *,
+    anisotropy: float,
+    scattering: float,
+    absorption: float,
+    thickness: float = math.inf,
+    nodes: int | None = None,
+) -> float:
+    """Fraction of a normally incident pulse that has left the lit face after at most `path` [m] in the medium.
+
+    The Laplace transform over path is R at the absorption s; inverted for its running integral with the Euler
+    summation of Abate and Whitt (1995), and with the absorption's own decay put back by shifting s. Error about 1e-8.
+    """
+    terms, euler = 24, 14
+    a = 19.0
+
+    def transform(s: complex) -> complex:
+        extinction = scattering + absorption + s
+        depth = math.inf if thickness == math.inf else extinction * thickness
+        solved = slab(anisotropy=anisotropy, albedo=scattering / extinction, optical_depth=depth, nodes=nodes)
+        return solved.reflected / s
+
+    values = [transform(complex(a, 2 * math.pi * k) / (2 * path)).real for k in range(terms + euler + 1)]
+    series = values[0] / 2 + np.cumsum([0.0] + [(-1) ** k * values[k] for k in range(1, terms + euler + 1)])
+    tail = [math.comb(euler, m) * 2.0**-euler * series[terms + m] for m in range(euler + 1)]
+    return math.exp(a / 2) / path * math.fsum(tail)
+
+
+def _real(value):
+    return value.real if np.all(np.imag(value) == 0) else value
+
+
+def _redistribution(cosines: NDArray, g: float) -> tuple[NDArray, NDArray]:
+    """Henyey–Greenstein averaged over azimuth, Σ(2k + 1)gᵏP_k(μ)P_k(±μ'): same and opposite side."""
+    same, opposite = np.ones((2, cosines.size, cosines.size))
+    previous, current = np.ones_like(cosines), cosines
+    k = 1
+    while (2 * k + 1) * abs(g) ** k > 1e-15:
+        term = (2 * k + 1) * g**k * np.outer(current, current)
+        same = same + term
+        opposite = opposite + (-1) ** k * term
+        previous, current = current, ((2 * k + 1) * cosines * current - k * previous) / (k + 1)
+        k += 1
+    return same, opposite
+
+
+def _single_scattering(cosines: NDArray, same: NDArray, opposite: NDArray, albedo: complex, depth: complex):
+    """Reflection and diffuse transmission of a layer in which light scatters at most once."""
+    out, into = cosines[:, None], cosines[None, :]
+    sum_ = 1 / out + 1 / into
+    reflect = albedo * opposite / 4 * -np.expm1(-depth * sum_) / (out + into)
+    difference = depth * (1 / into - 1 / out)
+    small = np.abs(difference) < 1e-13
+    safe = np.where(small, 1.0, difference)
+    # (e^{-τ/μ} − e^{-τ/μ'})/(μ − μ') = e^{-τ/μ'}·(e^{δ} − 1)/δ·τ/(μμ'), δ = τ/μ' − τ/μ; written from the slower decay
+    # to avoid overflow decay = np.where(np.real(difference) > 0, np.exp(-depth / out), np.exp(-depth / into))
+    ratio = np.where(small, 1.0, np.where(np.real(difference) > 0, -np.expm1(-safe), np.expm1(safe)) / safe)
+    transmit = albedo * same / 4 * decay * ratio * depth / (out * into)
+    return reflect, transmit
+
+
+def _double(reflect: NDArray, transmit: NDArray, direct: NDArray, flux: NDArray):
+    """Two equal layers on top of each other: down and up are the diffuse kernels at the interface between them."""
+    weighted = reflect * flux
+    twice = weighted @ reflect
+    down = np.linalg.solve(np.eye(flux.size) - twice * flux, transmit + twice * direct)
+    up = reflect * direct + weighted @ down
+    passed = transmit * flux
+    return (
+        reflect + direct[:, None] * up + passed @ up,
+        transmit * direct + direct[:, None] * down + passed @ down,
+    )
