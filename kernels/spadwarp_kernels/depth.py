@@ -180,7 +180,7 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
         bound = counts * (wp.log(slope / seen) - 1.0 + seen / slope)
         if bound < beat:
             return -1.0
-        # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean): Newton from S = 0 rises to the root, never past it.
+        # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean): Newton from S = 0 rises to the root, not past it.
         signal = float(0.0)
         for _ in range(_NEWTON_STEPS):
             slope = float(0.0)
