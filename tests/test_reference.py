@@ -99,8 +99,7 @@ def test_lidar_return_is_the_same_from_the_laser_s_side_and_from_the_camera_s():
 
 
 def test_lambertian_plane_keeps_radiometry():
-    """A small field on axis, laser beside the lens: Γ·e^{−2cd}·A/(π d²) times the share of the cone that the field
-    sees."""
+    """A small field on axis, laser beside the lens: Γ·e^{−2cd}·A/(π d²) times the share of the cone in view."""
     lidar = Lidar(laser_position=(0, 0, 0), half_angle=math.radians(5), field_of_view=math.radians(1), pixels=4)
     image = lambertian_plane(lidar, depth=5.0, reflectance=0.5)
     share = (2 * math.tan(math.radians(0.5))) ** 2 / lidar.solid_angle

@@ -43,8 +43,7 @@ class Slab:
 def slab(
     *, anisotropy: float, albedo: complex, optical_depth: complex, mu: ArrayLike = (), nodes: int | None = None
 ) -> Slab:
-    """Solve a slab, or with optical_depth = math.inf the half-space, with `nodes` Gauss nodes per hemisphere (None: by
-    g)."""
+    """Solve a slab, or with optical_depth = math.inf the half-space; `nodes` per hemisphere (None: by g)."""
     if nodes is None:
         needed = 0 if abs(anisotropy) < 1e-3 else math.log(1e-12) / (2 * math.log(abs(anisotropy)))
         nodes = max(48, math.ceil(needed))
@@ -148,7 +147,8 @@ def _single_scattering(cosines: NDArray, same: NDArray, opposite: NDArray, albed
     small = np.abs(difference) < 1e-13
     safe = np.where(small, 1.0, difference)
     # (e^{-τ/μ} − e^{-τ/μ'})/(μ − μ') = e^{-τ/μ'}·(e^{δ} − 1)/δ·τ/(μμ'), δ = τ/μ' − τ/μ; written from the slower decay
-    # to avoid overflow decay = np.where(np.real(difference) > 0, np.exp(-depth / out), np.exp(-depth / into))
+    # to avoid overflow
+    decay = np.where(np.real(difference) > 0, np.exp(-depth / out), np.exp(-depth / into))
     ratio = np.where(small, 1.0, np.where(np.real(difference) > 0, -np.expm1(-safe), np.expm1(safe)) / safe)
     transmit = albedo * same / 4 * decay * ratio * depth / (out * into)
     return reflect, transmit

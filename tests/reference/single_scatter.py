@@ -175,8 +175,7 @@ def _ray_in_cone(ray: NDArray, apex: NDArray, axis: NDArray, cos_half: float) ->
 
 
 def _distance_at_path(path: NDArray, focus: NDArray, ray: NDArray) -> NDArray:
-    """Where on a ray the way along it and on to `focus` (seen from its start) has the given lengths: [...,
-    len(path)]."""
+    """Where on a ray the way along it and on to `focus` (seen from its start) has the lengths `path`: [..., paths]."""
     return (path**2 - focus @ focus) / (2 * (path - (ray @ focus)[..., None]))
 
 
