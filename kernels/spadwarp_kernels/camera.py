@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .direction import cos_sin_turn
 from .philox import STREAM_LENS, random_block, u01
 
 
@@ -62,8 +63,8 @@ def sample_lens(camera: Camera, seed: wp.uint64, id: wp.uint64, event: wp.uint32
     """A uniform point on the aperture disc, the same for every use within one event of one photon."""
     block = random_block(seed, id, event, STREAM_LENS)
     r = camera.aperture_radius * wp.sqrt(u01(block[0]))
-    phi = 6.283185307179586 * u01(block[1])
+    turn = cos_sin_turn(u01(block[1]))
     sample = LensSample()
-    sample.point = wp.vec3(r * wp.cos(phi), r * wp.sin(phi), 0.0)
+    sample.point = wp.vec3(r * turn[0], r * turn[1], 0.0)
     sample.dither = u01(block[2])
     return sample

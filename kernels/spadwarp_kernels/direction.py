@@ -2,7 +2,20 @@
 
 import warp as wp
 
-_TWO_PI = wp.constant(6.283185307179586)
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float s, c;
+    sincospif(2.0f * xi, &s, &c);
+    return wp::vec2(c, s);
+#else
+    const float phi = 6.2831853f * xi;
+    return wp::vec2(wp::cos(phi), wp::sin(phi));
+#endif
+""")
+def cos_sin_turn(xi: float) -> wp.vec2:
+    """(cos, sin) of 2 pi xi, xi in [0, 1); full precision also where the module is compiled with fast mathematics."""
+    ...
 
 
 @wp.func
@@ -21,9 +34,9 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     Exact on an orthonormal basis; equal in distribution to the paper's eq 15, without its division by zero along the axis.
     """
     sin_theta = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
-    phi = _TWO_PI * xi
+    turn = cos_sin_turn(xi)
     b1, b2 = orthonormal_basis(u)
-    v = (1.0 - t) * u + (sin_theta * wp.cos(phi)) * b1 + (sin_theta * wp.sin(phi)) * b2
+    v = (1.0 - t) * u + (sin_theta * turn[0]) * b1 + (sin_theta * turn[1]) * b2
     # One Newton step of the inverse square root keeps |v| = 1 over any number of events.
     return v * (1.5 - 0.5 * wp.dot(v, v))
 
@@ -51,7 +64,7 @@ def one_minus_cosine(u: wp.vec3, v: wp.vec3) -> float:
 def sample_lambert(normal: wp.vec3, xi1: float, xi2: float) -> wp.vec3:
     """A unit vector about the unit normal with density cos(theta)/pi, for uniform xi1, xi2 in [0, 1)."""
     r = wp.sqrt(xi1)
-    phi = _TWO_PI * xi2
+    turn = cos_sin_turn(xi2)
     b1, b2 = orthonormal_basis(normal)
-    v = wp.sqrt(wp.max(1.0 - xi1, 0.0)) * normal + (r * wp.cos(phi)) * b1 + (r * wp.sin(phi)) * b2
+    v = wp.sqrt(wp.max(1.0 - xi1, 0.0)) * normal + (r * turn[0]) * b1 + (r * turn[1]) * b2
     return wp.normalize(v)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .direction import orthonormal_basis, rotate_direction
+from .direction import cos_sin_turn, orthonormal_basis, rotate_direction
 from .philox import STREAM_EMISSION, random_block, u01, u01_fine
 
 LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
@@ -49,6 +49,6 @@ def emit_photon(laser: Laser, seed: wp.uint64, id: wp.uint64):
     else:
         b1, b2 = orthonormal_basis(laser.axis)
         r = laser.radius * wp.sqrt(xi)
-        phi = 6.283185307179586 * azimuth
-        position = laser.position + (r * wp.cos(phi)) * b1 + (r * wp.sin(phi)) * b2
+        turn = cos_sin_turn(azimuth)
+        position = laser.position + (r * turn[0]) * b1 + (r * turn[1]) * b2
     return position, direction

@@ -64,7 +64,7 @@ CONTRIBUTIONS, BEFORE_GATE, AFTER_GATE, CLIPPED, INVALID = (
     __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value), __ATOMIC_RELAXED);
 #endif
 """)
-def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: wp.int64, value: wp.int64):
+def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: int, value: wp.int64):
     """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the CPU)."""
     ...
 
@@ -87,3 +87,30 @@ def to_fixed_point(value: float, scale: float, dither: float) -> wp.int64:
     if units > _DEPOSIT_LIMIT:
         return wp.int64(-1)
     return wp.int64(-2)
+
+
+@wp.func
+def add_to_ledger(ledger: wp.array(dtype=wp.int64), thread: int, entry: int, value: wp.int64):
+    """Adds to one entry in the slot of a thread; neighbouring threads write to neighbouring addresses."""
+    atomic_add_int64(ledger, entry * LEDGER_SLOTS + thread % LEDGER_SLOTS, value)
+
+
+@wp.func
+def deposit(
+    tally: wp.array(dtype=wp.int64),
+    ledger: wp.array(dtype=wp.int64),
+    thread: int,
+    index: int,
+    value: float,
+    scale: float,
+    dither: float,
+):
+    """Adds a contribution to a voxel of the tally; index -1 or -2 counts it in the ledger as before or after the gate."""
+    units = to_fixed_point(value, scale, dither)
+    if units < wp.int64(0):
+        add_to_ledger(ledger, thread, wp.where(units == wp.int64(-1), CLIPPED, INVALID), wp.int64(1))
+    elif index >= 0:
+        if units > wp.int64(0):
+            atomic_add_int64(tally, index, units)
+    else:
+        add_to_ledger(ledger, thread, wp.where(index == -1, BEFORE_GATE, AFTER_GATE), units)

@@ -14,25 +14,21 @@ from typing import NamedTuple
 import warp as wp
 
 from .camera import Camera, LensSample, project, sample_lens
-from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
+from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance, exit_face
-from .gate import AFTER, BEFORE, Gate, gate_bin
+from .gate import Gate, gate_bin
 from .guided import Guiding, clip_flight, sample_flight
 from .laser import Laser, emit_photon
 from .medium import Medium, free_path
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import STREAM_FLIGHT_SAMPLE, STREAM_ROULETTE, STREAM_TRANSPORT, random_block, u01, u01_fine
-from .surface import intersect_mesh, offset_from_surface, segment_meets_box
+from .surface import intersect_mesh, lambert_brdf, offset_from_surface, segment_meets_box
 from .tally import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,
-    AFTER_GATE,
-    BEFORE_GATE,
-    CLIPPED,
     CONTRIBUTIONS,
     DIRECTED,
     COUNTERS,
-    INVALID,
     LEDGER_ENTRIES,
     LEDGER_SLOTS,
     LEDGER_WIDTH,
@@ -44,10 +40,11 @@ from .tally import (
     SURFACE_QUERIES,
     WATER_COLLISIONS,
     WEIGHT_CUTOFF,
-    atomic_add_int64,
-    to_fixed_point,
+    add_to_ledger,
+    deposit,
     to_ledger,
 )
+from .warp_lanes import count_lanes
 
 ESTIMATORS = ("none", "analog", "next_event", "guided")
 
@@ -57,6 +54,13 @@ BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
 
 _EMIT, _FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _END, _DONE = (wp.constant(i) for i in range(7))
 _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
+
+
+# The warp traces its rays when this many of its 32 lanes have one: fewer leave lanes idle in the BVH, more in the water.
+WAITING_LANES = 20
+
+# Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
+MAX_REGISTERS = (80, 128)
 
 
 class TransportSpec(NamedTuple):
@@ -122,42 +126,35 @@ def next_event_value(
 
 
 @wp.func
-def _tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> wp.int64:
+def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
     """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
     k = gate_bin(gate, path)
     if k < 0:
-        return wp.int64(k)
-    row = wp.int64(component) * wp.int64(camera.width * camera.height) + wp.int64(pixel)
-    return row * wp.int64(gate.bins) + wp.int64(k)
-
-
-@wp.func
-def _deposit(
-    tally: wp.array(dtype=wp.int64), ledger: wp.array(dtype=wp.int64), slot: wp.int64, index: wp.int64, units: wp.int64
-):
-    if index >= wp.int64(0) and units > wp.int64(0):
-        atomic_add_int64(tally, index, units)
-    elif units > wp.int64(0):
-        entry = wp.where(index == wp.int64(BEFORE), BEFORE_GATE, AFTER_GATE)
-        atomic_add_int64(ledger, slot + wp.int64(entry), units)
-    elif units < wp.int64(0):
-        entry = wp.where(units == wp.int64(-1), CLIPPED, INVALID)
-        atomic_add_int64(ledger, slot + wp.int64(entry), wp.int64(1))
+        return k
+    return (component * camera.width * camera.height + pixel) * gate.bins + k
 
 
 @functools.cache
-def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
-    """The transport kernel for a spec; launch grid: any number of threads, photon i is walked by thread i mod thread_count."""
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
+    """The transport kernel for a spec; launch grid: `thread_count` threads, photon i is walked by thread i mod thread_count.
+
+    On CUDA `thread_count` must be a multiple of the block size, since whole warps vote.
+    """
     if spec.estimator not in ESTIMATORS:
         raise ValueError(f"estimator = {spec.estimator!r} is not one of {', '.join(ESTIMATORS)}")
     analog = spec.estimator == "analog"
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
-    surface_next_event = next_event or guided
     paper_albedo, has_mesh, bounded, roulette, records = spec[2:]
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
+    waiting_lanes = WAITING_LANES if has_mesh else 32
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(
+        module="unique",
+        module_options={"fast_math": cuda},
+        enable_backward=False,
+        cuda_max_registers=MAX_REGISTERS[has_mesh],
+    )
     def transport(
         # Model:
         medium: Medium,
@@ -179,11 +176,10 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
         out: Records,
     ):
         thread = wp.tid()
-        slot = wp.int64((thread % LEDGER_SLOTS) * LEDGER_WIDTH)
+        stage = int(_EMIT)
 
         # State of the photon:
         photon = int(thread)
-        id = wp.uint64(0)
         x = wp.vec3(0.0)
         u = wp.vec3(0.0)
         weight = float(0.0)
@@ -192,41 +188,38 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
         path = float(0.0)
         collisions = int(0)
         surface_count = int(0)
-        reason = int(-1)  # ledger entry of the history's end
-        # State of the event:
+        reason = int(0)  # ledger entry of the history's end
+        # Its next event:
         block = wp.vec4ui()
         distance = float(0.0)  # to the end of the flight
-        face = int(-1)  # hit at that end; -1 in the water
+        face = int(-1)  # hit there; -1 in the water
         normal = wp.vec3(0.0)
         albedo = float(medium.albedo)
-        lens = LensSample()
-        interval = wp.vec2(0.0)
-        # The ray to trace and what waits for it:
+        # The ray to trace, and the contribution that waits for it:
         ray = int(_NO_RAY)
-        ray_origin = wp.vec3(0.0)
         reach = float(0.0)
-        pending_index = wp.int64(0)
-        pending_units = wp.int64(0)
-        # Tallies of the thread:
+        interval = wp.vec2(0.0)  # of the flight that the camera sees
+        along = float(0.0)  # point of the flight that is scored; 0 is x
+        lens = LensSample()
+        pending_index = int(0)
+        pending_value = float(0.0)
+        # What the thread has to tell:
         absorbed_water = wp.int64(0)
         absorbed_surface = wp.int64(0)
         directed = wp.int64(0)
-        water_collisions = int(0)
-        surface_events = int(0)
         surface_queries = int(0)
         shadow_queries = int(0)
         contributions = int(0)
 
-        stage = int(_EMIT)
-        while stage != _DONE:
-            # ---- Until a ray has to be traced
-            while ray == _NO_RAY and stage != _DONE:
+        while count_lanes(stage == _DONE) < 32:
+            # ---- Water: until enough lanes of the warp have a ray to trace
+            waiting = int(0)
+            while waiting < wp.static(waiting_lanes):
                 if stage == _EMIT:
                     if photon >= photon_count:
                         stage = _DONE
                     else:
-                        id = first_id + wp.uint64(photon)
-                        x, u = emit_photon(laser, seed, id)
+                        x, u = emit_photon(laser, seed, first_id + wp.uint64(photon))
                         weight = 1.0
                         analog_weight = 1.0
                         ledger_weight = to_ledger(1.0)
@@ -236,6 +229,7 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                         stage = _FLIGHT
 
                 if stage == _FLIGHT:
+                    id = first_id + wp.uint64(photon)
                     block = random_block(seed, id, wp.uint32(collisions + 1), STREAM_TRANSPORT)
                     face = -1
                     distance = free_path(u01(block[0]), medium.extinction)
@@ -244,9 +238,8 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                         limit = wp.min(limit, exit_distance(limits, x, u))
                     reach = wp.min(distance, limit)
                     if wp.static(paper_albedo):
-                        albedo = medium.albedo * u01(
-                            random_block(seed, id, wp.uint32(collisions + 1), STREAM_ROULETTE)[1]
-                        )
+                        draw = random_block(seed, id, wp.uint32(collisions + 1), STREAM_ROULETTE)
+                        albedo = medium.albedo * u01(draw[1])
                     stage = _EVENT
                     if wp.static(guided):
                         lens = sample_lens(camera, seed, id, wp.uint32(2 * collisions + 2))
@@ -257,13 +250,14 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                     if wp.static(has_mesh):
                         if segment_meets_box(x, u, reach, surfaces.lower, surfaces.upper):
                             ray = _SURFACE_RAY
-                            ray_origin = x
 
                 if wp.static(guided):
                     if stage == _FLIGHT_SAMPLE and ray == _NO_RAY:
                         stage = _EVENT
                         if interval[0] < interval[1]:
-                            flight_block = random_block(seed, id, wp.uint32(collisions + 1), STREAM_FLIGHT_SAMPLE)
+                            flight_block = random_block(
+                                seed, first_id + wp.uint64(photon), wp.uint32(collisions + 1), STREAM_FLIGHT_SAMPLE
+                            )
                             g = medium.anisotropy
                             sample = sample_flight(
                                 x - lens.point,
@@ -274,55 +268,50 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                                 u01(flight_block[0]),
                                 u01_fine(flight_block[1]),
                             )
-                            y = x + sample.s * u
+                            along = sample.s
+                            y = x + along * u
                             pixel = project(camera, y)
-                            if pixel >= 0 and sample.density > 0.0 and sample.r > 0.0:
+                            if pixel >= 0 and sample.density > 0.0:
                                 to_lens = (lens.point - y) / sample.r
-                                value = next_event_value(
-                                    camera,
-                                    medium.extinction,
-                                    weight * medium.extinction * albedo * wp.exp(-medium.extinction * sample.s),
-                                    phase_pdf(
-                                        one_minus_cosine(snap_direction(u, medium.axis_threshold), to_lens), medium
-                                    ),
-                                    to_lens,
-                                    sample.r,
+                                t = one_minus_cosine(snap_direction(u, medium.axis_threshold), to_lens)
+                                weight_there = weight * albedo * medium.extinction * wp.exp(-medium.extinction * along)
+                                pending_value = (
+                                    next_event_value(
+                                        camera, medium.extinction, weight_there, phase_pdf(t, medium), to_lens, sample.r
+                                    )
+                                    / sample.density
                                 )
+                                component = wp.where(surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                                pending_index = tally_index(camera, gate, pixel, path + along + sample.r, component)
                                 contributions += 1
-                                pending_units = to_fixed_point(value / sample.density, scale, lens.dither)
-                                pending_index = _tally_index(
-                                    camera,
-                                    gate,
-                                    pixel,
-                                    path + sample.s + sample.r,
-                                    wp.where(surface_count > 0, FORWARD_SCATTERED, BACKSCATTER),
-                                )
                                 ray = _SHADOW_RAY
-                                ray_origin = y
 
                 if stage == _EVENT and ray == _NO_RAY:
+                    reason = -1
                     limit = limits.max_path - path
                     if wp.static(analog):
-                        # Does the flight itself pass through the aperture, before anything else happens to it?
+                        # Does the flight pass through the aperture, before anything else happens to it?
                         if u[2] < 0.0 and collisions > 0:
                             crossing = -x[2] / u[2]
                             on_lens = x + crossing * u
                             pixel = project(camera, x)
-                            inside = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1] <= camera.aperture_radius * camera.aperture_radius
+                            radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
+                            inside = radius2 <= camera.aperture_radius * camera.aperture_radius
                             if pixel >= 0 and inside and crossing <= wp.min(distance, limit):
                                 component = wp.where(surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
                                 if surface_count == 1 and collisions == 1:
                                     component = BALLISTIC
-                                dither = sample_lens(camera, seed, id, wp.uint32(2 * collisions + 1)).dither
+                                id = first_id + wp.uint64(photon)
                                 contributions += 1
-                                _deposit(
+                                deposit(
                                     tally,
                                     ledger,
-                                    slot,
-                                    _tally_index(camera, gate, pixel, path + crossing, component),
-                                    to_fixed_point(weight, scale, dither),
+                                    thread,
+                                    tally_index(camera, gate, pixel, path + crossing, component),
+                                    weight,
+                                    scale,
+                                    sample_lens(camera, seed, id, wp.uint32(2 * collisions + 1)).dither,
                                 )
-                    reason = -1
                     if distance > limit:
                         reason = MAX_PATH
                     if wp.static(bounded):
@@ -339,11 +328,15 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                         path += distance
                         collisions += 1
                         stage = _SCATTER
+                        if wp.static(has_mesh):
+                            if face >= 0:
+                                x = offset_from_surface(x, normal, distance)
                         if wp.static(next_event or guided):
                             # Water collisions are scored here by next_event alone: guided has scored the flight.
                             if wp.static(next_event) or face >= 0:
                                 pixel = project(camera, x)
                                 if pixel >= 0:
+                                    id = first_id + wp.uint64(photon)
                                     lens = sample_lens(camera, seed, id, wp.uint32(2 * collisions + 1))
                                     to_lens = lens.point - x
                                     r = wp.length(to_lens)
@@ -352,7 +345,7 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                                     component = int(FORWARD_SCATTERED)
                                     if face >= 0:
                                         cos_out = wp.max(wp.dot(to_lens, normal), 0.0)
-                                        scattering = surfaces.reflectance[face] * 0.3183098861837907 * cos_out
+                                        scattering = lambert_brdf(surfaces.reflectance[face]) * cos_out
                                         if collisions == 1:
                                             component = BALLISTIC
                                     else:
@@ -361,32 +354,28 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                                         if surface_count == 0:
                                             component = BACKSCATTER
                                     if scattering > 0.0:
-                                        value = next_event_value(camera, medium.extinction, weight, scattering, to_lens, r)
+                                        along = 0.0
+                                        pending_value = next_event_value(
+                                            camera, medium.extinction, weight, scattering, to_lens, r
+                                        )
+                                        pending_index = tally_index(camera, gate, pixel, path + r, component)
                                         contributions += 1
-                                        pending_units = to_fixed_point(value, scale, lens.dither)
-                                        pending_index = _tally_index(camera, gate, pixel, path + r, component)
                                         ray = _SHADOW_RAY
-                                        ray_origin = x
-                                        if wp.static(has_mesh):
-                                            if face >= 0:
-                                                ray_origin = offset_from_surface(x, normal, distance)
 
-                if wp.static(surface_next_event):
+                if wp.static(next_event or guided):
                     if ray == _SHADOW_RAY:
                         needed = False
                         if wp.static(has_mesh):
-                            if pending_units != wp.int64(0):
-                                to_lens = lens.point - ray_origin
-                                needed = segment_meets_box(
-                                    ray_origin, to_lens, 1.0, surfaces.lower, surfaces.upper
-                                )
+                            origin = x + along * u
+                            needed = segment_meets_box(
+                                origin, lens.point - origin, 1.0, surfaces.lower, surfaces.upper
+                            )
                         if not needed:
-                            _deposit(tally, ledger, slot, pending_index, pending_units)
+                            deposit(tally, ledger, thread, pending_index, pending_value, scale, lens.dither)
                             ray = _NO_RAY
 
                 if stage == _SCATTER and ray == _NO_RAY:
-                    # Weight (the score before held the weight of this event without it), terminate, new direction.
-                    gone = wp.int64(0)
+                    # The score took the photon as it arrived; now its weight, its end or its new direction.
                     survival = float(albedo)
                     if wp.static(has_mesh):
                         if face >= 0:
@@ -394,34 +383,29 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                     weight *= survival
                     analog_weight *= survival
                     after = to_ledger(weight)
-                    gone = ledger_weight - after
-                    ledger_weight = after
                     if face >= 0:
-                        absorbed_surface += gone
-                        surface_events += 1
+                        absorbed_surface += ledger_weight - after
                         surface_count += 1
                     else:
-                        absorbed_water += gone
-                        water_collisions += 1
+                        absorbed_water += ledger_weight - after
+                    ledger_weight = after
 
                     reason = -1
-                    if analog_weight < limits.weight_cutoff:
+                    if analog_weight < limits.weight_cutoff or analog_weight <= 0.0:
                         reason = WEIGHT_CUTOFF
                         if wp.static(roulette):
+                            id = first_id + wp.uint64(photon)
                             chance = u01(random_block(seed, id, wp.uint32(collisions), STREAM_ROULETTE)[0])
-                            if chance < 0.1:
+                            reason = ROULETTE
+                            if chance < 0.1 and analog_weight > 0.0:
                                 reason = -1
                                 weight *= 10.0
                                 analog_weight *= 10.0
                                 after = to_ledger(weight)
-                                atomic_add_int64(ledger, slot + wp.int64(ROULETTE), ledger_weight - after)
+                                add_to_ledger(ledger, thread, ROULETTE, ledger_weight - after)
                                 ledger_weight = after
-                            else:
-                                reason = ROULETTE
                     if reason < 0 and collisions >= limits.max_collisions:
                         reason = MAX_COLLISIONS
-                    if analog_weight <= 0.0 and reason < 0:
-                        reason = WEIGHT_CUTOFF
 
                     stage = _END
                     if reason < 0:
@@ -429,44 +413,41 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                         on_surface = False
                         if wp.static(has_mesh):
                             on_surface = face >= 0
-                        towards_lens = False
-                        v = wp.vec3(0.0, 0.0, -1.0)
+                        snapped = snap_direction(u, medium.axis_threshold)
                         if wp.static(guided):
+                            # Towards the lens with some probability; the weight makes up for it.
                             v = -wp.normalize(x)
                             chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
-                            towards_lens = u01(block[3]) < chance
-
-                        snapped = snap_direction(u, medium.axis_threshold)
-                        if towards_lens:
-                            t = sample_henyey_greenstein(u01_fine(block[1]), guiding.anisotropy)
-                            u = rotate_direction(v, t, u01(block[2]))
-                        elif on_surface:
-                            u = sample_lambert(normal, u01(block[1]), u01(block[2]))
-                        else:
-                            u = rotate_direction(snapped, phase_sample(u01_fine(block[1]), medium), u01(block[2]))
-
-                        if wp.static(guided):
-                            density = float(0.0)
-                            chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
+                            axis = wp.where(u01(block[3]) < chance, v, snapped)
+                            if u01(block[3]) >= chance and on_surface:
+                                u = sample_lambert(normal, u01(block[1]), u01(block[2]))
+                            else:
+                                t = phase_sample(u01_fine(block[1]), medium)
+                                if u01(block[3]) < chance:
+                                    t = sample_henyey_greenstein(u01_fine(block[1]), guiding.anisotropy)
+                                u = rotate_direction(axis, t, u01(block[2]))
+                            density = phase_pdf(one_minus_cosine(snapped, u), medium)
                             if on_surface:
                                 density = wp.max(wp.dot(u, normal), 0.0) * 0.3183098861837907
-                            else:
-                                density = phase_pdf(one_minus_cosine(snapped, u), medium)
                             lobe = henyey_greenstein_pdf(one_minus_cosine(v, u), guiding.anisotropy)
-                            mixture = (1.0 - chance) * density + chance * lobe
-                            weight *= density / wp.max(mixture, 1.0e-30)
+                            weight *= density / wp.max((1.0 - chance) * density + chance * lobe, 1.0e-30)
                             after = to_ledger(weight)
                             directed += ledger_weight - after
                             ledger_weight = after
                             if weight <= 0.0:
                                 reason = DIRECTED
                                 stage = _END
-                        if wp.static(has_mesh):
+                        else:
                             if on_surface:
-                                x = offset_from_surface(x, normal, distance)
+                                u = sample_lambert(normal, u01(block[1]), u01(block[2]))
+                            else:
+                                u = rotate_direction(snapped, phase_sample(u01_fine(block[1]), medium), u01(block[2]))
 
                 if stage == _END:
-                    atomic_add_int64(ledger, slot + wp.int64(reason), ledger_weight)
+                    add_to_ledger(ledger, thread, reason, ledger_weight)
+                    add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(collisions - surface_count))
+                    if wp.static(has_mesh):
+                        add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(surface_count))
                     if wp.static(records):
                         out.position[photon] = x
                         out.direction[photon] = u
@@ -477,32 +458,42 @@ def make_transport_kernel(spec: TransportSpec) -> wp.Kernel:
                     photon += thread_count
                     stage = _EMIT
 
-            # ---- Trace the ray, all threads of the warp together
-            if wp.static(has_mesh):
-                if ray == _SURFACE_RAY:
-                    surface_queries += 1
-                    hit = intersect_mesh(surfaces.mesh, ray_origin, u, reach)
-                    if hit.face >= 0:
-                        if wp.static(guided):
-                            interval = wp.vec2(interval[0], wp.min(interval[1], hit.distance))
-                        if hit.distance < distance:
-                            distance = hit.distance
-                            face = hit.face
-                            normal = hit.normal
-                elif ray == _SHADOW_RAY:
-                    shadow_queries += 1
-                    if not wp.mesh_query_ray_anyhit(surfaces.mesh, ray_origin, lens.point - ray_origin, 1.0):
-                        _deposit(tally, ledger, slot, pending_index, pending_units)
-                ray = _NO_RAY
+                waiting = count_lanes(ray != _NO_RAY or stage == _DONE)
 
-        atomic_add_int64(ledger, slot + wp.int64(ABSORBED_WATER), absorbed_water)
-        atomic_add_int64(ledger, slot + wp.int64(ABSORBED_SURFACE), absorbed_surface)
-        atomic_add_int64(ledger, slot + wp.int64(DIRECTED), directed)
-        atomic_add_int64(ledger, slot + wp.int64(WATER_COLLISIONS), wp.int64(water_collisions))
-        atomic_add_int64(ledger, slot + wp.int64(SURFACE_EVENTS), wp.int64(surface_events))
-        atomic_add_int64(ledger, slot + wp.int64(SURFACE_QUERIES), wp.int64(surface_queries))
-        atomic_add_int64(ledger, slot + wp.int64(SHADOW_QUERIES), wp.int64(shadow_queries))
-        atomic_add_int64(ledger, slot + wp.int64(CONTRIBUTIONS), wp.int64(contributions))
+            # ---- Surfaces: the warp traces its rays together
+            if wp.static(has_mesh):
+                if ray != _NO_RAY:
+                    origin = x
+                    to = u
+                    length = reach
+                    if wp.static(next_event or guided):
+                        if ray == _SHADOW_RAY:
+                            origin = x + along * u
+                            to = lens.point - origin
+                            length = wp.length(to)
+                            to = to / length
+                    hit = intersect_mesh(surfaces.mesh, origin, to, length)
+                    if ray == _SURFACE_RAY:
+                        surface_queries += 1
+                        if hit.face >= 0:
+                            if wp.static(guided):
+                                interval = wp.vec2(interval[0], wp.min(interval[1], hit.distance))
+                            if hit.distance < distance:
+                                distance = hit.distance
+                                face = hit.face
+                                normal = hit.normal
+                    else:
+                        shadow_queries += 1
+                        if hit.face < 0:
+                            deposit(tally, ledger, thread, pending_index, pending_value, scale, lens.dither)
+                    ray = _NO_RAY
+
+        add_to_ledger(ledger, thread, ABSORBED_WATER, absorbed_water)
+        add_to_ledger(ledger, thread, ABSORBED_SURFACE, absorbed_surface)
+        add_to_ledger(ledger, thread, DIRECTED, directed)
+        add_to_ledger(ledger, thread, SURFACE_QUERIES, wp.int64(surface_queries))
+        add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(shadow_queries))
+        add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(contributions))
 
     return transport
 
@@ -541,7 +532,7 @@ class Data:
 
     Attributes:
         tally: int64 [component * height * width * bin], fixed point.
-        ledger: int64 [LEDGER_SLOTS * LEDGER_WIDTH]; the sum over slots is the ledger, see `read_ledger`.
+        ledger: int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`.
         records: Terminal states of the last launch's photons.
     """
 
@@ -619,9 +610,10 @@ def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    threads = min(photon_count, CUDA_THREADS) if model.device.is_cuda else 1
+    block = 128
+    threads = min(-(-photon_count // block) * block, CUDA_THREADS) if model.device.is_cuda else 1
     wp.launch(
-        make_transport_kernel(spec),
+        make_transport_kernel(spec, model.device.is_cuda),
         dim=threads,
         inputs=[
             model.medium,
@@ -639,13 +631,13 @@ def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first
         ],
         outputs=[data.tally, data.ledger, data.records],
         device=model.device,
-        block_dim=128,
+        block_dim=block,
     )
 
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device."""
-    totals = data.ledger.numpy().reshape(LEDGER_SLOTS, LEDGER_WIDTH).sum(axis=0)
+    totals = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS).sum(axis=1)
     names = LEDGER_ENTRIES + COUNTERS
     values = {name: int(total) for name, total in zip(names, totals, strict=True)}
     return {n: values[n] for n in LEDGER_ENTRIES}, {n: values[n] for n in COUNTERS}
