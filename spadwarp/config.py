@@ -1,0 +1,581 @@
+"""Scenes: TOML in, frozen and validated models out.
+
+`load_scene` reads a file, `Scene.from_dict` takes tables, `Scene.with_overrides` changes a scene. A section may name a
+`preset`; the file's own fields lie over it and overrides over both. SI units, except where a name carries its unit.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from . import _layers
+from ._layers import parse_override
+from ._problems import describe
+from .errors import ConfigError, FileError
+from .presets import PRESETS, WATER_INDICES
+
+__all__ = [
+    "SPEED_OF_LIGHT",
+    "Analytic",
+    "Camera",
+    "Detector",
+    "Domain",
+    "Gate",
+    "Laser",
+    "Medium",
+    "Output",
+    "Scene",
+    "Target",
+    "Transport",
+    "load_scene",
+    "parse_override",
+]
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], vacuum
+PLANCK = 6.626_070_15e-34  # [J s]
+
+Overrides = Mapping[str, Any] | Sequence[str]
+
+
+def _whole(value: Any) -> Any:
+    """TOML writes 2e9 as a float; a whole one is as good as an integer."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _listed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _three(value: Any) -> Any:
+    return (value,) * 3 if isinstance(value, (int, float)) and not isinstance(value, bool) else _listed(value)
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
+Vector = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
+Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
+Corner = Annotated[tuple[Bound, Bound, Bound], BeforeValidator(_three)]
+Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_listed), Field(min_length=1, max_length=3)]
+Scale = Annotated[tuple[float, float, float], BeforeValidator(_three)]
+
+
+class Section(BaseModel):
+    """One table of a scene: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=())
+    section: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, fields: Any) -> Any:
+        return _layers.merge_section(cls.section, {}, fields) if isinstance(fields, Mapping) else fields
+
+    @field_validator("preset", check_fields=False)
+    @classmethod
+    def _known_preset(cls, name: str | None) -> str | None:
+        if name is not None and name not in PRESETS[cls.section]:
+            raise ValueError("preset", tuple(PRESETS[cls.section]))
+        return name
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again, without those that are None."""
+        return {name: value for name, value in self if value is not None}
+
+
+class Medium(Section):
+    """The water. Give exactly two of absorption, scattering, extinction, albedo; all four can be read."""
+
+    section: ClassVar[str] = "medium"
+    preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
+    absorption: float = Field(0.0, ge=0, description="absorption coefficient a [1/m]")
+    scattering: float = Field(0.0, ge=0, description="scattering coefficient b [1/m]")
+    extinction: float = Field(0.0, gt=0, description="extinction (beam attenuation) coefficient c = a + b [1/m]")
+    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["paper"] = Field(
+        0.0,
+        description='single-scattering albedo b/c, or "paper": uniform in (0, 0.97) at each collision',
+    )
+    phase_function: Literal["henyey_greenstein"] = Field("henyey_greenstein", description="law of the scattering angle")
+    anisotropy: float = Field(0.924, gt=-1, lt=1, description="mean cosine g of the scattering angle")
+    group_index: float = Field(
+        WATER_INDICES["seawater"][1],
+        ge=1,
+        le=3,
+        description='index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566',
+    )
+    phase_index: float = Field(
+        WATER_INDICES["seawater"][0],
+        ge=1,
+        le=3,
+        description='refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350',
+    )
+
+    @field_validator("phase_index", "group_index", mode="before")
+    @classmethod
+    def _named_index(cls, value: Any, info: Any) -> Any:
+        if isinstance(value, str):
+            if value not in WATER_INDICES:
+                raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
+            return WATER_INDICES[value][info.field_name == "group_index"]
+        return value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        # The two that were given stay in model_fields_set, from where to_dict() knows them.
+        self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
+        return self
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Names of the two coefficients that define the medium; the other two follow."""
+        return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
+
+    @property
+    def attenuation_length(self) -> float:
+        """1/c [m]."""
+        return 1.0 / self.extinction
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again: of the coefficients the two given ones."""
+        hidden = set(_layers.COEFFICIENTS) - set(self.given)
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
+
+
+class Laser(Section):
+    """The pulsed source. Photons leave it at the middle of the pulse, time 0."""
+
+    section: ClassVar[str] = "laser"
+    preset: str | None = Field(None, description="a named laser, see `spadwarp presets laser`")
+    position: Vector = Field((0.0, 0.0, 0.0), description="place in the camera frame [m]")
+    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0")
+    profile: Literal["uniform_cone", "gaussian", "collimated"] = Field(
+        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); or parallel"
+    )
+    half_angle_deg: float = Field(
+        15.0, gt=0, le=180, description="half angle θ of the cone, 1/e² half angle of the gaussian [°]"
+    )
+    beam_radius: float = Field(0.0, ge=0, description="radius of the collimated beam [m]; 0 is a pencil beam")
+    wavelength_nm: float = Field(532.0, gt=0, description="vacuum wavelength [nm]")
+    pulse_energy: float = Field(37.5e-9, gt=0, description="energy of one pulse [J]")
+    repetition_rate: float = Field(20e6, gt=0, description="pulses per second [Hz]")
+    pulse_fwhm_ps: float = Field(85.0, ge=0, description="pulse duration, full width at half maximum [ps]")
+
+    @model_validator(mode="after")
+    def _has_a_beam(self) -> Self:
+        if not any(self.direction):
+            raise ValueError(f"direction = {list(self.direction)} has no length")
+        if self.profile == "gaussian" and self.half_angle_deg >= 90:
+            raise ValueError(
+                f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a gaussian profile"
+            )
+        return self
+
+    @property
+    def half_angle(self) -> float:
+        """θ [rad]."""
+        return math.radians(self.half_angle_deg)
+
+    @property
+    def axis(self) -> tuple[float, float, float]:
+        """`direction` as a unit vector."""
+        x, y, z = self.direction
+        length = math.hypot(x, y, z)
+        return (x / length, y / length, z / length)
+
+    @property
+    def photons_per_pulse(self) -> float:
+        """E0·λ/(hc)."""
+        return self.pulse_energy * self.wavelength_nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
+
+
+class Camera(Section):
+    """A pinhole view through a round aperture, with square pixels.
+
+    The view is given by `horizontal_fov_deg`, or by `focal_length` with `pixel_pitch_um`; the aperture by
+    `aperture_diameter`, or by `f_number` with `focal_length`.
+    """
+
+    section: ClassVar[str] = "camera"
+    preset: str | None = Field(None, description="a named camera, see `spadwarp presets camera`")
+    width: Whole = Field(..., ge=1, le=16384, description="pixels in a row")
+    height: Whole = Field(..., ge=1, le=16384, description="rows")
+    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180, description="full horizontal field of view [°]")
+    focal_length: float | None = Field(None, gt=0, description="focal length [m]")
+    pixel_pitch_um: float | None = Field(None, gt=0, description="side of a pixel [µm]")
+    aperture_diameter: float | None = Field(None, gt=0, description="diameter of the entrance aperture [m]")
+    f_number: float | None = Field(None, gt=0, description="focal length over aperture diameter")
+
+    @model_validator(mode="after")
+    def _determined(self) -> Self:
+        if (self.horizontal_fov_deg is None) == (self.pixel_pitch_um is None):
+            raise ValueError("needs either horizontal_fov_deg or pixel_pitch_um with focal_length")
+        if (self.aperture_diameter is None) == (self.f_number is None):
+            raise ValueError("needs either aperture_diameter or f_number with focal_length")
+        if self.focal_length is None and (self.pixel_pitch_um is not None or self.f_number is not None):
+            raise ValueError(
+                f"focal_length is missing; {'pixel_pitch_um' if self.f_number is None else 'f_number'} needs it"
+            )
+        return self
+
+    @property
+    def pixel_tangent(self) -> float:
+        """Pixel pitch over focal length."""
+        if self.horizontal_fov_deg is not None:
+            return 2.0 * math.tan(math.radians(self.horizontal_fov_deg) / 2.0) / self.width
+        assert self.pixel_pitch_um is not None and self.focal_length is not None
+        return self.pixel_pitch_um * 1e-6 / self.focal_length
+
+    @property
+    def horizontal_fov(self) -> float:
+        """Full horizontal field of view [rad]."""
+        return 2.0 * math.atan(self.pixel_tangent * self.width / 2.0)
+
+    @property
+    def vertical_fov(self) -> float:
+        """Full vertical field of view [rad]."""
+        return 2.0 * math.atan(self.pixel_tangent * self.height / 2.0)
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the entrance aperture [m]."""
+        if self.aperture_diameter is not None:
+            return self.aperture_diameter / 2.0
+        assert self.focal_length is not None and self.f_number is not None
+        return self.focal_length / self.f_number / 2.0
+
+    @property
+    def aperture_area(self) -> float:
+        """Area of the entrance aperture [m²]."""
+        return math.pi * self.aperture_radius**2
+
+
+class Detector(Section):
+    """The SPAD array and its timing electronics."""
+
+    section: ClassVar[str] = "detector"
+    preset: str | None = Field(None, description="a named detector, see `spadwarp presets detector`")
+    pdp: float = Field(0.247, ge=0, le=1, description="photon detection probability of the active area")
+    fill_factor: float = Field(0.2, gt=0, le=1, description="active part of a pixel's area, microlenses included")
+    jitter_fwhm_ps: float = Field(200.0, ge=0, description="timing jitter, full width at half maximum [ps]")
+    irf: str = Field(
+        "gaussian",
+        description='instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file',
+    )
+    irf_tail_ps: float = Field(100.0, gt=0, description="time constant of the exponential tail [ps]")
+    dark_count_rate: float = Field(100.0, ge=0, description="median dark counts per second and pixel [1/s]")
+    dark_count_spread: float = Field(
+        0.0, ge=0, description="relative (log-normal) spread of the dark count rate over pixels"
+    )
+    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="part of the pixels that are hot")
+    hot_pixel_rate: float = Field(1e4, ge=0, description="dark count rate of a hot pixel [1/s]")
+    ambient_rate: float = Field(0.0, ge=0, description="detected background counts per second and pixel [1/s]")
+    mode: Literal["first_photon", "free_running"] = Field(
+        "first_photon", description="one count a pulse, or as many as come"
+    )
+    dead_time_ns: float = Field(0.0, ge=0, description="dead time after a count, free-running [ns]")
+    afterpulsing_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count causes another")
+    afterpulsing_time_constant_ns: float = Field(50.0, gt=0, description="decay time of afterpulsing [ns]")
+    crosstalk_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count fires a neighbour")
+    fold: bool = Field(True, description="fold time modulo the pulse period, as a detector sees it")
+    pulses: Whole = Field(20_000, ge=1, le=2**63 - 1, description="pulses in one exposure")
+    counter_depth: Whole = Field(
+        0, ge=0, le=2**31 - 1, description="largest count a histogram bin holds; 0 is unlimited"
+    )
+
+    @field_validator("irf")
+    @classmethod
+    def _known_irf(cls, value: str) -> str:
+        if value not in (names := ("gaussian", "exponentially_modified_gaussian")) and not value.lower().endswith(
+            ".csv"
+        ):
+            raise ValueError("choice", names, "the path of a .csv file")
+        return value
+
+    @property
+    def pde(self) -> float:
+        """Photon detection efficiency: PDP × fill factor."""
+        return self.pdp * self.fill_factor
+
+
+class Gate(Section):
+    """The time bins after the pulse leaves the laser."""
+
+    section: ClassVar[str] = "gate"
+    preset: str | None = Field(None, description="named electronics, see `spadwarp presets gate`")
+    start_ns: float = Field(0.0, ge=0, description="begin of the first bin [ns]")
+    bin_width_ps: float = Field(..., gt=0, description="width of a bin [ps]")
+    bins: Whole = Field(..., ge=1, le=1_000_000, description="number of bins")
+
+    @property
+    def start(self) -> float:
+        """Begin of the first bin [s]."""
+        return self.start_ns * 1e-9
+
+    @property
+    def bin_width(self) -> float:
+        """[s]."""
+        return self.bin_width_ps * 1e-12
+
+    @property
+    def stop(self) -> float:
+        """End of the last bin [s]."""
+        return self.start + self.bins * self.bin_width
+
+
+class Target(Section):
+    """One mesh: sized and scaled, then rotated, then moved."""
+
+    section: ClassVar[str] = "targets"
+    builtin: str | None = Field(None, min_length=1, description='a mesh that comes with spadwarp, such as "staircase"')
+    mesh: str | None = Field(None, description="path of a mesh file, relative to the scene file")
+    size: Size | None = Field(
+        None, description="extent of plane, box, sphere; one number, two for x and y, or three [m]"
+    )
+    subdivisions: Whole = Field(0, ge=0, le=12, description="times that every face is split into four")
+    scale: Scale = Field((1.0, 1.0, 1.0), description="factor, one or three; mesh units to metres")
+    rotation_deg: Vector = Field(
+        (0.0, 0.0, 0.0), description="turns about the target's own x, then the turned y, then z [°]"
+    )
+    translation: Vector = Field((0.0, 0.0, 0.0), description="shift in the camera frame [m]")
+    reflectance: float = Field(0.5, ge=0, le=1, description="Lambertian reflectance of both sides")
+
+    @model_validator(mode="after")
+    def _one_mesh(self) -> Self:
+        if (self.builtin is None) == (self.mesh is None):
+            raise ValueError("needs either builtin or mesh")
+        if not all(self.scale):
+            raise ValueError(f"scale = {list(self.scale)} holds a zero")
+        if self.size is not None and self.builtin is None:
+            raise ValueError(f"size = {list(self.size)} goes with builtin only; a mesh file takes scale")
+        return self
+
+
+class Domain(Section):
+    """Where the water is. A photon that leaves it is gone; a camera or laser outside it sees nothing."""
+
+    section: ClassVar[str] = "domain"
+    shape: Literal["unbounded", "slab", "box"] = Field(
+        "unbounded", description="slab: bounded in z; box: in x, y and z"
+    )
+    lower: Corner = Field(
+        (-math.inf,) * 3, description="lower corner [m]; one number stands for all three, a slab uses z"
+    )
+    upper: Corner = Field(
+        (math.inf,) * 3, description="upper corner [m]; one number stands for all three, a slab uses z"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for axis, low, high in zip("xyz", *self.bounds, strict=True):
+            if not low < high:
+                raise ValueError(f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}")
+        return self
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner as they act [m]; infinite where the shape has no bound."""
+        free = {"unbounded": 3, "slab": 2, "box": 0}[self.shape]
+        low, high = (-math.inf,) * free + self.lower[free:], (math.inf,) * free + self.upper[free:]
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+class Transport(Section):
+    """How photons are traced."""
+
+    section: ClassVar[str] = "transport"
+    photons: Whole = Field(1_000_000, ge=1, le=10**12, description="photons to emit")
+    seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of the random numbers; one seed gives the same bits")
+    estimator: Literal["analog", "next_event", "guided"] = Field(
+        "next_event", description="what scores: the photon itself, every event, or guided flights"
+    )
+    termination: Literal["cutoff", "roulette"] = Field(
+        "cutoff", description="drop light photons (biased), or Russian roulette"
+    )
+    weight_cutoff: float = Field(2e-4, ge=0, lt=1, description="analog weight below which a photon ends; 0 is never")
+    max_collisions: Whole = Field(64, ge=1, le=2**31 - 1, description="events of one photon, surfaces included")
+    max_path: float | None = Field(None, gt=0, description="longest geometric path [m]; the gate's end if not given")
+    lateral_limit: float = Field(
+        math.inf, gt=0, allow_inf_nan=True, description="photons end where |x| or |y| reaches this [m]; inf is no limit"
+    )
+    axis_threshold: float = Field(
+        0.9998, gt=0, le=1, description="|u_z| from which the near-axis rule acts; 1 turns it off (exact)"
+    )
+
+
+class Output(Section):
+    """What a run writes into its directory."""
+
+    section: ClassVar[str] = "output"
+    result: bool = Field(True, description="everything, as HDF5")
+    exr: bool = Field(True, description="truth and depth, as EXR")
+    png: bool = Field(True, description="pictures for a first look")
+    depth_method: Literal["peak", "centroid", "matched"] = Field("centroid", description="how the depth frame is made")
+
+
+class Analytic(Section):
+    """Settings of the analytic simulator; transport does not read them."""
+
+    section: ClassVar[str] = "analytic"
+    form: Literal["radiometric", "paper"] = Field(
+        "radiometric", description="constants of the lidar equation: radiometry, or eq 7 as printed"
+    )
+    backscatter: Literal["constant", "single_scatter", "monte_carlo"] = Field(
+        "single_scatter", description="time course of the backscatter"
+    )
+    backscatter_rate: float = Field(
+        0.0, ge=0, description="constant backscatter, detections per second in the gate [1/s]"
+    )
+    backscatter_fraction: float | None = Field(
+        None, ge=0, le=1, description="part of the pixels that report backscatter (BS); from the rates if not given"
+    )
+    count_law: Literal["per_pulse", "per_frame_paper", "per_frame"] = Field(
+        "per_pulse", description="at most one count a pulse, or a frame"
+    )
+    pulses: Whole = Field(20_000, ge=1, le=2**63 - 1, description="pulses of one depth frame, for per_pulse")
+    frames: Whole = Field(1000, ge=1, le=2**63 - 1, description="detector frames of one depth frame, for per_frame")
+    exposure: float = Field(1e-5, gt=0, description="exposure of one detector frame [s]")
+
+
+class Scene(BaseModel):
+    """Everything a run depends on, checked and frozen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    medium: Medium
+    laser: Laser = Laser()
+    camera: Camera
+    detector: Detector = Detector()
+    gate: Gate
+    targets: Annotated[tuple[Target, ...], BeforeValidator(_listed)] = ()
+    domain: Domain = Domain()
+    transport: Transport = Transport()
+    output: Output = Output()
+    analytic: Analytic = Analytic()
+    _source: Path | None = PrivateAttr(None)
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Scene:
+        """A scene from tables as TOML gives them; relative paths in them start at `source`'s folder.
+
+        Raises `ConfigError` with a line for each problem.
+        """
+        return _build(dict(tables), source=source)
+
+    @property
+    def source(self) -> Path | None:
+        """The file that the scene came from."""
+        return self._source
+
+    @property
+    def path_limit(self) -> float:
+        """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
+        gate_end = SPEED_OF_LIGHT / self.medium.group_index * self.gate.stop
+        return min(self.transport.max_path or gate_end, gate_end)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Tables from which `from_dict` makes an equal scene."""
+        tables: dict[str, Any] = {}
+        for name, section in self:
+            tables[name] = [one.to_dict() for one in section] if name == "targets" else section.to_dict()
+        if not tables["targets"]:
+            del tables["targets"]
+        return tables
+
+    def to_toml(self) -> str:
+        """The full text that `load_scene` reads back to an equal scene."""
+        return _layers.toml_text(self.to_dict())
+
+    def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
+        """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
+
+        Overrides act as in `load_scene`. Raises `ConfigError`.
+        """
+        changed = self
+        for one in (overrides, sections):
+            if one:
+                changed = _build(changed.to_dict(), overrides=one, source=self.source, resolve=False)
+        return changed
+
+    def __eq__(self, other: object) -> bool:
+        """Equal in every field; where it came from does not matter."""
+        return isinstance(other, Scene) and self.__dict__ == other.__dict__
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.__dict__.values()))
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Scene:
+    """Read a scene file.
+
+    `overrides` lie over the file: `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings, None
+    for a field's default. A medium is given by two coefficients; overriding one keeps another: extinction keeps the
+    albedo, albedo the extinction, absorption the scattering, scattering the absorption; overriding two replaces both.
+    Relative paths start at the file's folder, those in overrides at the working directory.
+    Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
+    """
+    try:
+        text = Path(path).read_bytes().decode()
+        tables = tomllib.loads(text)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+    return _build(tables, overrides=overrides, source=path)
+
+
+def _build(
+    tables: dict[str, Any],
+    *,
+    overrides: Overrides | None = None,
+    source: str | os.PathLike[str] | None = None,
+    resolve: bool = True,
+) -> Scene:
+    name = None if source is None else str(source)
+    layer: dict[str, Any] = {}
+    try:
+        if source is not None and resolve:
+            tables = _with_paths(tables, Path(source).absolute().parent)
+        if overrides:
+            layer = _layers.override_layer(overrides)
+            tables = _layers.merge_scene(tables, _with_paths(layer, Path.cwd()))
+        scene = Scene.model_validate(tables)
+    except ConfigError as error:
+        raise ConfigError(error.problems, source=name) from None
+    except ValidationError as error:
+        raise ConfigError(describe(error, Scene, layer), source=name) from None
+    scene._source = None if source is None else Path(source)
+    return scene
+
+
+def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The tables with relative mesh and response paths made absolute."""
+
+    def absolute(fields: Any, name: str, ending: str = "") -> Any:
+        value = fields.get(name) if isinstance(fields, Mapping) else None
+        if isinstance(value, str) and value.lower().endswith(ending):
+            return {**fields, name: str(folder / Path(value).expanduser())}
+        return fields
+
+    changed = dict(tables)
+    targets = tables.get("targets")
+    if isinstance(targets, Mapping):
+        changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
+    elif isinstance(targets, (list, tuple)):
+        changed["targets"] = [absolute(target, "mesh") for target in targets]
+    if "detector" in tables:
+        changed["detector"] = absolute(tables["detector"], "irf", ".csv")
+    return changed
