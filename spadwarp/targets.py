@@ -1,0 +1,226 @@
+"""Targets: mesh files and built-in shapes, placed in the camera frame."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import MeshError
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from spadwarp.config import Scene, Target
+
+__all__ = ["BUILTINS", "TriangleMesh", "build_mesh", "load_target"]
+
+MAX_FACES = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """All targets of a scene as one mesh in the camera frame: +x right, +y down, +z away from the camera.
+
+    Attributes:
+        vertices: float32 `[V, 3]` [m].
+        faces: int32 `[F, 3]`, indices into `vertices`.
+        reflectance: float32 `[F]`, Lambertian reflectance of both sides, in [0, 1].
+        target: int32 `[F]`, index into `scene.targets`.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    reflectance: NDArray[np.float32]
+    target: NDArray[np.int32]
+
+    @property
+    def face_count(self) -> int:
+        """Number of triangles."""
+        return len(self.faces)
+
+    @property
+    def bounds(self) -> NDArray[np.float32]:
+        """Lowest and highest coordinates of the faces [m], `[2, 3]`."""
+        corners = self.vertices[self.faces.ravel()]
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def build_mesh(scene: Scene) -> TriangleMesh | None:
+    """The scene's targets as one mesh, or None if it has none.
+
+    Raises:
+        MeshError: A target that is missing, unreadable, empty, not finite or without area; names file and field.
+    """
+    parts: list[TriangleMesh] = []
+    vertex_count = 0
+    for index, target in enumerate(scene.targets):
+        field = f"targets[{index}]" if scene.source is None else f"{scene.source}: targets[{index}]"
+        mesh = load_target(target, field=field)
+        faces = np.asarray(mesh.faces, dtype=np.int64) + vertex_count
+        vertex_count += len(mesh.vertices)
+        if vertex_count > MAX_FACES or sum(part.face_count for part in parts) + len(faces) > MAX_FACES:
+            raise MeshError(f"{field}: the targets have more than {MAX_FACES} faces or vertices together")
+        parts.append(
+            TriangleMesh(
+                vertices=np.asarray(mesh.vertices, dtype=np.float32),
+                faces=faces.astype(np.int32),
+                reflectance=np.full(len(faces), target.reflectance, dtype=np.float32),
+                target=np.full(len(faces), index, dtype=np.int32),
+            )
+        )
+    if not parts:
+        return None
+    return TriangleMesh(
+        vertices=np.concatenate([part.vertices for part in parts]),
+        faces=np.concatenate([part.faces for part in parts]),
+        reflectance=np.concatenate([part.reflectance for part in parts]),
+        target=np.concatenate([part.target for part in parts]),
+    )
+
+
+def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
+    """One target as a mesh in the camera frame [m].
+
+    In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) turns about the
+    target's own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are
+    taken as they stand.
+
+    Faces that have no area in float32 are dropped with a warning that counts them.
+
+    Args:
+        target: What and where.
+        field: How errors and warnings name the target.
+
+    Raises:
+        MeshError: Missing or unreadable file, unknown built-in, or a mesh that is empty, not finite or has no area.
+    """
+    if target.mesh is not None:
+        name, mesh = f"{field}.mesh = {target.mesh!r}", _read_mesh(Path(target.mesh), field)
+    elif target.builtin in BUILTINS:
+        name, mesh = f"{field}.builtin = {target.builtin!r}", BUILTINS[target.builtin]()
+    else:
+        raise MeshError(f"{field}.builtin = {target.builtin!r} is not one of {', '.join(map(repr, BUILTINS))}")
+    if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
+        raise MeshError(
+            f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"
+            f" of {len(mesh.faces)}; at most {MAX_FACES} are allowed"
+        )
+    for _ in range(target.subdivisions):
+        mesh = mesh.subdivide()
+        if target.builtin == "sphere":  # new corners lie on chords
+            mesh.vertices *= 0.5 / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+
+    size = target.size or (1.0,)  # one number for all axes, two for x and y, or three
+    stretch = np.array([*size, 1.0] if len(size) == 2 else np.broadcast_to(size, 3))
+    mesh.apply_transform(_placement(stretch * target.scale, target.rotation_deg, target.translation))
+    if len(mesh.faces) == 0:
+        raise MeshError(f"{name}: the mesh has no faces")
+    corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
+    if not np.isfinite(corners).all():
+        bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
+        raise MeshError(f"{name}: {bad} of {len(mesh.faces)} faces have coordinates that are not finite")
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    solid = (normals != 0.0).any(axis=1)
+    if not solid.any():
+        raise MeshError(f"{name}: none of the {len(mesh.faces)} faces has an area")
+    if not solid.all():
+        warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
+        mesh.update_faces(solid)
+    return mesh
+
+
+def _placement(
+    scale: NDArray[np.float64], rotation_deg: Sequence[float], translation: Sequence[float]
+) -> NDArray[np.float64]:
+    """4 × 4 matrix that scales, rotates (intrinsic x, y, z) and translates column vectors."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = (about_x @ about_y @ about_z) * scale
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def _read_mesh(path: Path, field: str) -> trimesh.Trimesh:
+    """A mesh file in the file's own units and axes; several objects in it become one."""
+    import trimesh
+
+    name = f"{field}.mesh = {str(path)!r}"
+    if not path.is_file():
+        raise MeshError(f"{name}: {'is not a file' if path.exists() else 'no such file'}")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # what trimesh raises depends on the format and its parser
+        known = "STL, OBJ, PLY, OFF and GLB can be read"
+        raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise MeshError(f"{name}: the file holds no triangles")
+    return mesh
+
+
+# Built-in targets
+
+
+def _staircase() -> trimesh.Trimesh:
+    """The paper's staircase (a 4 m plate with nine bars): one closed mesh, face at z = 0, bars towards −z.
+
+    Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal bars,
+    the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half free, the
+    strip is at the middle of the plate, as in the depth maps that the paper's authors published.
+    """
+    plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
+    left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]
+    upper = [((0.0, y, -proud), (2.0, y + 0.6, 0.1)) for y, proud in ((-2.0, 0.3), (-1.3, 0.2), (-0.6, 0.1))]
+    lower = [((x, 0.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((0.03, 0.3), (0.7, 0.2), (1.37, 0.1))]
+    return _union([plate, *left, *upper, *lower])
+
+
+def _union(boxes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> trimesh.Trimesh:
+    """One closed mesh of axis-aligned boxes, each given by its lowest and its highest corner."""
+    import trimesh
+
+    mesh = trimesh.boolean.union([trimesh.creation.box(bounds=bounds) for bounds in boxes], engine="manifold")
+    mesh.vertices = np.round(mesh.vertices, 6)  # the union came back in float32
+    return mesh
+
+
+def _plane() -> trimesh.Trimesh:
+    """A square of side 1 m at z = 0 that faces −z, two triangles."""
+    import trimesh
+
+    corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
+    return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
+
+
+def _box() -> trimesh.Trimesh:
+    """A cube of side 1 m about the origin, twelve triangles."""
+    import trimesh
+
+    return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+
+
+def _sphere() -> trimesh.Trimesh:
+    """A ball of diameter 1 m about the origin: an icosahedron subdivided three times, 1280 triangles, corners on it."""
+    import trimesh
+
+    return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+
+
+BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
+    "staircase": _staircase,
+    "plane": _plane,
+    "box": _box,
+    "sphere": _sphere,
+}
+"""The built-in targets by name: functions without arguments that make a new mesh in the target's own frame [m].
+
+`size` stretches plane, box and sphere, which are 1 m large.
+"""
