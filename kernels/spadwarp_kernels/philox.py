@@ -22,6 +22,17 @@ STREAM_DETECTOR = wp.constant(wp.uint32(5))
 STREAM_ANALYTIC = wp.constant(wp.uint32(6))
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(word));
+#endif
+    return word;
+""")
+def _opaque(word: wp.uint32) -> wp.uint32:
+    """The word itself, out of the compiler's sight: else it keeps all ten round keys in registers across a kernel's loops."""
+    ...
+
+
 @wp.func
 def philox4x32(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: wp.uint32, k1: wp.uint32) -> wp.vec4ui:
     """Philox4x32 with ten rounds: four 32-bit words from a 128-bit counter and a 64-bit key."""
@@ -29,8 +40,8 @@ def philox4x32(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: w
     b = c1
     c = c2
     d = c3
-    x = k0
-    y = k1
+    x = _opaque(k0)
+    y = _opaque(k1)
     for _ in range(10):
         p0 = _M0 * wp.uint64(a)
         p1 = _M1 * wp.uint64(c)

@@ -134,6 +134,50 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
     return (component * camera.width * camera.height + pixel) * gate.bins + k
 
 
+@wp.struct
+class _Walk:
+    """State of a thread between the stages.
+
+    A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the values of
+    both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
+    """
+
+    stage: int
+    # The photon:
+    photon: int
+    x: wp.vec3
+    u: wp.vec3
+    weight: float
+    analog_weight: float
+    ledger_weight: wp.int64
+    path: float
+    collisions: int
+    surface_count: int
+    reason: int  # ledger entry of the history's end
+    # Its next event:
+    block: wp.vec4ui
+    distance: float  # to the end of the flight
+    face: int  # hit there; -1 in the water
+    normal: wp.vec3
+    albedo: float
+    # The ray to trace, and the contribution that waits for it:
+    ray: int
+    reach: float
+    interval: wp.vec2  # of the flight that the camera sees
+    along: float  # point of the flight that is scored; 0 is x
+    lens: wp.vec3
+    dither: float
+    pending_index: int
+    pending_value: float
+    # What the thread has to tell:
+    absorbed_water: wp.int64
+    absorbed_surface: wp.int64
+    directed: wp.int64
+    surface_queries: int
+    shadow_queries: int
+    contributions: int
+
+
 @functools.cache
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: `thread_count` threads, photon i is walked by thread i mod thread_count.
@@ -176,324 +220,300 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         out: Records,
     ):
         thread = wp.tid()
-        stage = int(_EMIT)
+        s = _Walk()
+        s.stage = _EMIT
+        s.photon = thread
+        s.albedo = medium.albedo
 
-        # State of the photon:
-        photon = int(thread)
-        x = wp.vec3(0.0)
-        u = wp.vec3(0.0)
-        weight = float(0.0)
-        analog_weight = float(0.0)
-        ledger_weight = wp.int64(0)
-        path = float(0.0)
-        collisions = int(0)
-        surface_count = int(0)
-        reason = int(0)  # ledger entry of the history's end
-        # Its next event:
-        block = wp.vec4ui()
-        distance = float(0.0)  # to the end of the flight
-        face = int(-1)  # hit there; -1 in the water
-        normal = wp.vec3(0.0)
-        albedo = float(medium.albedo)
-        # The ray to trace, and the contribution that waits for it:
-        ray = int(_NO_RAY)
-        reach = float(0.0)
-        interval = wp.vec2(0.0)  # of the flight that the camera sees
-        along = float(0.0)  # point of the flight that is scored; 0 is x
-        lens = LensSample()
-        pending_index = int(0)
-        pending_value = float(0.0)
-        # What the thread has to tell:
-        absorbed_water = wp.int64(0)
-        absorbed_surface = wp.int64(0)
-        directed = wp.int64(0)
-        surface_queries = int(0)
-        shadow_queries = int(0)
-        contributions = int(0)
-
-        while count_lanes(stage == _DONE) < 32:
+        while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp have a ray to trace
             waiting = int(0)
             while waiting < wp.static(waiting_lanes):
-                if stage == _EMIT:
-                    if photon >= photon_count:
-                        stage = _DONE
+                if s.stage == _EMIT:
+                    if s.photon >= photon_count:
+                        s.stage = _DONE
                     else:
-                        x, u = emit_photon(laser, seed, first_id + wp.uint64(photon))
-                        weight = 1.0
-                        analog_weight = 1.0
-                        ledger_weight = to_ledger(1.0)
-                        path = 0.0
-                        collisions = 0
-                        surface_count = 0
-                        stage = _FLIGHT
+                        start, heading = emit_photon(laser, seed, first_id + wp.uint64(s.photon))
+                        s.x = start
+                        s.u = heading
+                        s.weight = 1.0
+                        s.analog_weight = 1.0
+                        s.ledger_weight = to_ledger(1.0)
+                        s.path = 0.0
+                        s.collisions = 0
+                        s.surface_count = 0
+                        s.stage = _FLIGHT
 
-                if stage == _FLIGHT:
-                    id = first_id + wp.uint64(photon)
-                    block = random_block(seed, id, wp.uint32(collisions + 1), STREAM_TRANSPORT)
-                    face = -1
-                    distance = free_path(u01(block[0]), medium.extinction)
-                    limit = limits.max_path - path
+                if s.stage == _FLIGHT:
+                    id = first_id + wp.uint64(s.photon)
+                    s.block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
+                    s.face = -1
+                    s.distance = free_path(u01(s.block[0]), medium.extinction)
+                    limit = limits.max_path - s.path
                     if wp.static(bounded):
-                        limit = wp.min(limit, exit_distance(limits, x, u))
-                    reach = wp.min(distance, limit)
+                        limit = wp.min(limit, exit_distance(limits, s.x, s.u))
+                    s.reach = wp.min(s.distance, limit)
                     if wp.static(paper_albedo):
-                        draw = random_block(seed, id, wp.uint32(collisions + 1), STREAM_ROULETTE)
-                        albedo = medium.albedo * u01(draw[1])
-                    stage = _EVENT
+                        draw = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
+                        s.albedo = medium.albedo * u01(draw[1])
+                    s.stage = _EVENT
                     if wp.static(guided):
-                        lens = sample_lens(camera, seed, id, wp.uint32(2 * collisions + 2))
-                        interval = clip_flight(camera, gate, x, u, path, lens.point, limit)
-                        if interval[0] < interval[1] and medium.extinction > 0.0:
-                            stage = _FLIGHT_SAMPLE
-                            reach = wp.max(reach, interval[1])
+                        sample = sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 2))
+                        s.lens = sample.point
+                        s.dither = sample.dither
+                        s.interval = clip_flight(camera, gate, s.x, s.u, s.path, s.lens, limit)
+                        if s.interval[0] < s.interval[1] and medium.extinction > 0.0:
+                            s.stage = _FLIGHT_SAMPLE
+                            s.reach = wp.max(s.reach, s.interval[1])
                     if wp.static(has_mesh):
-                        if segment_meets_box(x, u, reach, surfaces.lower, surfaces.upper):
-                            ray = _SURFACE_RAY
+                        if segment_meets_box(s.x, s.u, s.reach, surfaces.lower, surfaces.upper):
+                            s.ray = _SURFACE_RAY
 
                 if wp.static(guided):
-                    if stage == _FLIGHT_SAMPLE and ray == _NO_RAY:
-                        stage = _EVENT
-                        if interval[0] < interval[1]:
+                    if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
+                        s.stage = _EVENT
+                        if s.interval[0] < s.interval[1]:
                             flight_block = random_block(
-                                seed, first_id + wp.uint64(photon), wp.uint32(collisions + 1), STREAM_FLIGHT_SAMPLE
+                                seed, first_id + wp.uint64(s.photon), wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE
                             )
                             g = medium.anisotropy
-                            sample = sample_flight(
-                                x - lens.point,
-                                u,
-                                interval,
+                            flight = sample_flight(
+                                s.x - s.lens,
+                                s.u,
+                                s.interval,
                                 medium.extinction,
                                 (1.0 - g) * (1.0 - g) / wp.max(g, 0.05),
                                 u01(flight_block[0]),
                                 u01_fine(flight_block[1]),
                             )
-                            along = sample.s
-                            y = x + along * u
+                            s.along = flight.s
+                            y = s.x + s.along * s.u
                             pixel = project(camera, y)
-                            if pixel >= 0 and sample.density > 0.0:
-                                to_lens = (lens.point - y) / sample.r
-                                t = one_minus_cosine(snap_direction(u, medium.axis_threshold), to_lens)
-                                weight_there = weight * albedo * medium.extinction * wp.exp(-medium.extinction * along)
-                                pending_value = (
+                            if pixel >= 0 and flight.density > 0.0:
+                                to_lens = (s.lens - y) / flight.r
+                                t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
+                                weight_there = s.weight * s.albedo * medium.extinction * wp.exp(-medium.extinction * s.along)
+                                s.pending_value = (
                                     next_event_value(
-                                        camera, medium.extinction, weight_there, phase_pdf(t, medium), to_lens, sample.r
+                                        camera, medium.extinction, weight_there, phase_pdf(t, medium), to_lens, flight.r
                                     )
-                                    / sample.density
+                                    / flight.density
                                 )
-                                component = wp.where(surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                                pending_index = tally_index(camera, gate, pixel, path + along + sample.r, component)
-                                contributions += 1
-                                ray = _SHADOW_RAY
+                                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                                s.pending_index = tally_index(camera, gate, pixel, s.path + s.along + flight.r, component)
+                                s.contributions += 1
+                                s.ray = _SHADOW_RAY
 
-                if stage == _EVENT and ray == _NO_RAY:
-                    reason = -1
-                    limit = limits.max_path - path
+                if s.stage == _EVENT and s.ray == _NO_RAY:
+                    s.reason = -1
+                    limit = limits.max_path - s.path
                     if wp.static(analog):
                         # Does the flight pass through the aperture, before anything else happens to it?
-                        if u[2] < 0.0 and collisions > 0:
-                            crossing = -x[2] / u[2]
-                            on_lens = x + crossing * u
-                            pixel = project(camera, x)
+                        if s.u[2] < 0.0 and s.collisions > 0:
+                            crossing = -s.x[2] / s.u[2]
+                            on_lens = s.x + crossing * s.u
+                            pixel = project(camera, s.x)
                             radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
                             inside = radius2 <= camera.aperture_radius * camera.aperture_radius
-                            if pixel >= 0 and inside and crossing <= wp.min(distance, limit):
-                                component = wp.where(surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                                if surface_count == 1 and collisions == 1:
+                            if pixel >= 0 and inside and crossing <= wp.min(s.distance, limit):
+                                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                                if s.surface_count == 1 and s.collisions == 1:
                                     component = BALLISTIC
-                                id = first_id + wp.uint64(photon)
-                                contributions += 1
+                                id = first_id + wp.uint64(s.photon)
+                                s.contributions += 1
                                 deposit(
                                     tally,
                                     ledger,
                                     thread,
-                                    tally_index(camera, gate, pixel, path + crossing, component),
-                                    weight,
+                                    tally_index(camera, gate, pixel, s.path + crossing, component),
+                                    s.weight,
                                     scale,
-                                    sample_lens(camera, seed, id, wp.uint32(2 * collisions + 1)).dither,
+                                    sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 1)).dither,
                                 )
-                    if distance > limit:
-                        reason = MAX_PATH
+                    if s.distance > limit:
+                        s.reason = MAX_PATH
                     if wp.static(bounded):
-                        out_distance = exit_distance(limits, x, u)
-                        if out_distance < distance and out_distance <= limit:
-                            reason = exit_face(limits, x, u)
+                        out_distance = exit_distance(limits, s.x, s.u)
+                        if out_distance < s.distance and out_distance <= limit:
+                            s.reason = exit_face(limits, s.x, s.u)
                         limit = wp.min(limit, out_distance)
-                    if reason >= 0:
-                        x = x + limit * u
-                        path += limit
-                        stage = _END
+                    if s.reason >= 0:
+                        s.x = s.x + limit * s.u
+                        s.path += limit
+                        s.stage = _END
                     else:
-                        x = x + distance * u
-                        path += distance
-                        collisions += 1
-                        stage = _SCATTER
+                        s.x = s.x + s.distance * s.u
+                        s.path += s.distance
+                        s.collisions += 1
+                        s.stage = _SCATTER
                         if wp.static(has_mesh):
-                            if face >= 0:
-                                x = offset_from_surface(x, normal, distance)
+                            if s.face >= 0:
+                                s.x = offset_from_surface(s.x, s.normal, s.distance)
                         if wp.static(next_event or guided):
-                            # Water collisions are scored here by next_event alone: guided has scored the flight.
-                            if wp.static(next_event) or face >= 0:
-                                pixel = project(camera, x)
+                            # Water s.collisions are scored here by next_event alone: guided has scored the flight.
+                            if wp.static(next_event) or s.face >= 0:
+                                pixel = project(camera, s.x)
                                 if pixel >= 0:
-                                    id = first_id + wp.uint64(photon)
-                                    lens = sample_lens(camera, seed, id, wp.uint32(2 * collisions + 1))
-                                    to_lens = lens.point - x
+                                    id = first_id + wp.uint64(s.photon)
+                                    sample = sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 1))
+                                    s.lens = sample.point
+                                    s.dither = sample.dither
+                                    to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
                                     scattering = float(0.0)
                                     component = int(FORWARD_SCATTERED)
-                                    if face >= 0:
-                                        cos_out = wp.max(wp.dot(to_lens, normal), 0.0)
-                                        scattering = lambert_brdf(surfaces.reflectance[face]) * cos_out
-                                        if collisions == 1:
+                                    if s.face >= 0:
+                                        cos_out = wp.max(wp.dot(to_lens, s.normal), 0.0)
+                                        scattering = lambert_brdf(surfaces.reflectance[s.face]) * cos_out
+                                        if s.collisions == 1:
                                             component = BALLISTIC
                                     else:
-                                        snapped = snap_direction(u, medium.axis_threshold)
-                                        scattering = albedo * phase_pdf(one_minus_cosine(snapped, to_lens), medium)
-                                        if surface_count == 0:
+                                        snapped = snap_direction(s.u, medium.axis_threshold)
+                                        scattering = s.albedo * phase_pdf(one_minus_cosine(snapped, to_lens), medium)
+                                        if s.surface_count == 0:
                                             component = BACKSCATTER
                                     if scattering > 0.0:
-                                        along = 0.0
-                                        pending_value = next_event_value(
-                                            camera, medium.extinction, weight, scattering, to_lens, r
+                                        s.along = 0.0
+                                        s.pending_value = next_event_value(
+                                            camera, medium.extinction, s.weight, scattering, to_lens, r
                                         )
-                                        pending_index = tally_index(camera, gate, pixel, path + r, component)
-                                        contributions += 1
-                                        ray = _SHADOW_RAY
+                                        s.pending_index = tally_index(camera, gate, pixel, s.path + r, component)
+                                        s.contributions += 1
+                                        s.ray = _SHADOW_RAY
 
                 if wp.static(next_event or guided):
-                    if ray == _SHADOW_RAY:
+                    if s.ray == _SHADOW_RAY:
                         needed = False
                         if wp.static(has_mesh):
-                            origin = x + along * u
+                            origin = s.x + s.along * s.u
                             needed = segment_meets_box(
-                                origin, lens.point - origin, 1.0, surfaces.lower, surfaces.upper
+                                origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper
                             )
                         if not needed:
-                            deposit(tally, ledger, thread, pending_index, pending_value, scale, lens.dither)
-                            ray = _NO_RAY
+                            deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
+                            s.ray = _NO_RAY
 
-                if stage == _SCATTER and ray == _NO_RAY:
+                if s.stage == _SCATTER and s.ray == _NO_RAY:
                     # The score took the photon as it arrived; now its weight, its end or its new direction.
-                    survival = float(albedo)
+                    survival = float(s.albedo)
                     if wp.static(has_mesh):
-                        if face >= 0:
-                            survival = surfaces.reflectance[face]
-                    weight *= survival
-                    analog_weight *= survival
-                    after = to_ledger(weight)
-                    if face >= 0:
-                        absorbed_surface += ledger_weight - after
-                        surface_count += 1
+                        if s.face >= 0:
+                            survival = surfaces.reflectance[s.face]
+                    s.weight *= survival
+                    s.analog_weight *= survival
+                    after = to_ledger(s.weight)
+                    if s.face >= 0:
+                        s.absorbed_surface += s.ledger_weight - after
+                        s.surface_count += 1
                     else:
-                        absorbed_water += ledger_weight - after
-                    ledger_weight = after
+                        s.absorbed_water += s.ledger_weight - after
+                    s.ledger_weight = after
 
-                    reason = -1
-                    if analog_weight < limits.weight_cutoff or analog_weight <= 0.0:
-                        reason = WEIGHT_CUTOFF
+                    s.reason = -1
+                    if s.analog_weight < limits.weight_cutoff or s.analog_weight <= 0.0:
+                        s.reason = WEIGHT_CUTOFF
                         if wp.static(roulette):
-                            id = first_id + wp.uint64(photon)
-                            chance = u01(random_block(seed, id, wp.uint32(collisions), STREAM_ROULETTE)[0])
-                            reason = ROULETTE
-                            if chance < 0.1 and analog_weight > 0.0:
-                                reason = -1
-                                weight *= 10.0
-                                analog_weight *= 10.0
-                                after = to_ledger(weight)
-                                add_to_ledger(ledger, thread, ROULETTE, ledger_weight - after)
-                                ledger_weight = after
-                    if reason < 0 and collisions >= limits.max_collisions:
-                        reason = MAX_COLLISIONS
+                            id = first_id + wp.uint64(s.photon)
+                            chance = u01(random_block(seed, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
+                            s.reason = ROULETTE
+                            if chance < 0.1 and s.analog_weight > 0.0:
+                                s.reason = -1
+                                s.weight *= 10.0
+                                s.analog_weight *= 10.0
+                                after = to_ledger(s.weight)
+                                add_to_ledger(ledger, thread, ROULETTE, s.ledger_weight - after)
+                                s.ledger_weight = after
+                    if s.reason < 0 and s.collisions >= limits.max_collisions:
+                        s.reason = MAX_COLLISIONS
 
-                    stage = _END
-                    if reason < 0:
-                        stage = _FLIGHT
+                    s.stage = _END
+                    if s.reason < 0:
+                        s.stage = _FLIGHT
                         on_surface = False
                         if wp.static(has_mesh):
-                            on_surface = face >= 0
-                        snapped = snap_direction(u, medium.axis_threshold)
+                            on_surface = s.face >= 0
+                        snapped = snap_direction(s.u, medium.axis_threshold)
                         if wp.static(guided):
                             # Towards the lens with some probability; the weight makes up for it.
-                            v = -wp.normalize(x)
+                            v = -wp.normalize(s.x)
                             chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
-                            axis = wp.where(u01(block[3]) < chance, v, snapped)
-                            if u01(block[3]) >= chance and on_surface:
-                                u = sample_lambert(normal, u01(block[1]), u01(block[2]))
+                            axis = wp.where(u01(s.block[3]) < chance, v, snapped)
+                            if u01(s.block[3]) >= chance and on_surface:
+                                s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
-                                t = phase_sample(u01_fine(block[1]), medium)
-                                if u01(block[3]) < chance:
-                                    t = sample_henyey_greenstein(u01_fine(block[1]), guiding.anisotropy)
-                                u = rotate_direction(axis, t, u01(block[2]))
-                            density = phase_pdf(one_minus_cosine(snapped, u), medium)
+                                t = phase_sample(u01_fine(s.block[1]), medium)
+                                if u01(s.block[3]) < chance:
+                                    t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.anisotropy)
+                                s.u = rotate_direction(axis, t, u01(s.block[2]))
+                            density = phase_pdf(one_minus_cosine(snapped, s.u), medium)
                             if on_surface:
-                                density = wp.max(wp.dot(u, normal), 0.0) * 0.3183098861837907
-                            lobe = henyey_greenstein_pdf(one_minus_cosine(v, u), guiding.anisotropy)
-                            weight *= density / wp.max((1.0 - chance) * density + chance * lobe, 1.0e-30)
-                            after = to_ledger(weight)
-                            directed += ledger_weight - after
-                            ledger_weight = after
-                            if weight <= 0.0:
-                                reason = DIRECTED
-                                stage = _END
+                                density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
+                            lobe = henyey_greenstein_pdf(one_minus_cosine(v, s.u), guiding.anisotropy)
+                            s.weight *= density / wp.max((1.0 - chance) * density + chance * lobe, 1.0e-30)
+                            after = to_ledger(s.weight)
+                            s.directed += s.ledger_weight - after
+                            s.ledger_weight = after
+                            if s.weight <= 0.0:
+                                s.reason = DIRECTED
+                                s.stage = _END
                         else:
                             if on_surface:
-                                u = sample_lambert(normal, u01(block[1]), u01(block[2]))
+                                s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
-                                u = rotate_direction(snapped, phase_sample(u01_fine(block[1]), medium), u01(block[2]))
+                                s.u = rotate_direction(snapped, phase_sample(u01_fine(s.block[1]), medium), u01(s.block[2]))
 
-                if stage == _END:
-                    add_to_ledger(ledger, thread, reason, ledger_weight)
-                    add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(collisions - surface_count))
+                if s.stage == _END:
+                    add_to_ledger(ledger, thread, s.reason, s.ledger_weight)
+                    add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.collisions - s.surface_count))
                     if wp.static(has_mesh):
-                        add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(surface_count))
+                        add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(s.surface_count))
                     if wp.static(records):
-                        out.position[photon] = x
-                        out.direction[photon] = u
-                        out.weight[photon] = weight
-                        out.path[photon] = path
-                        out.collisions[photon] = collisions
-                        out.reason[photon] = reason
-                    photon += thread_count
-                    stage = _EMIT
+                        out.position[s.photon] = s.x
+                        out.direction[s.photon] = s.u
+                        out.weight[s.photon] = s.weight
+                        out.path[s.photon] = s.path
+                        out.collisions[s.photon] = s.collisions
+                        out.reason[s.photon] = s.reason
+                    s.photon += thread_count
+                    s.stage = _EMIT
 
-                waiting = count_lanes(ray != _NO_RAY or stage == _DONE)
+                waiting = count_lanes(s.ray != _NO_RAY or s.stage == _DONE)
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_mesh):
-                if ray != _NO_RAY:
-                    origin = x
-                    to = u
-                    length = reach
+                if s.ray != _NO_RAY:
+                    origin = s.x
+                    to = s.u
+                    length = s.reach
                     if wp.static(next_event or guided):
-                        if ray == _SHADOW_RAY:
-                            origin = x + along * u
-                            to = lens.point - origin
+                        if s.ray == _SHADOW_RAY:
+                            origin = s.x + s.along * s.u
+                            to = s.lens - origin
                             length = wp.length(to)
                             to = to / length
                     hit = intersect_mesh(surfaces.mesh, origin, to, length)
-                    if ray == _SURFACE_RAY:
-                        surface_queries += 1
+                    if s.ray == _SURFACE_RAY:
+                        s.surface_queries += 1
                         if hit.face >= 0:
                             if wp.static(guided):
-                                interval = wp.vec2(interval[0], wp.min(interval[1], hit.distance))
-                            if hit.distance < distance:
-                                distance = hit.distance
-                                face = hit.face
-                                normal = hit.normal
+                                s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
+                            if hit.distance < s.distance:
+                                s.distance = hit.distance
+                                s.face = hit.face
+                                s.normal = hit.normal
                     else:
-                        shadow_queries += 1
+                        s.shadow_queries += 1
                         if hit.face < 0:
-                            deposit(tally, ledger, thread, pending_index, pending_value, scale, lens.dither)
-                    ray = _NO_RAY
+                            deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
+                    s.ray = _NO_RAY
 
-        add_to_ledger(ledger, thread, ABSORBED_WATER, absorbed_water)
-        add_to_ledger(ledger, thread, ABSORBED_SURFACE, absorbed_surface)
-        add_to_ledger(ledger, thread, DIRECTED, directed)
-        add_to_ledger(ledger, thread, SURFACE_QUERIES, wp.int64(surface_queries))
-        add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(shadow_queries))
-        add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(contributions))
+        add_to_ledger(ledger, thread, ABSORBED_WATER, s.absorbed_water)
+        add_to_ledger(ledger, thread, ABSORBED_SURFACE, s.absorbed_surface)
+        add_to_ledger(ledger, thread, DIRECTED, s.directed)
+        add_to_ledger(ledger, thread, SURFACE_QUERIES, wp.int64(s.surface_queries))
+        add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(s.shadow_queries))
+        add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(s.contributions))
 
     return transport
 
