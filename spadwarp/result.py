@@ -16,6 +16,7 @@ from spadwarp.config import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from spadwarp.config import Camera, Scene
+    from spadwarp.depth import Method
 
 __all__ = ["COMPONENTS", "Component", "Result", "Truth", "pixel_directions", "range_from_path"]
 
@@ -121,7 +122,7 @@ class Result:
     @property
     def detections(self) -> NDArray[np.float64]:
         """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
-        return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detector.pde)
+        return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detector.pde)
 
     @property
     def intensity(self) -> NDArray[np.float64]:
@@ -137,18 +138,18 @@ class Result:
     def bin_edges(self) -> NDArray[np.float64]:
         """Edges of the bins in time of flight [s], `[T + 1]`; bin k covers [edge k, edge k + 1)."""
         gate = self.scene.gate
-        return gate.start + gate.bin_width * np.arange(gate.bins + 1)
+        return gate.start + gate.bin_width * np.arange(gate.bins + 1, dtype=np.float64)
 
     @property
     def bin_centres(self) -> NDArray[np.float64]:
         """Centres of the bins in time of flight [s], `[T]`."""
         gate = self.scene.gate
-        return gate.start + gate.bin_width * (np.arange(gate.bins) + 0.5)
+        return gate.start + gate.bin_width * (np.arange(gate.bins, dtype=np.float64) + 0.5)
 
     @property
     def path_edges(self) -> NDArray[np.float64]:
         """Edges of the bins in geometric path, laser to target to lens [m], `[T + 1]`."""
-        return self.bin_edges * self.water_speed
+        return self.bin_edges * np.float64(self.water_speed)
 
     @property
     def water_speed(self) -> float:
@@ -158,7 +159,7 @@ class Result:
     # Depth
 
     def depth(
-        self, *, method: str = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
+        self, *, method: Method = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
     ) -> NDArray[np.float64]:
         """Depth frame [m], float64 `[H, W]`; NaN where nothing returned.
 
@@ -172,7 +173,7 @@ class Result:
         if quantity not in ("depth", "range"):
             raise ValueError(f"quantity = {quantity!r} is not 'depth' or 'range'")
         gate = self.scene.gate
-        time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)  # type: ignore[arg-type]
+        time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
         directions = pixel_directions(self.scene.camera)
         distance = range_from_path(time * self.water_speed, directions, self.scene.laser.position)
         return distance * directions[..., 2] if quantity == "depth" else distance

@@ -87,9 +87,9 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
 def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     """One target as a mesh in the camera frame [m].
 
-    In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) turns about the
-    target's own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are
-    taken as they stand.
+    In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) turns it
+    about its own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's
+    axes are taken as they stand.
 
     Faces that have no area in float32 are dropped with a warning that counts them.
 
@@ -172,9 +172,9 @@ def _read_mesh(path: Path, field: str) -> trimesh.Trimesh:
 def _staircase() -> trimesh.Trimesh:
     """The paper's staircase (a 4 m plate with nine bars): one closed mesh, face at z = 0, bars towards −z.
 
-    Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal bars,
-    the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half free, the
-    strip is at the middle of the plate, as in the depth maps that the paper's authors published.
+    Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal
+    bars, the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half
+    free, the strip is at the middle of the plate, as in the depth maps that the paper's authors published.
     """
     plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
     left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]

@@ -1,0 +1,308 @@
+"""Results in HDF5, images in EXR. Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.errors import FileError, SpadwarpError
+
+if TYPE_CHECKING:
+    from spadwarp.result import Result, Truth
+
+__all__ = [
+    "FORMAT",
+    "FORMAT_VERSION",
+    "atomic_path",
+    "load_result",
+    "load_truth_exr",
+    "read_exr",
+    "save_depth_exr",
+    "save_result",
+    "save_truth_exr",
+    "write_exr",
+]
+
+FORMAT = "spadwarp result"
+FORMAT_VERSION = 1
+
+_CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
+_RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
+_TRUTH = ("depth", "range", "normal", "reflectance")
+_READ_ME = (
+    "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
+    "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
+    "tallies: [component, height, width, bin]. "
+    "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
+    "time * 299792458 / group_index is the path in metres, laser to target to lens. "
+    "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
+    "Camera frame: +x right, +y down, +z forward."
+)
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its name when the block ends well, and is removed when it does not.
+
+    What was at `path` stays untouched until then. Raises `FileError` where the folder or the file cannot be written.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except SpadwarpError:
+        raise
+    except (OSError, RuntimeError) as error:  # h5py and OpenEXR report a full disk as either
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+# HDF5
+
+
+def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Path:
+    """Writes a result to one HDF5 file from which `load_result` makes an equal one; returns its path.
+
+    Args:
+        result: What to write.
+        path: The file; an existing one is replaced when the new one is whole.
+        compression: Level of gzip, 1 (fast) to 9.
+
+    Raises:
+        FileError: The file cannot be written.
+    """
+    import h5py
+
+    if not 1 <= compression <= 9:
+        raise ValueError(f"compression = {compression} is outside [1, 9]")
+    _, height, width, bins = result.tallies.shape
+    columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
+    rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
+    packed = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
+
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
+        )
+        file.create_dataset("tallies", data=result.tallies, chunks=(1, rows, columns, bins), **packed)
+        file.create_dataset("bin_edges", data=result.bin_edges)
+        file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
+        file.create_dataset("config", data=result.scene.to_toml())
+        for name in _RECORDS:
+            file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
+        for name in _TRUTH:
+            file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **packed)
+    return Path(path)
+
+
+def load_result(path: str | Path) -> Result:
+    """Reads what `save_result` wrote.
+
+    Raises:
+        FileError: No such file, not a spadwarp result, of a newer format version, or damaged; says which.
+    """
+    import h5py
+
+    from spadwarp.config import Scene
+    from spadwarp.result import Result, Truth
+
+    if not Path(path).is_file():
+        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
+    if not h5py.is_hdf5(path):
+        raise FileError(f"{path}: not an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise FileError(f"{path}: an HDF5 file, but not a spadwarp result (attribute format is not {FORMAT!r})")
+            version = int(file.attrs["format_version"])
+            if version > FORMAT_VERSION:
+                raise FileError(
+                    f"{path}: format version {version} is newer than {FORMAT_VERSION}, the newest that can be read here"
+                )
+            source = file.attrs.get("source")
+            return Result(
+                scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=source),
+                tallies=file["tallies"][...],
+                unit=float(file.attrs["unit"]),
+                photons=int(file.attrs["photons"]),
+                seed=int(file.attrs["seed"]),
+                ledger_unit=float(file.attrs["ledger_unit"]),
+                partial=bool(file.attrs["partial"]),
+                photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
+                truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
+                **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
+            )
+    except FileError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
+        raise FileError(f"{path}: not a whole spadwarp result: {error}") from error
+
+
+def _attributes(result: Result) -> dict[str, Any]:
+    """What a reader without spadwarp needs, in SI units."""
+    from spadwarp.result import COMPONENTS
+
+    scene = result.scene
+    medium, laser, camera, detector, gate = scene.medium, scene.laser, scene.camera, scene.detector, scene.gate
+    values = {
+        "unit": result.unit,
+        "photons": result.photons,
+        "seed": str(result.seed),
+        "ledger_unit": result.ledger_unit,
+        "partial": result.partial,
+        "components": list(COMPONENTS),
+        "gate_start": gate.start,
+        "bin_width": gate.bin_width,
+        "absorption": medium.absorption,
+        "scattering": medium.scattering,
+        "extinction": medium.extinction,
+        "albedo": medium.albedo,
+        "anisotropy": medium.anisotropy,
+        "group_index": medium.group_index,
+        "phase_index": medium.phase_index,
+        "laser_position": laser.position,
+        "laser_axis": laser.axis,
+        "laser_wavelength": laser.wavelength_nm * 1e-9,
+        "laser_pulse_energy": laser.pulse_energy,
+        "laser_repetition_rate": laser.repetition_rate,
+        "laser_photons_per_pulse": laser.photons_per_pulse,
+        "laser_pulse_fwhm": laser.pulse_fwhm_ps * 1e-12,
+        "camera_pixel_tangent": camera.pixel_tangent,
+        "camera_aperture_area": camera.aperture_area,
+        "detector_pde": detector.pde,
+        "detector_jitter_fwhm": detector.jitter_fwhm_ps * 1e-12,
+        "detector_irf": detector.irf,
+    }
+    return values if scene.source is None else {**values, "source": str(scene.source)}
+
+
+# EXR
+
+_STRUCTURE = (
+    "channels",
+    "compression",
+    "dataWindow",
+    "displayWindow",
+    "lineOrder",
+    "pixelAspectRatio",
+    "screenWindowCenter",
+    "screenWindowWidth",
+    "type",
+)
+
+
+def write_exr(
+    path: str | Path, channels: Mapping[str, ArrayLike], metadata: Mapping[str, str | int | float] | None = None
+) -> Path:
+    """Writes an EXR image, losslessly compressed; returns its path.
+
+    Args:
+        path: The file; an existing one is replaced when the new one is whole.
+        channels: Name → `[H, W]`, all of one shape; float16, float32 and uint32 as they are, float64 as float32.
+        metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
+
+    Raises:
+        ValueError: No channels, another type or shape, or a metadata name that EXR uses itself.
+        FileError: The file cannot be written.
+    """
+    import OpenEXR
+
+    pixels = {name: _exr_pixels(name, array) for name, array in channels.items()}
+    shapes = {name: array.shape for name, array in pixels.items()}
+    if len(set(shapes.values())) != 1:
+        raise ValueError(f"channels have shapes {shapes}; one shape for all, and at least one channel, is needed")
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for name, value in (metadata or {}).items():
+        if name in _STRUCTURE:
+            raise ValueError(f"metadata name {name!r} is one that EXR uses itself")
+        header[name] = str(value)
+    with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
+        file.write(str(temporary))
+    return Path(path)
+
+
+def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
+    """Pixels as OpenEXR takes them; it writes wrong ones for arrays that are not contiguous."""
+    pixels = np.asarray(array)
+    if pixels.ndim != 2 or pixels.size == 0:
+        raise ValueError(f"channel {name!r} has shape {pixels.shape}; [height, width] is needed")
+    if pixels.dtype == np.float64:
+        pixels = pixels.astype(np.float32)
+    if pixels.dtype not in (np.float16, np.float32, np.uint32):
+        raise ValueError(f"channel {name!r} is {pixels.dtype}; float16, float32, float64 or uint32 is needed")
+    return np.ascontiguousarray(pixels)
+
+
+def read_exr(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Channels (name → `[H, W]`, float16, float32 or uint32 as stored) and metadata of an EXR image's first part.
+
+    Raises:
+        FileError: No such file, not an EXR, or damaged.
+    """
+    import OpenEXR
+
+    if not Path(path).is_file():
+        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            metadata = {name: value for name, value in file.header().items() if name not in _STRUCTURE}
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise FileError(f"{path}: not an EXR image, or damaged: {error}") from error
+    return channels, metadata
+
+
+def save_truth_exr(result: Result, path: str | Path) -> Path:
+    """Truth maps as EXR: Z (planar depth [m]), range [m], N.X, N.Y, N.Z (camera frame), and reflectance in R, G and B.
+
+    NaN where nothing is hit. Raises `FileError`.
+    """
+    truth = result.truth
+    channels = {"Z": truth.depth, "range": truth.range}
+    channels |= {f"N.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
+    channels |= dict.fromkeys("RGB", truth.reflectance)
+    return write_exr(path, channels, {"content": "truth", "R G B": "reflectance", **_exr_notes(result)})
+
+
+def load_truth_exr(path: str | Path) -> Truth:
+    """Reads what `save_truth_exr` wrote. Raises `FileError`, also for an EXR without its channels."""
+    from spadwarp.result import Truth
+
+    channels, _ = read_exr(path)
+    needed = ("Z", "range", "N.X", "N.Y", "N.Z", "R")
+    if missing := [name for name in needed if name not in channels]:
+        raise FileError(f"{path}: not truth maps: no channel {', '.join(missing)} among {', '.join(channels)}")
+    depth, distance, *normal, reflectance = (channels[name].astype(np.float32) for name in needed)
+    return Truth(depth=depth, range=distance, normal=np.stack(normal, axis=-1), reflectance=reflectance)
+
+
+def save_depth_exr(result: Result, depth: ArrayLike, path: str | Path) -> Path:
+    """A depth frame of the result as EXR: Z (planar depth [m], NaN where nothing returned). Raises `FileError`."""
+    return write_exr(path, {"Z": depth}, {"content": "measured depth", **_exr_notes(result)})
+
+
+def _exr_notes(result: Result) -> dict[str, str | int | float]:
+    scene = result.scene
+    return {
+        "Z": "planar depth [m]",
+        "frame": "+x right, +y down, +z forward",
+        "pixel_tangent": scene.camera.pixel_tangent,
+        "photons": result.photons,
+        "seed": result.seed,
+        "config": scene.to_toml(),
+    }
