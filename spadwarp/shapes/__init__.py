@@ -1,8 +1,9 @@
-"""The built-in targets: watertight procedural meshes of things that are found, or that one would like to find, under water.
+"""The built-in targets: watertight procedural meshes of things that lie, or might lie, under water.
 
-Each is about 2 to 4 m large, so that it fills the view of a 20° camera at 15 m, and shows its good side to a camera that looks
-along +z. The local frame is the camera's: +x right, +y down (the top of an upright object is at −y), bounding box centred at
-the origin, metres. No randomness and no files: the same bits come out of every call.
+Each is 3.3 to 3.9 m in its larger side, so that it fills the height or most of the width that a camera of 20° sees at
+15 m, and shows its good side to a camera that looks along +z. The local frame is the camera's: +x right, +y down (the
+top of an upright object is at −y), metres, the bounding box centred at the origin. Sizes in the docstrings are width ×
+height × depth (x, y, z). No randomness and no files: the same bits come out of every call.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
         life.bust,
     )
 }
-"""Every built-in target by name: functions without arguments that build the mesh anew. Their docstrings give the size."""
+"""Every built-in target by name: functions without arguments that build the mesh anew; their docstrings give sizes."""
 
 
 def make_shape(name: str) -> trimesh.Trimesh:

@@ -1,8 +1,8 @@
 """The few solids from which the built-in targets are put together.
 
-Everything here is a `manifold3d.Manifold`: closed, oriented, free of self-intersections after a boolean, so the targets are
-watertight by construction. Shapes are modelled in a studio frame, +x right, +y up, +z towards the viewer, in metres;
-`to_trimesh` turns that into the camera frame. Angles are in degrees.
+Everything here is a `manifold3d.Manifold`: closed, oriented, and free of self-intersections after a boolean, so that
+the targets are watertight by construction. Shapes are modelled in a studio frame, +x right, +y up, +z towards the
+viewer, in metres; `to_trimesh` turns that into the camera frame. Angles are in degrees.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Point = Sequence[float] | np.ndarray
 """Three coordinates [m]."""
 
-_TO_Y = (-90.0, 0.0, 0.0)  # turns what stands along z so that it stands along y
+_FROM_Z = {"x": (0.0, 90.0, 0.0), "y": (-90.0, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}  # turns what stands along z
 
 
 def union(*parts: Manifold) -> Manifold:
@@ -32,7 +32,9 @@ def box(size: Point, at: Point = (0, 0, 0), *, rounding: float = 0.0) -> Manifol
     """Box with side lengths `size` centred at `at`, its edges and corners rounded with radius `rounding`."""
     if rounding == 0.0:
         return Manifold.cube(size, center=True).translate(at)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (np.asarray(size) / 2 - rounding)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (
+        np.asarray(size) / 2 - rounding
+    )
     return Manifold.batch_hull([ball(rounding, corner, segments=24) for corner in corners]).translate(at)
 
 
@@ -54,14 +56,14 @@ def capsule(start: Point, end: Point, radius: float, end_radius: float | None = 
     return Manifold.batch_hull([ball(radius, start, segments=24), ball(end_radius, end, segments=24)])
 
 
-def lathe(profile: Sequence[Sequence[float]] | np.ndarray, *, segments: int = 72) -> Manifold:
-    """Solid of revolution about the y axis of the closed polygon `profile`, pairs (radius, height) in either sense."""
-    return CrossSection([_counterclockwise(profile)]).revolve(segments).rotate(_TO_Y)
+def lathe(profile: Sequence[Sequence[float]] | np.ndarray, *, axis: str = "y", segments: int = 72) -> Manifold:
+    """Closed polygon `profile`, pairs (radius, height) in either sense, revolved about the x, y or z axis."""
+    return CrossSection([_counterclockwise(profile)]).revolve(segments).rotate(_FROM_Z[axis])
 
 
-def torus(radius: float, thickness: float, *, segments: int = 64) -> Manifold:
-    """Ring about the y axis: a circle of radius `thickness` carried round at `radius`."""
-    return CrossSection.circle(thickness, 20).translate((radius, 0)).revolve(segments).rotate(_TO_Y)
+def torus(radius: float, thickness: float, *, axis: str = "y", segments: int = 64) -> Manifold:
+    """Ring about the x, y or z axis: a circle of radius `thickness` carried round at `radius`."""
+    return CrossSection.circle(thickness, 20).translate((radius, 0)).revolve(segments).rotate(_FROM_Z[axis])
 
 
 def plate(outline: Sequence[Sequence[float]] | np.ndarray, thickness: float) -> Manifold:
@@ -72,7 +74,7 @@ def plate(outline: Sequence[Sequence[float]] | np.ndarray, thickness: float) -> 
 def tube(
     path: Sequence[Point] | np.ndarray, radius: float | Sequence[float] | np.ndarray, *, sides: int = 16
 ) -> Manifold:
-    """Round section carried along `path` [N, 3] without twist; `radius` is one number or one for each point; flat ends."""
+    """Round section carried along `path` [N, 3] without twist; `radius` is one number or one a point; flat ends."""
     points = np.asarray(path, dtype=float)
     radii = np.broadcast_to(np.asarray(radius, dtype=float), len(points))
     tangents = np.gradient(points, axis=0)
@@ -110,8 +112,8 @@ def implicit(
 ) -> Manifold:
     """Solid where `inside(x, y, z)` > 0, by marching tetrahedra.
 
-    The grid has spacing `step` [m] from `lower` to `upper`, six tetrahedra a cell (Kuhn's subdivision, which fits together
-    from cell to cell, so that the surface is closed); `inside` must be negative on its border.
+    The grid has spacing `step` [m] from `lower` to `upper`, six tetrahedra a cell (Kuhn's subdivision, which fits
+    together from cell to cell, so that the surface is closed). Raises ValueError if the solid reaches the border.
     """
     grid = np.meshgrid(*(np.arange(lo, hi + step, step) for lo, hi in zip(lower, upper, strict=True)), indexing="ij")
     value = inside(*grid)
@@ -135,7 +137,7 @@ def implicit(
     keys, faces = np.unique(ends[..., 0] * value.size + ends[..., 1], return_inverse=True)
     a, b = np.divmod(keys, value.size)
     t = (value[a] / (value[a] - value[b]))[:, None]
-    return _solid(points[a] * (1 - t) + points[b] * t, faces.reshape(-1, 3)).simplify(step / 12)
+    return _solid(points[a] * (1 - t) + points[b] * t, faces.reshape(-1, 3)).simplify(step / 25)
 
 
 def _tetrahedron_cases() -> dict[int, list[list[list[int]]]]:
@@ -156,6 +158,11 @@ def around(part: Manifold, count: int, *, axis: str = "y", first: float = 0.0) -
     """`count` copies of `part`, evenly turned about the x, y or z axis, the first one by `first` degrees."""
     turn = np.eye(3)["xyz".index(axis)]
     return union(*(part.rotate(turn * (first + 360 * k / count)) for k in range(count)))
+
+
+def copies(part: Manifold, points: Iterable[Point]) -> Manifold:
+    """A copy of `part` moved by each of `points`."""
+    return union(*(part.translate(point) for point in points))
 
 
 def mirrored(part: Manifold, axis: str = "x") -> Manifold:
@@ -185,26 +192,28 @@ def spline(points: Sequence[Point] | np.ndarray, steps: int = 8, *, closed: bool
     return np.concatenate(pieces if closed else [*pieces, p[-2:-1]])
 
 
-def superellipse(half_width: float, half_height: float, exponent: float = 2.0, count: int = 48) -> np.ndarray:
-    """Outline [count, 2] of |x/w|^n + |y/h|^n = 1: an ellipse for n = 2, a rounded box for larger n."""
+def superellipse(
+    half_width: float, half_height: float, exponent: float = 2.0, count: int = 48, *, at: Sequence[float] = (0, 0)
+) -> np.ndarray:
+    """Outline [count, 2] of |x/w|^n + |y/h|^n = 1 about `at`: an ellipse for n = 2, a rounded box for larger n."""
     angle = 2 * np.pi * np.arange(count) / count
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack(
-        [
-            half_width * np.sign(c) * np.abs(c) ** (2 / exponent),
-            half_height * np.sign(s) * np.abs(s) ** (2 / exponent),
-        ],
-        axis=1,
-    )
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.sign(unit) * np.abs(unit) ** (2 / exponent) * (half_width, half_height) + np.asarray(at)
+
+
+def station(x: float, bottom: float, top: float, half_width: float, exponent: float = 2.0) -> np.ndarray:
+    """Ring of points [N, 3] for `loft`: the cross-section, a superellipse, of a long body at `x`."""
+    outline = superellipse((top - bottom) / 2, half_width, exponent, 64, at=((top + bottom) / 2, 0))
+    return np.insert(outline, 0, x, axis=1)
 
 
 def smooth_union(fields: Iterable[np.ndarray], radius: float) -> np.ndarray:
     """Implicit fields (positive inside, [m]) joined with fillets of about `radius` (polynomial smooth maximum)."""
-    first, *rest = fields
+    joined, *rest = fields
     for field in rest:
-        h = np.maximum(radius - np.abs(first - field), 0.0) / radius
-        first = np.maximum(first, field) + h * h * radius / 4
-    return first
+        h = np.maximum(radius - np.abs(joined - field), 0.0) / radius
+        joined = np.maximum(joined, field) + h * h * radius / 4
+    return joined
 
 
 def to_trimesh(solid: Manifold) -> trimesh.Trimesh:
