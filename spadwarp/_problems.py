@@ -76,9 +76,12 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         siblings = _fields(model, key[:-1])
         hint = _suggest(str(key[-1]), siblings) or f"; known are {', '.join(siblings)}"
         return f"{name} is not a known {'field' if len(key) > 1 else 'section'}{hint}"
-    if kind == "missing":
+    if kind == "missing" and not isinstance(key[-1], int):
         return f"{name} is missing" + (f" ({info.description})" if info is not None and info.description else "")
     cause = problem.get("ctx", {}).get("error")
+    if kind in ("missing", "too_short", "too_long"):  # of a list
+        name = key_text(key[: max(i for i, part in enumerate(key) if isinstance(part, str)) + 1])
+        return f"{name} = {_shown(value)} has the wrong number of values"
     shown = f"{name} = {_shown(value)}" + (" (an override)" if overridden else "")
     if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
         whole_table = isinstance(value, (Mapping, BaseModel))
@@ -95,8 +98,6 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         others = [cause.args[2]] if cause is not None and len(cause.args) > 2 else []
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
         return f"{shown} is not one of {listed}{_suggest(str(value), choices)}"
-    if kind in ("too_short", "too_long"):
-        return f"{shown} has the wrong number of values"
     if kind in _KINDS:
         return f"{shown} is not {_KINDS[kind]}"
     message = problem["msg"]

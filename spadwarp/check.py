@@ -1,0 +1,419 @@
+"""What may be wrong with a scene that is valid, in numbers, before a photon is traced."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import SPEED_OF_LIGHT, Camera, Laser, Scene
+from .presets import PURE_WATER_ABSORPTION, WATER_INDICES
+
+if TYPE_CHECKING:
+    from .targets import TriangleMesh
+
+__all__ = ["CheckMessage", "check", "summary"]
+
+Points = NDArray[np.float64]
+
+_MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies that is worth a word
+_GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckMessage:
+    """One finding: `warning` if the run will not show what the scene asks for, `note` if one should know it.
+
+    `field` names the place in the scene, `values` the numbers in `text` (units as in the text).
+    """
+
+    level: Literal["warning", "note"]
+    field: str
+    text: str
+    values: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.field}: {self.text}"
+
+
+def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
+    """Everything worth knowing about a scene, warnings first.
+
+    `mesh` is the scene's mesh if the caller has it; else it is built. Occlusion is not looked at. Raises `MeshError`.
+    """
+    shape = _Shape(scene, mesh)
+    messages = [*_targets(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
+    return sorted(messages, key=lambda message: message.level != "warning")
+
+
+def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
+    """Numbers that follow from a scene; lengths in m, None where there is no target in the view and the beam.
+
+    `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected number of unscattered
+    target photons that one pixel on the beam's axis detects from a pulse; `samples_per_pixel` how many of the traced
+    photons reach a pixel's part of the target unscattered. `histogram_bytes` is one set of tallies. Raises `MeshError`.
+    """
+    shape = _Shape(scene, mesh)
+    camera, gate, laser = scene.camera, scene.gate, scene.laser
+    return {
+        "attenuation_length": scene.medium.attenuation_length,
+        "albedo": scene.medium.scattering / scene.medium.extinction,
+        "target_range": shape.target_range,
+        "target_arrival_ns": shape.arrival_ns,
+        "optical_depth": None if shape.target_range is None else scene.medium.extinction * shape.target_range[0],
+        "gate_range": (shape.range_of(gate.start), shape.range_of(gate.stop)),
+        "bin_range": shape.range_of(gate.bin_width),
+        "path_limit": scene.path_limit,
+        "unambiguous_range": shape.range_of(1.0 / laser.repetition_rate),
+        "irf_fwhm_ps": shape.irf_fwhm_ps,
+        "horizontal_fov_deg": math.degrees(camera.horizontal_fov),
+        "vertical_fov_deg": math.degrees(camera.vertical_fov),
+        "aperture_area": camera.aperture_area,
+        "photons_per_pulse": laser.photons_per_pulse,
+        "pde": scene.detector.pde,
+        "signal_per_pulse": shape.signal_per_pulse,
+        "samples_per_pixel": shape.samples_per_pixel,
+        "histogram_bytes": shape.histogram_bytes,
+    }
+
+
+class _Shape:
+    """A scene with its mesh, and what both imply."""
+
+    def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
+        if mesh is None and scene.targets:
+            from .targets import build_mesh
+
+            mesh = build_mesh(scene)
+        self.scene = scene
+        self.target = np.zeros(0, dtype=np.int32) if mesh is None else mesh.target
+        self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
+        self.view = _view_planes(scene.camera)
+        self.beam = _beam_planes(scene.laser)
+        self.lit = _inside(self.triangles, np.concatenate([self.view, self.beam]))
+        paths = np.linalg.norm(self.lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(self.lit, axis=1)
+        ranges = np.linalg.norm(self.lit, axis=1)
+        self.target_range = (float(ranges.min()), float(ranges.max())) if len(ranges) else None
+        self.target_path = (float(paths.min()), float(paths.max())) if len(paths) else None
+
+    @property
+    def arrival_ns(self) -> tuple[float, float] | None:
+        """First and last unscattered return of the target."""
+        if self.target_path is None:
+            return None
+        nanoseconds = 1e9 * self.scene.medium.group_index / SPEED_OF_LIGHT
+        return self.target_path[0] * nanoseconds, self.target_path[1] * nanoseconds
+
+    def range_of(self, time: float) -> float:
+        """Range [m] of a round trip of `time` [s], laser at the lens."""
+        return time * SPEED_OF_LIGHT / (2.0 * self.scene.medium.group_index)
+
+    @property
+    def irf_fwhm_ps(self) -> float:
+        return math.hypot(self.scene.laser.pulse_fwhm_ps, self.scene.detector.jitter_fwhm_ps)
+
+    @property
+    def histogram_bytes(self) -> int:
+        camera = self.scene.camera
+        return 3 * 8 * camera.width * camera.height * self.scene.gate.bins
+
+    def _pixel_share(self, distance: float) -> float:
+        """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
+        laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
+        if laser.profile == "uniform_cone":
+            area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
+        elif laser.profile == "gaussian":
+            area = 0.5 * math.pi * (math.tan(laser.half_angle) * distance) ** 2
+        else:
+            area = math.pi * laser.beam_radius**2
+        return min(1.0, footprint / area) if area > 0.0 else 1.0
+
+    @property
+    def samples_per_pixel(self) -> float | None:
+        if self.target_range is None:
+            return None
+        distance = self.target_range[0]
+        arriving = math.exp(-self.scene.medium.extinction * distance)
+        return self.scene.transport.photons * arriving * self._pixel_share(distance)
+
+    @property
+    def signal_per_pulse(self) -> float | None:
+        if self.target_range is None:
+            return None
+        scene, distance = self.scene, self.target_range[0]
+        reflectance = max(target.reflectance for target in scene.targets)
+        collected = reflectance / math.pi * scene.camera.aperture_area / distance**2  # Lambertian, towards the lens
+        fraction = self._pixel_share(distance) * math.exp(-2.0 * scene.medium.extinction * distance) * collected
+        return fraction * scene.laser.photons_per_pulse * scene.detector.pde
+
+
+def _targets(shape: _Shape) -> Iterator[CheckMessage]:
+    scene = shape.scene
+    if not scene.targets:
+        yield CheckMessage("note", "targets", "the scene has none: only the water scatters light back")
+    for index in range(len(scene.targets)):
+        triangles = shape.triangles[shape.target == index]
+        if len(triangles):
+            yield from _placement(shape, f"targets[{index}]", triangles)
+    (low, high), laser = scene.domain.bounds, scene.laser.position
+    for place, point in (("the lens", (0.0, 0.0, 0.0)), ("the laser", laser)):
+        if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):
+            yield CheckMessage(
+                "warning",
+                "domain",
+                f"{place} at {_vector(point)} m is outside the water, {_vector(low)} to {_vector(high)} m",
+            )
+
+
+def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMessage]:
+    """Findings about one target; a later one would only repeat an earlier one, so the first ends the search."""
+    scene = shape.scene
+    corners = triangles.reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    where = f"spans x {_span(low[0], high[0])}, y {_span(low[1], high[1])}, z {_span(low[2], high[2])} m"
+    seen = _inside(triangles, shape.view)
+    if not len(seen):
+        half = scene.camera.pixel_tangent / 2.0
+        depth = max(float(high[2]), 0.0)
+        wide, tall = half * scene.camera.width * depth, half * scene.camera.height * depth
+        text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
+        yield CheckMessage("warning", name, text, {"half_width": wide, "half_height": tall, "depth": depth})
+        return
+    lit = _inside(triangles, np.concatenate([shape.view, shape.beam]))
+    if not len(lit):
+        angles = _angles(seen, scene.laser)
+        text = (
+            f"the beam misses what the camera sees of it: {where}, that is {math.degrees(angles.min()):.3g} to "
+            f"{math.degrees(angles.max()):.3g}° off the axis, {_beam_text(scene.laser)}"
+        )
+        yield CheckMessage("warning", name, text, {"nearest_angle_deg": math.degrees(angles.min())})
+        return
+    paths = np.linalg.norm(lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(lit, axis=1)
+    nanoseconds = 1e9 * scene.medium.group_index / SPEED_OF_LIGHT
+    first, last = float(paths.min()) * nanoseconds, float(paths.max()) * nanoseconds
+    start, stop = scene.gate.start * 1e9, scene.gate.stop * 1e9
+    values = {"first_ns": first, "last_ns": last, "start_ns": start, "stop_ns": stop}
+    times = (
+        f"its light comes back from {first:.5g} to {last:.5g} ns, the gate is open from {start:.5g} to {stop:.5g} ns"
+    )
+    if first >= stop or last < start:
+        yield CheckMessage("warning", name, f"outside the gate: {times}", values)
+    elif first < start or last > stop:
+        yield CheckMessage("warning", name, f"partly outside the gate: {times}", values)
+    limit = scene.path_limit
+    if paths.max() > limit < SPEED_OF_LIGHT / scene.medium.group_index * scene.gate.stop:
+        text = f"max_path = {limit:.4g} m ends photons before they return from {name}, up to {paths.max():.4g} m"
+        yield CheckMessage("warning", "transport.max_path", text, {"max_path": limit, "path": float(paths.max())})
+    side = float(np.abs(lit[:, :2]).max())
+    if side > scene.transport.lateral_limit:
+        text = f"lateral_limit = {scene.transport.lateral_limit:.4g} m cuts {name}, which is seen out to {side:.4g} m"
+        yield CheckMessage("warning", "transport.lateral_limit", text, {"side": side})
+    bounds = np.array(scene.domain.bounds)
+    if (low < bounds[0]).any() or (high > bounds[1]).any():
+        text = f"{where}; the water reaches from {_vector(bounds[0])} to {_vector(bounds[1])} m: nothing outside is hit"
+        yield CheckMessage("warning", name, text)
+
+
+def _timing(shape: _Shape) -> Iterator[CheckMessage]:
+    scene = shape.scene
+    laser, gate, index = scene.laser, scene.gate, scene.medium.group_index
+    unambiguous, period_ns = shape.range_of(1.0 / laser.repetition_rate), 1e9 / laser.repetition_rate
+    if shape.arrival_ns is not None and shape.arrival_ns[1] > period_ns:
+        last = shape.arrival_ns[1]
+        text = (
+            f"the target returns after up to {last:.5g} ns, later than the next pulse ({period_ns:.5g} ns): the "
+            f"unambiguous range is {unambiguous:.4g} m, "
+            + ("time folds" if scene.detector.fold else "ignored, since detector.fold is false")
+        )
+        values = {"unambiguous_range": unambiguous, "last_ns": last, "period_ns": period_ns}
+        yield CheckMessage("warning" if scene.detector.fold else "note", "laser.repetition_rate", text, values)
+    if (length := (gate.stop - gate.start) * 1e9) > period_ns * (1 + 1e-9):
+        text = f"the gate of {length:.5g} ns is longer than the pulse period, {period_ns:.5g} ns: time folds within it"
+        yield CheckMessage("note", "gate.bins", text, {"gate_ns": length, "period_ns": period_ns})
+    if gate.bin_width_ps > shape.irf_fwhm_ps:
+        text = (
+            f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
+            f"{shape.irf_fwhm_ps:.4g} ps: depth is resolved to {shape.range_of(gate.bin_width):.3g} m"
+        )
+        yield CheckMessage("note", "gate.bin_width_ps", text, {"irf_fwhm_ps": shape.irf_fwhm_ps})
+    if "group_index" not in scene.medium.model_fields_set:
+        yield CheckMessage(
+            "note", "medium.group_index", f"not given: {index}, seawater at 532 nm, is used for the time of flight"
+        )
+    elif 1.32 < index < 1.35:
+        sea, distance = (
+            WATER_INDICES["seawater"][1],
+            shape.target_range[0] if shape.target_range else shape.range_of(gate.stop),
+        )
+        error = distance * (sea / index - 1.0)
+        text = (
+            f"{index} is a phase index; light pulses travel with the group index, {sea} in seawater and "
+            f"{WATER_INDICES['fresh'][1]} in fresh water at 532 nm: {error:.2f} m at {distance:.3g} m in seawater"
+        )
+        yield CheckMessage("warning", "medium.group_index", text, {"error": error, "distance": distance})
+
+
+def _water(shape: _Shape) -> Iterator[CheckMessage]:
+    medium, transport, laser = shape.scene.medium, shape.scene.transport, shape.scene.laser
+    wavelengths = list(PURE_WATER_ABSORPTION)
+    if wavelengths[0] <= laser.wavelength_nm <= wavelengths[-1]:
+        pure = float(np.interp(laser.wavelength_nm, wavelengths, list(PURE_WATER_ABSORPTION.values())))
+        if medium.absorption < 0.95 * pure:
+            text = f"absorption = {medium.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
+            yield CheckMessage("note", "medium.absorption", text, {"absorption": medium.absorption, "pure_water": pure})
+    if medium.preset is not None and abs(laser.wavelength_nm - 532.0) > 10.0:
+        text = f"the coefficients of {medium.preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
+        yield CheckMessage("note", "medium.preset", text, {"wavelength_nm": laser.wavelength_nm})
+    mean = medium.extinction * shape.scene.path_limit  # collisions along the longest path that counts
+    most = mean + 3.0 * math.sqrt(mean)
+    cutoff = _cutoff_collisions(shape.scene)
+    values = {"path_collisions": mean, "cutoff_collisions": cutoff}
+    if transport.max_collisions < min(most, cutoff):
+        text = (
+            f"max_collisions = {transport.max_collisions} ends histories that the longest path would let collide "
+            f"{mean:.3g} times on average, {most:.3g} at most"
+        )
+        yield CheckMessage("warning", "transport.max_collisions", text, values)
+    elif cutoff < min(most, transport.max_collisions):
+        text = (
+            f"weight_cutoff = {transport.weight_cutoff:g} ends histories after about {cutoff:.0f} collisions, before "
+            f"max_collisions = {transport.max_collisions} matters; the longest path allows {mean:.3g} on average "
+            f'(termination = "roulette" is without this bias)'
+        )
+        yield CheckMessage("note", "transport.weight_cutoff", text, values)
+
+
+def _cutoff_collisions(scene: Scene) -> float:
+    """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
+    transport, albedo = scene.transport, scene.medium.albedo
+    if transport.termination != "cutoff" or transport.weight_cutoff == 0.0 or albedo == 1.0:
+        return math.inf
+    if albedo == 0.0:
+        return 1.0
+    # The mean of ln ω for ω uniform in (0, 0.97) is ln 0.97 − 1.
+    step = math.log(0.97) - 1.0 if albedo == "paper" else math.log(albedo)
+    return max(1.0, math.ceil(math.log(transport.weight_cutoff) / step))
+
+
+def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
+    scene = shape.scene
+    size = shape.histogram_bytes
+    if size > _MEMORY_LIMIT:
+        text = f"one set of tallies takes {size / 2**30:.3g} GiB, and on the CPU every thread has its own"
+        yield CheckMessage("warning", "gate.bins", text, {"bytes": size})
+    if shape.target_range is None:
+        return
+    samples, signal = shape.samples_per_pixel, shape.signal_per_pulse
+    assert samples is not None and signal is not None
+    depth = scene.medium.extinction * shape.target_range[0]
+    text = (
+        f"optical depth to the nearest lit point {depth:.3g} one way ({shape.target_range[0]:.4g} m); a pixel on the "
+        f"beam's axis detects {signal:.3g} unscattered photons a pulse"
+    )
+    yield CheckMessage("note", "medium.extinction", text, {"optical_depth": depth, "signal_per_pulse": signal})
+    if signal > 0.05:
+        text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
+        yield CheckMessage("note", "laser.pulse_energy", text, {"signal_per_pulse": signal})
+    if scene.transport.estimator == "analog":
+        photons = signal * scene.transport.photons / (scene.laser.photons_per_pulse * scene.detector.pde or math.inf)
+        if photons < 10.0:
+            text = (
+                f"analog: only about {photons:.2g} of {scene.transport.photons:.3g} photons reach a pixel unscattered"
+            )
+            yield CheckMessage("warning", "transport.estimator", text, {"photons_per_pixel": photons})
+    elif samples < 10.0:
+        text = f"only about {samples:.2g} of {scene.transport.photons:.3g} photons reach what a pixel sees unscattered"
+        yield CheckMessage("warning", "transport.photons", text, {"samples_per_pixel": samples})
+
+
+# Geometry: planes are rows (n, d) with n·x + d >= 0 inside, `[P, 4]`; triangles `[F, 3, 3]` [m].
+
+
+def _view_planes(camera: Camera) -> Points:
+    tx, ty = camera.pixel_tangent * camera.width / 2.0, camera.pixel_tangent * camera.height / 2.0
+    return np.array([[1, 0, tx, 0], [-1, 0, tx, 0], [0, 1, ty, 0], [0, -1, ty, 0], [0, 0, 1, 0]], dtype=np.float64)
+
+
+def _beam_planes(laser: Laser) -> Points:
+    """24 planes around the beam, a pyramid or a prism that just holds it; none if it is wider than a half-space."""
+    axis, origin = np.array(laser.axis), np.array(laser.position)
+    if laser.profile != "collimated" and laser.half_angle_deg >= 90.0:
+        return np.zeros((0, 4))
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    b1 = np.cross(axis, helper) / np.linalg.norm(np.cross(axis, helper))
+    phi = np.arange(24) * (2.0 * math.pi / 24)
+    outward = np.cos(phi)[:, None] * b1 + np.sin(phi)[:, None] * np.cross(axis, b1)
+    slope, radius = 0.0, max(laser.beam_radius, 1e-6)
+    if laser.profile != "collimated":
+        slope = math.tan(laser.half_angle) * (_GAUSSIAN_EDGE if laser.profile == "gaussian" else 1.0)
+        radius = 0.0
+    normals = np.concatenate([slope * axis - outward, axis[None]])
+    offsets = -normals @ origin + np.append(np.full(24, radius), 0.0)
+    return np.column_stack([normals, offsets])
+
+
+def _inside(triangles: Points, planes: Points) -> Points:
+    """Points of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
+    whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
+    for plane in planes:
+        distance = triangles @ plane[:3] + plane[3]
+        whole &= (distance >= 0.0).all(axis=1)
+        outside |= (distance < 0.0).all(axis=1)
+    found = [_spread(triangles[whole])]
+    for triangle in triangles[~whole & ~outside]:
+        polygon = _clip(triangle, planes)
+        if len(polygon):
+            fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
+            found.append(_spread(fan))
+            if len(found) > 256:  # enough for every number that is told
+                break
+    return np.concatenate(found)
+
+
+def _spread(triangles: Points) -> Points:
+    """Points spread over each triangle: corners alone where there are many triangles."""
+    steps = 6 if len(triangles) < 2000 else 1
+    weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
+    return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
+
+
+def _clip(polygon: Points, planes: Points) -> Points:
+    """The part of a convex polygon inside all planes (Sutherland & Hodgman 1974), `[K, 3]`, empty if there is none."""
+    for plane in planes:
+        distance = polygon @ plane[:3] + plane[3]
+        kept: list[Points] = []
+        for i, (d, x) in enumerate(zip(distance, polygon, strict=True)):
+            before, y = distance[i - 1], polygon[i - 1]
+            if (d >= 0.0) != (before >= 0.0):
+                kept.append(y + (x - y) * (before / (before - d)))
+            if d >= 0.0:
+                kept.append(x)
+        if len(kept) < 3:
+            return np.zeros((0, 3))
+        polygon = np.array(kept)
+    return polygon
+
+
+def _angles(points: Points, laser: Laser) -> Points:
+    """Angles [rad] of the points against the beam's axis, seen from the laser."""
+    away = points - np.array(laser.position)
+    along = away @ np.array(laser.axis)
+    return np.arctan2(np.linalg.norm(away - along[:, None] * np.array(laser.axis), axis=1), along)
+
+
+def _beam_text(laser: Laser) -> str:
+    if laser.profile == "collimated":
+        return f"the beam is parallel with a radius of {laser.beam_radius:.3g} m"
+    return f"the beam's half angle is {laser.half_angle_deg:.3g}°"
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.4g} to {high:.4g}"
+
+
+def _vector(values: Any) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
