@@ -11,7 +11,7 @@ from spadwarp.shapes import solids as so
 
 
 def front_depth(mesh, cells=64):
-    """Nearest z [cells, cells] of 60 000 points on the surface, seen along +z from far away; NaN where there are none."""
+    """Nearest z [cells, cells] of 60 000 surface points, seen along +z from far away; NaN where there are none."""
     rng = np.random.default_rng(5)
     areas = mesh.area_faces
     faces = rng.choice(len(areas), 60_000, p=areas / areas.sum())
