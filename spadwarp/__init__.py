@@ -1,0 +1,53 @@
+"""spadwarp: Monte Carlo photon transport for single-photon (SPAD) imaging in scattering water, on NVIDIA Warp.
+
+    scene = spadwarp.load_scene("configs/scenes/staircase_15m.toml")
+    result = spadwarp.simulate(scene, photons=2_000_000, seed=7)
+    result.histogram, result.depth(), result.save("result.h5")
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# Loaded when first used, so that `import spadwarp` and `spadwarp --help` need neither Warp nor h5py.
+_HOMES = {
+    "load_scene": "config",
+    "Scene": "config",
+    "presets": "presets",
+    "check": "check",
+    "simulate": "simulation",
+    "trace": "simulation",
+    "PhotonRecords": "simulation",
+    "truth_maps": "model",
+    "Result": "result",
+    "Truth": "result",
+    "load_result": "files",
+    "SpadwarpError": "errors",
+    "ConfigError": "errors",
+    "DeviceError": "errors",
+    "FileError": "errors",
+    "MeshError": "errors",
+}
+
+__all__ = ["__version__", *_HOMES]
+
+if TYPE_CHECKING:
+    from spadwarp.check import check
+    from spadwarp.config import Scene, load_scene
+    from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
+    from spadwarp.files import load_result
+    from spadwarp.model import truth_maps
+    from spadwarp.presets import presets
+    from spadwarp.result import Result, Truth
+    from spadwarp.simulation import PhotonRecords, simulate, trace
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"spadwarp.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["ConfigError", "FileError", "MeshError", "SpadwarpError"]
+__all__ = ["ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"]
 
 
 class SpadwarpError(Exception):
@@ -33,3 +33,7 @@ class MeshError(SpadwarpError):
 
 class FileError(SpadwarpError):
     """A file that cannot be read or written, or that does not hold what it should."""
+
+
+class DeviceError(SpadwarpError):
+    """A device that is not there, or too small for what was asked."""

@@ -1,0 +1,103 @@
+"""Warp functions and kernels for photon transport, SPAD detection and depth; needs warp and numpy only.
+
+Functions marked `wp.func` go into the caller's own kernels; `transport` walks photons against the caller's own `wp.Mesh`.
+"""
+
+from .camera import Camera, pixel_direction, project, sample_lens
+from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
+from .domain import Limits, exit_distance
+from .gate import C0, Gate, gate_bin
+from .guided import Guiding
+from .laser import LASER_PROFILES, Laser, emit_photon
+from .medium import Medium, free_path
+from .phase import (
+    HENYEY_GREENSTEIN,
+    PhaseFunction,
+    henyey_greenstein_pdf,
+    sample_henyey_greenstein,
+)
+from .philox import philox4x32, random_block, u01, u01_fine
+from .surface import (
+    SurfaceHit,
+    intersect_mesh,
+    intersect_mesh_aimed,
+    lambert_brdf,
+    offset_from_surface,
+    segment_meets_box,
+)
+from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
+from .transport import (
+    COMPONENTS,
+    ESTIMATORS,
+    Data,
+    Model,
+    Records,
+    Surfaces,
+    TransportSpec,
+    load_transport_kernel,
+    make_data,
+    make_records,
+    make_surfaces,
+    make_transport_kernel,
+    next_event_value,
+    read_ledger,
+    transport,
+)
+from .truth import truth_kernel
+
+__all__ = [
+    "C0",
+    "COMPONENTS",
+    "COUNTERS",
+    "ESTIMATORS",
+    "HENYEY_GREENSTEIN",
+    "LASER_PROFILES",
+    "LEDGER_ENTRIES",
+    "LEDGER_UNIT",
+    "Camera",
+    "Data",
+    "Gate",
+    "Guiding",
+    "Laser",
+    "Limits",
+    "Medium",
+    "Model",
+    "PhaseFunction",
+    "Records",
+    "SurfaceHit",
+    "Surfaces",
+    "TransportSpec",
+    "emit_photon",
+    "exit_distance",
+    "free_path",
+    "gate_bin",
+    "henyey_greenstein_pdf",
+    "intersect_mesh",
+    "intersect_mesh_aimed",
+    "lambert_brdf",
+    "load_transport_kernel",
+    "make_data",
+    "make_records",
+    "make_surfaces",
+    "make_transport_kernel",
+    "next_event_value",
+    "offset_from_surface",
+    "one_minus_cosine",
+    "orthonormal_basis",
+    "philox4x32",
+    "pixel_direction",
+    "project",
+    "random_block",
+    "read_ledger",
+    "rotate_direction",
+    "sample_henyey_greenstein",
+    "sample_lambert",
+    "sample_lens",
+    "segment_meets_box",
+    "snap_direction",
+    "to_fixed_point",
+    "transport",
+    "truth_kernel",
+    "u01",
+    "u01_fine",
+]

@@ -618,6 +618,15 @@ def make_surfaces(mesh: wp.Mesh | None, reflectance: wp.array | float = 0.5, *, 
 CUDA_THREADS = 1 << 19
 
 
+_BLOCK = 128
+
+
+def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
+    """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
+    device = wp.get_device(device)
+    make_transport_kernel(spec, device.is_cuda).module.load(device, _BLOCK if device.is_cuda else 1)
+
+
 def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int) -> None:
     """Walks the photons first_id ... first_id + photon_count - 1 and adds them to `data`; asynchronous on CUDA.
 
@@ -630,8 +639,7 @@ def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    block = 128
-    threads = min(-(-photon_count // block) * block, CUDA_THREADS) if model.device.is_cuda else 1
+    threads = min(-(-photon_count // _BLOCK) * _BLOCK, CUDA_THREADS) if model.device.is_cuda else 1
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
         dim=threads,
@@ -651,7 +659,7 @@ def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first
         ],
         outputs=[data.tally, data.ledger, data.records],
         device=model.device,
-        block_dim=block,
+        block_dim=_BLOCK,
     )
 
 

@@ -1,0 +1,235 @@
+"""From a scene to what the kernels take: devices, parameter structs, the mesh's BVH, the unit of the tallies."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spadwarp.config import SPEED_OF_LIGHT, Scene
+from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.result import COMPONENTS, Truth
+
+if TYPE_CHECKING:
+    import warp as wp
+    from spadwarp_kernels import Model
+
+    from spadwarp.targets import TriangleMesh
+
+# Photons that a tally can hold: the unit is chosen so that the brightest bin stays below 2^62 after this many.
+PHOTON_CAPACITY = 2**40
+
+# The paper's albedo is uniform in (0, 0.97).
+PAPER_ALBEDO = 0.97
+
+_UNLIMITED = 1.0e30
+
+
+def pick_device(name: str | None = None) -> wp.Device:
+    """The Warp device of that name; by default the first GPU, else the CPU.
+
+    Raises:
+        DeviceError: There is no such device; names those there are.
+    """
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.init()
+    names = [device.alias for device in wp.get_devices()]
+    if name is None:
+        name = next((alias for alias in names if alias.startswith("cuda")), "cpu")
+    if name == "cuda" and "cuda:0" in names:
+        name = "cuda:0"
+    if name not in names:
+        hint = "" if len(names) > 1 else "; Warp sees no NVIDIA GPU with driver R580 or newer"
+        raise DeviceError(f"device = {name!r} is not one of {', '.join(names)}{hint}")
+    return wp.get_device(name)
+
+
+def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
+    """Tally units per emitted photon, a power of two: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62.
+
+    The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered evenly
+    in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that the beam
+    spans; times 16 for what scatters more than once.
+    """
+    camera, laser, gate, medium = scene.camera, scene.laser, scene.gate, scene.medium
+    speed = SPEED_OF_LIGHT / medium.group_index
+    pixels = camera.width * camera.height
+    half_field = 0.5 * camera.width * camera.pixel_tangent
+    if laser.profile == "collimated":
+        spread, lit = 0.0, 1.0
+    else:
+        spread = math.tan(min(laser.half_angle, 1.5))
+        lit = min(max(math.pi * (spread / camera.pixel_tangent) ** 2, 1.0), pixels)
+    baseline = math.hypot(laser.position[0], laser.position[1])
+    nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
+    water = medium.scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
+    surface = 0.0
+    if mesh is not None:
+        lower, upper = mesh.bounds.astype(float)
+        gap = float(np.linalg.norm(np.maximum(np.maximum(lower, -upper), 0.0)))
+        surface = 1.0 / (math.pi * max(gap, nearest) ** 2)
+    path = 2.0 * nearest
+    brightest = 16.0 * camera.aperture_area * max(water, surface) * math.exp(-medium.extinction * path) / lit
+    brightest = min(max(brightest, 1e-30), 1.0)
+    exponent = math.floor(62 - math.log2(PHOTON_CAPACITY) - math.log2(brightest))
+    # Beyond 2^52 an analog photon of weight 1 would not fit into one contribution.
+    return 2.0 ** min(exponent, 52)
+
+
+def build_model(scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True) -> Model:
+    """The scene on a device.
+
+    Args:
+        scene: What to simulate.
+        device: From `pick_device`.
+        mesh: From `spadwarp.targets.build_mesh`.
+        camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
+
+    Raises:
+        ConfigError: The histogram has more bins than an index can count, or the laser stands outside the domain.
+        DeviceError: The device has too little memory.
+    """
+    import spadwarp_kernels as sk
+    import warp as wp
+
+    _check_domain(scene)
+    medium = sk.Medium()
+    medium.extinction = scene.medium.extinction
+    medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
+    medium.anisotropy = scene.medium.anisotropy
+    medium.axis_threshold = scene.transport.axis_threshold
+
+    laser = sk.Laser()
+    laser.position = wp.vec3(*scene.laser.position)
+    laser.axis = wp.vec3(*scene.laser.axis)
+    laser.profile = sk.LASER_PROFILES.index(scene.laser.profile)
+    if scene.laser.profile == "gaussian":
+        laser.spread = math.tan(scene.laser.half_angle) ** 2
+    else:
+        laser.spread = 2.0 * math.sin(0.5 * scene.laser.half_angle) ** 2
+    laser.radius = scene.laser.beam_radius
+
+    lens = sk.Camera()
+    lens.width, lens.height = scene.camera.width, scene.camera.height
+    lens.pixel_tangent = scene.camera.pixel_tangent
+    lens.aperture_radius, lens.aperture_area = scene.camera.aperture_radius, scene.camera.aperture_area
+
+    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    gate = sk.Gate()
+    gate.start, gate.stop = scene.gate.start * speed, scene.gate.stop * speed
+    gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)
+    gate.bins = scene.gate.bins
+
+    limits = sk.Limits()
+    lower, upper = scene.domain.bounds
+    limits.lower = wp.vec3(*(max(value, -_UNLIMITED) for value in lower))
+    limits.upper = wp.vec3(*(min(value, _UNLIMITED) for value in upper))
+    limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
+    limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
+    limits.weight_cutoff = scene.transport.weight_cutoff
+    limits.max_collisions = scene.transport.max_collisions
+
+    guiding = sk.Guiding()
+    guiding.probability = guiding.surface_probability = 0.3
+    guiding.anisotropy = 0.97
+
+    device_mesh, surfaces = None, sk.make_surfaces(None, device=device)
+    if mesh is not None:
+        device_mesh = wp.Mesh(
+            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+            wp.array(mesh.faces.ravel(), dtype=int, device=device),
+            # The fastest to traverse of Warp's builders on CUDA; on the CPU its default.
+            bvh_constructor="cubql" if device.is_cuda else None,
+            bvh_leaf_size=1 if device.is_cuda else None,
+        )
+        reflectance = wp.array(mesh.reflectance, dtype=float, device=device)
+        surfaces = sk.make_surfaces(device_mesh, reflectance)
+    model = sk.Model(
+        device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
+    )
+    if camera:
+        _check_size(scene, model)
+    return model
+
+
+def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
+    """The compile-time choices of a scene; `choices` override them."""
+    import spadwarp_kernels as sk
+
+    spec = sk.TransportSpec(
+        estimator=scene.transport.estimator,
+        paper_albedo=scene.medium.albedo == "paper",
+        mesh=mesh is not None,
+        bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),
+        roulette=scene.transport.termination == "roulette",
+    )
+    return spec._replace(**choices)
+
+
+def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
+    """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
+    from spadwarp.targets import build_mesh
+
+    mesh = build_mesh(scene)
+    return trace_truth(scene, build_model(scene, pick_device(device), mesh, camera=False))
+
+
+def trace_truth(scene: Scene, model: Model) -> Truth:
+    """`truth_maps` for a model that is already on its device."""
+    import spadwarp_kernels as sk
+    import warp as wp
+
+    shape = (scene.camera.height, scene.camera.width)
+    if model.mesh is None:
+        nothing = np.full(shape, np.nan, np.float32)
+        return Truth(
+            depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing
+        )
+    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
+    normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
+    wp.launch(
+        sk.truth_kernel,
+        dim=shape,
+        inputs=[model.camera, model.mesh.id, model.surfaces.reflectance],
+        outputs=[depth, distance, normal, reflectance],
+        device=model.device,
+    )
+    return Truth(
+        depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy()
+    )
+
+
+def _source(scene: Scene) -> str | None:
+    return None if scene.source is None else str(scene.source)
+
+
+def _check_domain(scene: Scene) -> None:
+    for axis, place, low, high in zip("xyz", scene.laser.position, *scene.domain.bounds, strict=True):
+        if not low <= place <= high:
+            problem = f"laser.position: {axis} = {place} is outside [{low}, {high}], the domain"
+            raise ConfigError(problem, source=_source(scene))
+
+
+def _check_size(scene: Scene, model: Model) -> None:
+    """Refuses what cannot fit before anything is computed."""
+    shape = f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    if model.tally_size >= 2**31:
+        problem = f"camera and gate: {shape} = {model.tally_size} is outside [1, {2**31 - 1}]"
+        raise ConfigError(problem, source=_source(scene))
+    needed = 8 * model.tally_size
+    if model.device.is_cuda:
+        there = model.device.free_memory
+    elif hasattr(os, "sysconf"):
+        # Counts on the device, their copy in the result, and the total of the components.
+        needed *= 2
+        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    else:
+        return
+    if needed > there:
+        raise DeviceError(
+            f"{shape} need {needed / 2**30:.1f} GiB on {model.device.alias}; there are {there / 2**30:.1f} GiB"
+        )

@@ -1,0 +1,323 @@
+"""Running a scene: passes of photons over the cores of the CPU or a GPU, into a `Result` or photon records."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.config import Scene
+from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.model import build_model, pick_device, trace_truth, transport_spec
+from spadwarp.result import COMPONENTS, Result
+
+if TYPE_CHECKING:
+    from spadwarp_kernels import Data, Model
+
+# Called with ("compile", 0, 0) before kernels are compiled or loaded, then with ("trace", photons done, photons asked for).
+Progress = Callable[[str, int, int], None]
+
+# Photons in one launch: large enough to fill the device, small enough that progress is seen and Ctrl-C heard.
+CPU_PASS = 1 << 16
+CUDA_PASS = 1 << 26
+
+
+def simulate(
+    scene: Scene,
+    *,
+    photons: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    threads: int | None = None,
+    pass_size: int | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Traces photons through a scene into expected histograms per pixel.
+
+    One seed gives the same bits on one kind of device, whatever `threads` and `pass_size`.
+
+    Args:
+        scene: From `spadwarp.load_scene`.
+        photons: Emitted photons, > 0; by default `scene.transport.photons`.
+        seed: 0 ... 2^64 - 1; by default `scene.transport.seed`.
+        device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
+        threads: CPU threads; by default one a core. A GPU takes none.
+        pass_size: Photons in one launch, up to 2^26.
+        progress: Called from the caller's thread.
+
+    Returns:
+        The result. After Ctrl-C it holds the photons that were done and is marked `partial`.
+
+    Raises:
+        ConfigError, MeshError, DeviceError: The scene cannot be simulated; nothing was computed.
+        KeyboardInterrupt: Ctrl-C before the first pass was done, or a second Ctrl-C.
+    """
+    from spadwarp.targets import build_mesh
+
+    photons = scene.transport.photons if photons is None else photons
+    seed = scene.transport.seed if seed is None else seed
+    _check_range("photons", photons, 1, 10**12)
+    _check_range("seed", seed, 0, 2**64 - 1)
+    began = time.perf_counter()
+    wp_device = pick_device(device)
+    mesh = build_mesh(scene)
+    model = build_model(scene, wp_device, mesh)
+    ready = time.perf_counter()
+    run = _Run(model, transport_spec(scene, mesh), seed=seed, progress=progress)
+    compiled = time.perf_counter()
+    truth = trace_truth(scene, model)
+    traced = time.perf_counter()
+    done = run.trace(0, photons, threads=threads, pass_size=pass_size)
+    tallies = run.data.tally.numpy().reshape(len(COMPONENTS), scene.camera.height, scene.camera.width, scene.gate.bins)
+    finished = time.perf_counter()
+    if done == 0:
+        raise KeyboardInterrupt
+    if tallies.min() < 0 or tallies.max() >= 2**62:
+        raise SpadwarpError(
+            f"a histogram bin overflowed after {done} photons: the scene is brighter than the tally's unit allows for; "
+            "run fewer photons at a time and merge the results"
+        )
+    ledger, counters = run.accounts()
+    return Result(
+        scene=scene,
+        tallies=tallies,
+        unit=1.0 / model.scale,
+        photons=done,
+        seed=seed,
+        ledger=ledger,
+        ledger_unit=run.ledger_unit,
+        counters=counters,
+        truth=truth,
+        timing={
+            "setup": ready - began,
+            "compile": compiled - ready,
+            "truth": traced - compiled,
+            "trace": finished - traced,
+        },
+        provenance=provenance(wp_device),
+        partial=done < photons,
+        photon_ranges=((0, done),),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonRecords:
+    """How each photon ended.
+
+    Attributes:
+        id: uint64 `[N]`.
+        position: float32 `[N, 3]`, where it ended [m].
+        direction: float32 `[N, 3]`, unit vector of its last flight.
+        weight: float32 `[N]`, what was left of it.
+        path: float32 `[N]`, geometric path [m].
+        collisions: int32 `[N]`, events, surfaces included.
+        reason: int32 `[N]`, index into `reasons`.
+        reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
+        ledger: As in `Result`, with its unit.
+    """
+
+    id: NDArray[np.uint64]
+    position: NDArray[np.float32]
+    direction: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    path: NDArray[np.float32]
+    collisions: NDArray[np.int32]
+    reason: NDArray[np.int32]
+    reasons: tuple[str, ...]
+    ledger: dict[str, int]
+    ledger_unit: float
+
+    def ended(self, *names: str) -> NDArray[np.bool_]:
+        """Mask of the photons that ended for one of the named reasons."""
+        return np.isin(self.reason, [self.reasons.index(name) for name in names])
+
+
+def trace(
+    scene: Scene,
+    *,
+    photons: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> PhotonRecords:
+    """Walks photons without a camera and returns the terminal state of each.
+
+    Path is limited by `transport.max_path` alone; the gate plays no part. A photon takes 44 bytes.
+
+    Args and raises: as `simulate`.
+    """
+    import spadwarp_kernels as sk
+
+    from spadwarp.targets import build_mesh
+
+    photons = scene.transport.photons if photons is None else photons
+    seed = scene.transport.seed if seed is None else seed
+    _check_range("photons", photons, 1, 2**31 - 1)
+    _check_range("seed", seed, 0, 2**64 - 1)
+    mesh = build_mesh(scene)
+    model = build_model(scene, pick_device(device), mesh, camera=False)
+    spec = transport_spec(scene, mesh, estimator="none", records=True)
+    run = _Run(model, spec, seed=seed, progress=progress)
+    size = CUDA_PASS if model.device.is_cuda else CPU_PASS
+    parts: list[dict[str, NDArray[Any]]] = []
+    for first in range(0, photons, size):
+        count = min(size, photons - first)
+        run.data.records = sk.make_records(count, device=model.device)
+        run.launch(first, count)
+        names = ("position", "direction", "weight", "path", "collisions", "reason")
+        parts.append({name: getattr(run.data.records, name).numpy() for name in names})
+        run.report(first + count, photons)
+    ledger, _ = run.accounts()
+    return PhotonRecords(
+        id=np.arange(photons, dtype=np.uint64),
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        reasons=sk.LEDGER_ENTRIES,
+        ledger=ledger,
+        ledger_unit=run.ledger_unit,
+    )
+
+
+class _Run:
+    """One model, its tallies, and the passes over photon ids."""
+
+    def __init__(self, model: Model, spec: Any, *, seed: int, progress: Progress | None) -> None:
+        import spadwarp_kernels as sk
+
+        self.model, self.spec, self.seed, self.progress = model, spec, seed, progress
+        self.ledger_unit = sk.LEDGER_UNIT
+        self.data: Data = sk.make_data(model)
+        if progress is not None:
+            progress("compile", 0, 0)
+        # Compiles, or loads from Warp's cache, before the clock of the passes starts.
+        sk.load_transport_kernel(spec, model.device)
+
+    def launch(self, first: int, count: int) -> None:
+        """One pass; back when its photons are done."""
+        import spadwarp_kernels as sk
+        import warp as wp
+
+        sk.transport(self.spec, self.model, self.data, seed=self.seed, first_id=first, photon_count=count)
+        wp.synchronize_device(self.model.device)
+
+    def report(self, done: int, total: int) -> None:
+        if self.progress is not None:
+            self.progress("trace", done, total)
+
+    def accounts(self) -> tuple[dict[str, int], dict[str, int]]:
+        import spadwarp_kernels as sk
+
+        return sk.read_ledger(self.data)
+
+    def trace(self, start: int, stop: int, *, threads: int | None = None, pass_size: int | None = None) -> int:
+        """Walks the photons start ... stop - 1; returns how many were done before an interrupt, always a prefix."""
+        cuda = self.model.device.is_cuda
+        size = pass_size or (CUDA_PASS if cuda else CPU_PASS)
+        _check_range("pass_size", size, 1, CUDA_PASS)
+        workers = 1 if cuda else min(threads or _core_count(), -(-(stop - start) // size))
+        _check_range("threads", workers, 1, 4096)
+        with _interruptible() as interrupted:
+            if workers == 1:
+                done = start
+                while done < stop and not interrupted.is_set():
+                    count = min(size, stop - done)
+                    self.launch(done, count)
+                    done += count
+                    self.report(done - start, stop - start)
+                return done - start
+            return self._trace_in_threads(start, stop, size, workers, interrupted)
+
+    def _trace_in_threads(self, start: int, stop: int, size: int, workers: int, interrupted: threading.Event) -> int:
+        """CPU passes on several threads; all add to one tally, with atomics of their own."""
+        queue = iter(range(start, stop, size))
+        lock = threading.Condition()
+        finished = 0
+        errors: list[BaseException] = []
+
+        def work() -> None:
+            nonlocal finished
+            while not interrupted.is_set():
+                with lock:
+                    first = next(queue, None)
+                if first is None:
+                    return
+                try:
+                    self.launch(first, min(size, stop - first))
+                except BaseException as error:
+                    errors.append(error)
+                    interrupted.set()
+                    return
+                with lock:
+                    finished += min(size, stop - first)
+                    lock.notify()
+
+        pool = [threading.Thread(target=work, daemon=True) for _ in range(workers)]
+        for thread in pool:
+            thread.start()
+        while any(thread.is_alive() for thread in pool):
+            with lock:
+                lock.wait(timeout=0.1)
+                done = finished
+            self.report(done, stop - start)
+        if errors:
+            raise errors[0]
+        self.report(finished, stop - start)
+        # Every pass that was begun was finished, and they are begun in order: what was done is a prefix.
+        return finished
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; a second one raises KeyboardInterrupt. Signals reach the main thread only."""
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def handle(number: int, frame: object) -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        interrupted.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def provenance(device: Any) -> dict[str, Any]:
+    """What made a result: versions, device, machine, date."""
+    import warp as wp
+
+    import spadwarp
+
+    return {
+        "spadwarp": spadwarp.__version__,
+        "warp": wp.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "device": device.alias,
+        "device_name": device.name if device.is_cuda else platform.processor() or platform.machine(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _core_count() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _check_range(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise ConfigError(f"{name} = {value} is outside [{low}, {high}]")
