@@ -1,8 +1,8 @@
 """spadwarp: Monte Carlo photon transport for single-photon (SPAD) imaging in scattering water, on NVIDIA Warp.
 
-    scene = spadwarp.load_scene("configs/scenes/staircase_15m.toml")
-    result = spadwarp.simulate(scene, photons=2_000_000, seed=7)
-    result.histogram, result.depth(), result.save("result.h5")
+scene = spadwarp.load_scene("configs/scenes/staircase_15m.toml")
+result = spadwarp.simulate(scene, photons=2_000_000, seed=7)
+result.histogram, result.depth(), result.save("result.h5")
 """
 
 from importlib import import_module

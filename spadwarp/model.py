@@ -14,9 +14,9 @@ from spadwarp.result import COMPONENTS, Truth
 
 if TYPE_CHECKING:
     import warp as wp
-    from spadwarp_kernels import Model
 
     from spadwarp.targets import TriangleMesh
+    from spadwarp_kernels import Model
 
 # Photons that a tally can hold: the unit is chosen so that the brightest bin stays below 2^62 after this many.
 PHOTON_CAPACITY = 2**40
@@ -51,8 +51,10 @@ def pick_device(name: str | None = None) -> wp.Device:
 def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     """Tally units per emitted photon, a power of two: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62.
 
-    The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered evenly
-    in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that the beam
+    The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered
+    evenly
+    in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that the
+    beam
     spans; times 16 for what scatters more than once.
     """
     camera, laser, gate, medium = scene.camera, scene.laser, scene.gate, scene.medium
@@ -93,8 +95,9 @@ def build_model(scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, c
         ConfigError: The histogram has more bins than an index can count, or the laser stands outside the domain.
         DeviceError: The device has too little memory.
     """
-    import spadwarp_kernels as sk
     import warp as wp
+
+    import spadwarp_kernels as sk
 
     _check_domain(scene)
     medium = sk.Medium()
@@ -180,15 +183,14 @@ def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    import spadwarp_kernels as sk
     import warp as wp
+
+    import spadwarp_kernels as sk
 
     shape = (scene.camera.height, scene.camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
-        return Truth(
-            depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing
-        )
+        return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
     wp.launch(
@@ -198,9 +200,7 @@ def trace_truth(scene: Scene, model: Model) -> Truth:
         outputs=[depth, distance, normal, reflectance],
         device=model.device,
     )
-    return Truth(
-        depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy()
-    )
+    return Truth(depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy())
 
 
 def _source(scene: Scene) -> str | None:
@@ -216,7 +216,9 @@ def _check_domain(scene: Scene) -> None:
 
 def _check_size(scene: Scene, model: Model) -> None:
     """Refuses what cannot fit before anything is computed."""
-    shape = f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    shape = (
+        f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    )
     if model.tally_size >= 2**31:
         problem = f"camera and gate: {shape} = {model.tally_size} is outside [1, {2**31 - 1}]"
         raise ConfigError(problem, source=_source(scene))

@@ -24,7 +24,8 @@ from spadwarp.result import COMPONENTS, Result
 if TYPE_CHECKING:
     from spadwarp_kernels import Data, Model
 
-# Called with ("compile", 0, 0) before kernels are compiled or loaded, then with ("trace", photons done, photons asked for).
+# Called with ("compile", 0, 0) before kernels are compiled or loaded, then with ("trace", photons done, photons asked
+# for).
 Progress = Callable[[str, int, int], None]
 
 # Photons in one launch: large enough to fill the device, small enough that progress is seen and Ctrl-C heard.
@@ -157,7 +158,6 @@ def trace(
     Args and raises: as `simulate`.
     """
     import spadwarp_kernels as sk
-
     from spadwarp.targets import build_mesh
 
     photons = scene.transport.photons if photons is None else photons
@@ -203,8 +203,9 @@ class _Run:
 
     def launch(self, first: int, count: int) -> None:
         """One pass; back when its photons are done."""
-        import spadwarp_kernels as sk
         import warp as wp
+
+        import spadwarp_kernels as sk
 
         sk.transport(self.spec, self.model, self.data, seed=self.seed, first_id=first, photon_count=count)
         wp.synchronize_device(self.model.device)
@@ -221,9 +222,9 @@ class _Run:
     def trace(self, start: int, stop: int, *, threads: int | None = None, pass_size: int | None = None) -> int:
         """Walks the photons start ... stop - 1; returns how many were done before an interrupt, always a prefix."""
         cuda = self.model.device.is_cuda
-        size = pass_size or (CUDA_PASS if cuda else CPU_PASS)
+        size = (CUDA_PASS if cuda else CPU_PASS) if pass_size is None else pass_size
         _check_range("pass_size", size, 1, CUDA_PASS)
-        workers = 1 if cuda else min(threads or _core_count(), -(-(stop - start) // size))
+        workers = 1 if cuda else min(_core_count() if threads is None else threads, -(-(stop - start) // size))
         _check_range("threads", workers, 1, 4096)
         with _interruptible() as interrupted:
             if workers == 1:
@@ -277,7 +278,8 @@ class _Run:
 
 @contextmanager
 def _interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second one raises KeyboardInterrupt. Signals reach the main thread only."""
+    """An event that the first Ctrl-C sets; a second one raises KeyboardInterrupt. Signals reach the main thread
+    only."""
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield interrupted

@@ -1,6 +1,7 @@
 """Warp functions and kernels for photon transport, SPAD detection and depth; needs warp and numpy only.
 
-Functions marked `wp.func` go into the caller's own kernels; `transport` walks photons against the caller's own `wp.Mesh`.
+Functions marked `wp.func` go into the caller's own kernels; `transport` walks photons against the caller's own
+`wp.Mesh`.
 """
 
 from .camera import Camera, pixel_direction, project, sample_lens

@@ -26,7 +26,8 @@ class Camera:
 
 @wp.func
 def project(camera: Camera, x: wp.vec3) -> int:
-    """Row-major index of the pixel that images the point x (line through x and the lens centre), or -1 outside the view."""
+    """Row-major index of the pixel that images the point x (line through x and the lens centre), or -1 outside the
+    view."""
     if x[2] <= 0.0:
         return -1
     scale = 1.0 / (x[2] * camera.pixel_tangent)
@@ -40,7 +41,8 @@ def project(camera: Camera, x: wp.vec3) -> int:
 
 @wp.func
 def pixel_direction(camera: Camera, column: float, row: float) -> wp.vec3:
-    """Unit direction from the lens centre through image coordinates in pixels; (0.5, 0.5) is the first pixel's centre."""
+    """Unit direction from the lens centre through image coordinates in pixels; (0.5, 0.5) is the first pixel's
+    centre."""
     return wp.normalize(
         wp.vec3(
             (column - 0.5 * float(camera.width)) * camera.pixel_tangent,

@@ -31,7 +31,8 @@ def orthonormal_basis(n: wp.vec3):
 def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     """The unit vector at angle theta from u, t = 1 - cos(theta), at azimuth 2 pi xi.
 
-    Exact on an orthonormal basis; equal in distribution to the paper's eq 15, without its division by zero along the axis.
+    Exact on an orthonormal basis; equal in distribution to the paper's eq 15, without its division by zero along the
+    axis.
     """
     sin_theta = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
     turn = cos_sin_turn(xi)
@@ -43,9 +44,11 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
 
 @wp.func
 def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
-    """The near-axis rule (eq 16): u itself, or the z axis with u's sign where |u_z| >= axis_threshold; 1 switches it off.
+    """The near-axis rule (eq 16): u itself, or the z axis with u's sign where |u_z| >= axis_threshold; 1 switches it
+    off.
 
-    A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase function;
+    A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase
+    function;
     the flight keeps u. Up to 1.15 degrees of tilt are dropped at the paper's 0.9998.
     """
     if axis_threshold < 1.0 and wp.abs(u[2]) >= axis_threshold:

@@ -37,11 +37,14 @@ def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
 @wp.func
 def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
-    lateral = wp.min(_to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral))
+    lateral = wp.min(
+        _to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral)
+    )
     box = wp.min(
         _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
         wp.min(
-            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]), _to_plane(x[2], u[2], limits.lower[2], limits.upper[2])
+            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]),
+            _to_plane(x[2], u[2], limits.lower[2], limits.upper[2]),
         ),
     )
     return wp.min(lateral, box)
@@ -50,7 +53,9 @@ def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
 @wp.func
 def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
     """Ledger entry of the limit that a ray from x along u meets first: a face of the domain, else the lateral limit."""
-    best = wp.min(_to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral))
+    best = wp.min(
+        _to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral)
+    )
     entry = LATERAL_LIMIT
     for i in range(3):
         distance = _to_plane(x[i], u[i], limits.lower[i], limits.upper[i])

@@ -26,7 +26,8 @@ class Guiding:
 
 @wp.struct
 class FlightSample:
-    """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for none."""
+    """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
+    none."""
 
     s: float
     r: float
@@ -48,10 +49,14 @@ def _clip(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def clip_flight(camera: Camera, gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, limit: float) -> wp.vec2:
-    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, that the camera sees within the gate; empty where s0 >= s1.
+def clip_flight(
+    camera: Camera, gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, limit: float
+) -> wp.vec2:
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, that the camera sees within the gate; empty where s0
+    >= s1.
 
-    The view is five half-spaces (front, four side planes through the lens centre). The arrival path s + r(s) rises with s,
+    The view is five half-spaces (front, four side planes through the lens centre). The arrival path s + r(s) rises
+    with s,
     so the gate cuts out an interval: s + r = L at s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
     """
     half_width = 0.5 * float(camera.width) * camera.pixel_tangent
@@ -94,7 +99,8 @@ def sample_flight(
     """A point of the flight x + s u within the interval, x relative to the lens point.
 
     Half the points are drawn from exp(-c s), half in the angle at which the light must turn to reach the lens:
-    towards the lens theta(s) = atan2(D, t_c - s) from q(theta) ~ (a^2 + theta^2)^(-3/2), which follows Henyey-Greenstein
+    towards the lens theta(s) = atan2(D, t_c - s) from q(theta) ~ (a^2 + theta^2)^(-3/2), which follows
+    Henyey-Greenstein
     for a2 = (1 - g)^2/g; away from it (s0 >= t_c) uniformly in psi = atan2(D, s - t_c), D = |x cross u|.
     """
     sample = FlightSample()
@@ -107,8 +113,8 @@ def sample_flight(
     kept = 1.0 - wp.exp(-extinction * width)
     away = s0 >= t_c
 
-    begin = float(0.0)
-    end = float(0.0)
+    begin = 0.0
+    end = 0.0
     if away:
         begin = wp.atan2(d, s0 - t_c)
         end = wp.atan2(d, s1 - t_c)
@@ -118,7 +124,7 @@ def sample_flight(
     span = begin - end
     angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
 
-    s = float(0.0)
+    s = 0.0
     if xi_choice < angular:
         if away:
             psi = begin - xi * span
@@ -139,7 +145,7 @@ def sample_flight(
     linear_density = 1.0 / width
     if extinction * width > 1.0e-4:
         linear_density = extinction * wp.exp(-extinction * (s - s0)) / kept
-    angular_density = float(0.0)
+    angular_density = 0.0
     if angular > 0.0:
         if away:
             angular_density = d / (r2 * span)

@@ -11,7 +11,8 @@ class Medium:
         extinction: c = a + b [1/m], >= 0; 0 is vacuum.
         albedo: Single-scattering albedo b/c in [0, 1]; with the paper's model, the upper end of the uniform draw.
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
-        axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1 switches it off.
+        axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
+            switches it off.
     """
 
     extinction: float
@@ -22,7 +23,8 @@ class Medium:
 
 @wp.func
 def free_path(u: float, extinction: float) -> float:
-    """Free flight [m] = -ln(1 - u)/c for uniform u in [0, 1) (eq 12, 13); its mean is 1/c. Infinite (1e30) in vacuum."""
+    """Free flight [m] = -ln(1 - u)/c for uniform u in [0, 1) (eq 12, 13); its mean is 1/c. Infinite (1e30) in
+    vacuum."""
     if extinction <= 0.0:
         return 1.0e30
     return -wp.log(1.0 - u) / extinction

@@ -1,6 +1,7 @@
 """Phase functions of the water, as densities per steradian over the scattering angle.
 
-Everything is written in t = 1 - cos(theta), not in cos(theta): the float32 grid is finest at 0, where the forward peak of
+Everything is written in t = 1 - cos(theta), not in cos(theta): the float32 grid is finest at 0, where the forward peak
+of
 natural water lies, while cos(theta) loses every angle below 3e-4 rad.
 """
 
@@ -15,20 +16,23 @@ _INV_4PI = wp.constant(0.07957747154594767)
 
 @wp.func
 def henyey_greenstein_pdf(t: float, g: float) -> float:
-    """Henyey-Greenstein density [1/sr] at t = 1 - cos(theta) in [0, 2], for g in (-1, 1); mean cosine g (Henyey & Greenstein 1941)."""
+    """Henyey-Greenstein density [1/sr] at t = 1 - cos(theta) in [0, 2], for g in (-1, 1); mean cosine g (Henyey &
+    Greenstein 1941)."""
     s = (1.0 - g) * (1.0 - g) + 2.0 * g * t
     return _INV_4PI * (1.0 - g * g) / (s * wp.sqrt(s))
 
 
 @wp.func
 def sample_henyey_greenstein(xi: float, g: float) -> float:
-    """t = 1 - cos(theta) drawn from Henyey-Greenstein for uniform xi in [0, 1); small xi is forward (eq 14, rearranged).
+    """t = 1 - cos(theta) drawn from Henyey-Greenstein for uniform xi in [0, 1); small xi is forward
+    (eq 14, rearranged).
 
-    Equal in distribution to cos(theta) = [1 + g^2 - ((1 - g^2)/(1 - g + 2 g xi))^2]/(2 g), without its cancellation at the
+    Equal in distribution to cos(theta) = [1 + g^2 - ((1 - g^2)/(1 - g + 2 g xi))^2]/(2 g), without its cancellation at
+    the
     peak and without its singularity at g = 0.
     """
     e = 1.0 + g - 2.0 * g * xi
-    return (1.0 - g) * xi * ((1.0 - g * g) / e + (1.0 - g)) / e
+    return wp.min((1.0 - g) * xi * ((1.0 - g * g) / e + (1.0 - g)) / e, 2.0)
 
 
 class PhaseFunction(NamedTuple):

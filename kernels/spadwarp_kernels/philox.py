@@ -1,6 +1,7 @@
 """Counter-based random numbers: Philox4x32-10 (Salmon et al. 2011).
 
-A draw is a pure function of (seed, 64-bit id, event, stream): it does not depend on launch size, thread or history, so one id
+A draw is a pure function of (seed, 64-bit id, event, stream): it does not depend on launch size, thread or history, so
+one id
 gives the same numbers however a launch is cut up.
 """
 
@@ -29,7 +30,8 @@ STREAM_ANALYTIC = wp.constant(wp.uint32(6))
     return word;
 """)
 def _opaque(word: wp.uint32) -> wp.uint32:
-    """The word itself, out of the compiler's sight: else it keeps all ten round keys in registers across a kernel's loops."""
+    """The word itself, out of the compiler's sight: else it keeps all ten round keys in registers across a kernel's
+    loops."""
     ...
 
 

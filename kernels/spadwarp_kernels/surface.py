@@ -7,7 +7,8 @@ _INV_PI = wp.constant(0.3183098861837907)
 
 @wp.struct
 class SurfaceHit:
-    """Nearest surface along a ray: distance [m], the unit normal on the ray's side, the face's index; `face` is -1 for a miss."""
+    """Nearest surface along a ray: distance [m], the unit normal on the ray's side, the face's index; `face` is -1 for
+    a miss."""
 
     distance: float
     normal: wp.vec3
@@ -30,9 +31,11 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 
 @wp.func
 def intersect_mesh_aimed(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """`intersect_mesh` for rays that may be aimed exactly at vertices or edges: a miss is tried again with u nudged by 1e-5.
+    """`intersect_mesh` for rays that may be aimed exactly at vertices or edges: a miss is tried again with u nudged by
+    1e-5.
 
-    The slab test of the BVH walk is not conservative, so that a ray in the plane of a flat bounding box can slip through.
+    The slab test of the BVH walk is not conservative, so that a ray in the plane of a flat bounding box can slip
+    through.
     Sampled rays meet such a plane with negligible probability and do without the second query.
     """
     hit = intersect_mesh(mesh, x, u, max_distance)
@@ -45,7 +48,7 @@ def intersect_mesh_aimed(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: 
 @wp.func
 def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
     """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    near = float(0.0)
+    near = 0.0
     far = float(length)
     for i in range(3):
         d = u[i]
@@ -61,7 +64,8 @@ def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upp
 
 @wp.func
 def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
-    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the same face.
+    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
+    same face.
 
     The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
     """
@@ -71,5 +75,6 @@ def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3
 
 @wp.func
 def lambert_brdf(reflectance: float) -> float:
-    """Lambertian f = reflectance/pi [1/sr]; times cos(theta_out) it is the density per steradian of the reflected weight."""
+    """Lambertian f = reflectance/pi [1/sr]; times cos(theta_out) it is the density per steradian of the reflected
+    weight."""
     return reflectance * _INV_PI

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-# Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63 and the paper's cut-off of 2e-4 is 839 units.
+# Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63 and the paper's cut-off of 2e-4 is
+# 839 units.
 LEDGER_ONE = wp.constant(4194304.0)
 LEDGER_UNIT = 1.0 / 4194304.0
 
@@ -61,11 +62,13 @@ CONTRIBUTIONS, BEFORE_GATE, AFTER_GATE, CLIPPED, INVALID = (
 #if defined(__CUDA_ARCH__)
     atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
 #else
-    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value), __ATOMIC_RELAXED);
+    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value),
+    __ATOMIC_RELAXED);
 #endif
 """)
 def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: int, value: wp.int64):
-    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the CPU)."""
+    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the
+    CPU)."""
     ...
 
 
@@ -77,7 +80,8 @@ def to_ledger(weight: float) -> wp.int64:
 
 @wp.func
 def to_fixed_point(value: float, scale: float, dither: float) -> wp.int64:
-    """value * scale >= 0, rounded up with probability equal to its fraction (dither uniform in [0, 1)): no value is too small to count.
+    """value * scale >= 0, rounded up with probability equal to its fraction (dither uniform in [0, 1)): no value is
+    too small to count.
 
     Returns -1 for what is clipped and -2 for what is not a number.
     """
@@ -105,7 +109,8 @@ def deposit(
     scale: float,
     dither: float,
 ):
-    """Adds a contribution to a voxel of the tally; index -1 or -2 counts it in the ledger as before or after the gate."""
+    """Adds a contribution to a voxel of the tally; index -1 or -2 counts it in the ledger as before or after the
+    gate."""
     units = to_fixed_point(value, scale, dither)
     if units < wp.int64(0):
         add_to_ledger(ledger, thread, wp.where(units == wp.int64(-1), CLIPPED, INVALID), wp.int64(1))

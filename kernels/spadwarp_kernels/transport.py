@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, LensSample, project, sample_lens
+from .camera import Camera, project, sample_lens
 from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance, exit_face
 from .gate import Gate, gate_bin
@@ -27,8 +27,8 @@ from .tally import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,
     CONTRIBUTIONS,
-    DIRECTED,
     COUNTERS,
+    DIRECTED,
     LEDGER_ENTRIES,
     LEDGER_SLOTS,
     LEDGER_WIDTH,
@@ -56,7 +56,8 @@ _EMIT, _FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _END, _DONE = (wp.constant(i) 
 _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
-# The warp traces its rays when this many of its 32 lanes have one: fewer leave lanes idle in the BVH, more in the water.
+# The warp traces its rays when this many of its 32 lanes have one: fewer leave lanes idle in the BVH, more in the
+# water.
 WAITING_LANES = 20
 
 # Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
@@ -120,9 +121,12 @@ class Surfaces:
 def next_event_value(
     camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
 ) -> float:
-    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a unit vector."""
+    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
+    unit vector."""
     cos_lens = wp.max(-to_lens[2], 0.0)
-    return weight * scattering * wp.exp(-extinction * distance) * camera.aperture_area * cos_lens / (distance * distance)
+    return (
+        weight * scattering * wp.exp(-extinction * distance) * camera.aperture_area * cos_lens / (distance * distance)
+    )
 
 
 @wp.func
@@ -138,7 +142,8 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
 class _Walk:
     """State of a thread between the stages.
 
-    A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the values of
+    A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
+        values of
     both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
     """
 
@@ -180,7 +185,8 @@ class _Walk:
 
 @functools.cache
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
-    """The transport kernel for a spec; launch grid: `thread_count` threads, photon i is walked by thread i mod thread_count.
+    """The transport kernel for a spec; launch grid: `thread_count` threads, photon i is walked by thread i mod
+    thread_count.
 
     On CUDA `thread_count` must be a multiple of the block size, since whole warps vote.
     """
@@ -227,7 +233,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp have a ray to trace
-            waiting = int(0)
+            waiting = 0
             while waiting < wp.static(waiting_lanes):
                 if s.stage == _EMIT:
                     if s.photon >= photon_count:
@@ -292,7 +298,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
                                 t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
-                                weight_there = s.weight * s.albedo * medium.extinction * wp.exp(-medium.extinction * s.along)
+                                weight_there = (
+                                    s.weight * s.albedo * medium.extinction * wp.exp(-medium.extinction * s.along)
+                                )
                                 s.pending_value = (
                                     next_event_value(
                                         camera, medium.extinction, weight_there, phase_pdf(t, medium), to_lens, flight.r
@@ -300,7 +308,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     / flight.density
                                 )
                                 component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                                s.pending_index = tally_index(camera, gate, pixel, s.path + s.along + flight.r, component)
+                                s.pending_index = tally_index(
+                                    camera, gate, pixel, s.path + s.along + flight.r, component
+                                )
                                 s.contributions += 1
                                 s.ray = _SHADOW_RAY
 
@@ -361,7 +371,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
-                                    scattering = float(0.0)
+                                    scattering = 0.0
                                     component = int(FORWARD_SCATTERED)
                                     if s.face >= 0:
                                         cos_out = wp.max(wp.dot(to_lens, s.normal), 0.0)
@@ -387,9 +397,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         needed = False
                         if wp.static(has_mesh):
                             origin = s.x + s.along * s.u
-                            needed = segment_meets_box(
-                                origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper
-                            )
+                            needed = segment_meets_box(origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper)
                         if not needed:
                             deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
                             s.ray = _NO_RAY
@@ -461,7 +469,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if on_surface:
                                 s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
-                                s.u = rotate_direction(snapped, phase_sample(u01_fine(s.block[1]), medium), u01(s.block[2]))
+                                s.u = rotate_direction(
+                                    snapped, phase_sample(u01_fine(s.block[1]), medium), u01(s.block[2])
+                                )
 
                 if s.stage == _END:
                     add_to_ledger(ledger, thread, s.reason, s.ledger_weight)
@@ -587,7 +597,9 @@ def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
     return records
 
 
-def make_surfaces(mesh: wp.Mesh | None, reflectance: wp.array | float = 0.5, *, device: wp.DeviceLike = None) -> Surfaces:
+def make_surfaces(
+    mesh: wp.Mesh | None, reflectance: wp.array | float = 0.5, *, device: wp.DeviceLike = None
+) -> Surfaces:
     """The kernel's view of a mesh.
 
     Args:
@@ -614,7 +626,8 @@ def make_surfaces(mesh: wp.Mesh | None, reflectance: wp.array | float = 0.5, *, 
     return surfaces
 
 
-# Threads of a CUDA launch: enough to fill any GPU, few enough that each walks many photons and flushes its tallies seldom.
+# Threads of a CUDA launch: enough to fill any GPU, few enough that each walks many photons and flushes its tallies
+# seldom.
 CUDA_THREADS = 1 << 19
 
 

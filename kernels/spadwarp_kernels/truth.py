@@ -17,7 +17,8 @@ def truth_kernel(
     normal: wp.array2d(dtype=wp.vec3),
     reflectance_out: wp.array2d(dtype=float),
 ):
-    """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height, width)."""
+    """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
+    width)."""
     row, column = wp.tid()
     u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
     hit = intersect_mesh_aimed(mesh, wp.vec3(0.0), u, 1.0e30)

@@ -11,5 +11,6 @@ import warp as wp
 #endif
 """)
 def count_lanes(condition: bool) -> int:
-    """Number of lanes, out of 32, in which the condition holds; every lane of the warp must take part, and all meet here."""
+    """Number of lanes, out of 32, in which the condition holds; every lane of the warp must take part, and all meet
+    here."""
     ...

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+
 from spadwarp_kernels.philox import philox4x32, random_block, u01, u01_fine
 
 
