@@ -113,8 +113,8 @@ def sample_flight(
     kept = 1.0 - wp.exp(-extinction * width)
     away = s0 >= t_c
 
-    begin = 0.0
-    end = 0.0
+    begin = float(0.0)
+    end = float(0.0)
     if away:
         begin = wp.atan2(d, s0 - t_c)
         end = wp.atan2(d, s1 - t_c)
@@ -124,7 +124,7 @@ def sample_flight(
     span = begin - end
     angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
 
-    s = 0.0
+    s = float(0.0)
     if xi_choice < angular:
         if away:
             psi = begin - xi * span
@@ -145,7 +145,7 @@ def sample_flight(
     linear_density = 1.0 / width
     if extinction * width > 1.0e-4:
         linear_density = extinction * wp.exp(-extinction * (s - s0)) / kept
-    angular_density = 0.0
+    angular_density = float(0.0)
     if angular > 0.0:
         if away:
             angular_density = d / (r2 * span)

@@ -27,9 +27,8 @@ def sample_henyey_greenstein(xi: float, g: float) -> float:
     """t = 1 - cos(theta) drawn from Henyey-Greenstein for uniform xi in [0, 1); small xi is forward
     (eq 14, rearranged).
 
-    Equal in distribution to cos(theta) = [1 + g^2 - ((1 - g^2)/(1 - g + 2 g xi))^2]/(2 g), without its cancellation at
-    the
-    peak and without its singularity at g = 0.
+    Equal in distribution to cos(theta) = [1 + g^2 - ((1 - g^2)/(1 - g + 2 g xi))^2]/(2 g), without its cancellation
+    at the peak and without its singularity at g = 0.
     """
     e = 1.0 + g - 2.0 * g * xi
     return wp.min((1.0 - g) * xi * ((1.0 - g * g) / e + (1.0 - g)) / e, 2.0)

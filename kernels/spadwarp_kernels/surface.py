@@ -48,7 +48,7 @@ def intersect_mesh_aimed(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: 
 @wp.func
 def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
     """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    near = 0.0
+    near = float(0.0)
     far = float(length)
     for i in range(3):
         d = u[i]

@@ -143,7 +143,7 @@ class _Walk:
     """State of a thread between the stages.
 
     A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
-        values of
+    values of
     both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
     """
 
@@ -233,7 +233,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp have a ray to trace
-            waiting = 0
+            waiting = int(0)
             while waiting < wp.static(waiting_lanes):
                 if s.stage == _EMIT:
                     if s.photon >= photon_count:
@@ -371,7 +371,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
-                                    scattering = 0.0
+                                    scattering = float(0.0)
                                     component = int(FORWARD_SCATTERED)
                                     if s.face >= 0:
                                         cos_out = wp.max(wp.dot(to_lens, s.normal), 0.0)

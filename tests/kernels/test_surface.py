@@ -28,7 +28,7 @@ def _mesh(shape, device):
 def _leaks(mesh: wp.uint64, extent: wp.vec3, rays: int, leaks: wp.array(dtype=int)):
     """Random rays from random points of a box that lies inside the mesh."""
     i = wp.tid()
-    missed = 0
+    missed = int(0)
     for k in range(rays):
         a = random_block(wp.uint64(1), wp.uint64(i), wp.uint32(k), wp.uint32(1))
         b = random_block(wp.uint64(1), wp.uint64(i), wp.uint32(k), wp.uint32(2))
