@@ -10,7 +10,8 @@ LEDGER_UNIT = 1.0 / 4194304.0
 # Largest single contribution, in tally units; what is above it is clipped and counted.
 _DEPOSIT_LIMIT = wp.constant(9.007199254740992e15)
 
-LEDGER_SLOTS = 256
+# Copies of the ledger, so that threads seldom add to one address at the same time.
+LEDGER_SLOTS = 4096
 
 LEDGER_ENTRIES = (
     "absorbed_water",

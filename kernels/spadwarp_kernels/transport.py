@@ -2,7 +2,7 @@
 
 One kernel, specialised by a hashable `TransportSpec`. A thread walks photon after photon through a small state machine
 
-    EMIT -> FLIGHT -> [FLIGHT_SAMPLE ->] EVENT -> SCATTER -> FLIGHT -> ... -> END -> EMIT
+    FLIGHT -> [FLIGHT_SAMPLE ->] EVENT -> SCATTER -> FLIGHT -> ... -> END
 
 and leaves the inner loop only when it has a ray to trace, so that the BVH is walked by all threads of a warp at once.
 """
@@ -52,13 +52,13 @@ ESTIMATORS = ("none", "analog", "next_event", "guided")
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
 BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
 
-_EMIT, _FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _END, _DONE = (wp.constant(i) for i in range(7))
+_FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _START, _END, _DONE = (wp.constant(i) for i in range(7))
 _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
-# The warp traces its rays when this many of its 32 lanes have one: fewer leave lanes idle in the BVH, more in the
-# water.
-WAITING_LANES = 20
+# A warp leaves the water when this many of its 32 lanes wait, without and with a mesh: fewer leave lanes idle in what
+# they wait for, more in the water.
+WAITING_LANES = (12, 20)
 
 # Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
 MAX_REGISTERS = (80, 128)
@@ -143,8 +143,7 @@ class _Walk:
     """State of a thread between the stages.
 
     A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
-    values of
-    both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
+    values of both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
     """
 
     stage: int
@@ -197,7 +196,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     guided = spec.estimator == "guided"
     paper_albedo, has_mesh, bounded, roulette, records = spec[2:]
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
-    waiting_lanes = WAITING_LANES if has_mesh else 32
+    waiting_lanes = WAITING_LANES[has_mesh]
 
     @wp.kernel(
         module="unique",
@@ -227,29 +226,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     ):
         thread = wp.tid()
         s = _Walk()
-        s.stage = _EMIT
+        s.stage = _START
         s.photon = thread
         s.albedo = medium.albedo
 
         while count_lanes(s.stage == _DONE) < 32:
-            # ---- Water: until enough lanes of the warp have a ray to trace
+            # ---- Water: until enough lanes of the warp wait for a surface or a new photon
             waiting = int(0)
             while waiting < wp.static(waiting_lanes):
-                if s.stage == _EMIT:
-                    if s.photon >= photon_count:
-                        s.stage = _DONE
-                    else:
-                        start, heading = emit_photon(laser, seed, first_id + wp.uint64(s.photon))
-                        s.x = start
-                        s.u = heading
-                        s.weight = 1.0
-                        s.analog_weight = 1.0
-                        s.ledger_weight = to_ledger(1.0)
-                        s.path = 0.0
-                        s.collisions = 0
-                        s.surface_count = 0
-                        s.stage = _FLIGHT
-
                 if s.stage == _FLIGHT:
                     id = first_id + wp.uint64(s.photon)
                     s.block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
@@ -473,22 +457,36 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     snapped, phase_sample(u01_fine(s.block[1]), medium), u01(s.block[2])
                                 )
 
-                if s.stage == _END:
-                    add_to_ledger(ledger, thread, s.reason, s.ledger_weight)
-                    add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.collisions - s.surface_count))
-                    if wp.static(has_mesh):
-                        add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(s.surface_count))
-                    if wp.static(records):
-                        out.position[s.photon] = s.x
-                        out.direction[s.photon] = s.u
-                        out.weight[s.photon] = s.weight
-                        out.path[s.photon] = s.path
-                        out.collisions[s.photon] = s.collisions
-                        out.reason[s.photon] = s.reason
-                    s.photon += thread_count
-                    s.stage = _EMIT
+                waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)
 
-                waiting = count_lanes(s.ray != _NO_RAY or s.stage == _DONE)
+            # ---- The next photon for those that need one
+            if s.stage == _END:
+                add_to_ledger(ledger, thread, s.reason, s.ledger_weight)
+                add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.collisions - s.surface_count))
+                if wp.static(has_mesh):
+                    add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(s.surface_count))
+                if wp.static(records):
+                    out.position[s.photon] = s.x
+                    out.direction[s.photon] = s.u
+                    out.weight[s.photon] = s.weight
+                    out.path[s.photon] = s.path
+                    out.collisions[s.photon] = s.collisions
+                    out.reason[s.photon] = s.reason
+                s.photon += thread_count
+                s.stage = _START
+            if s.stage == _START:
+                s.stage = _DONE
+                if s.photon < photon_count:
+                    start, heading = emit_photon(laser, seed, first_id + wp.uint64(s.photon))
+                    s.x = start
+                    s.u = heading
+                    s.weight = 1.0
+                    s.analog_weight = 1.0
+                    s.ledger_weight = to_ledger(1.0)
+                    s.path = 0.0
+                    s.collisions = 0
+                    s.surface_count = 0
+                    s.stage = _FLIGHT
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_mesh):
