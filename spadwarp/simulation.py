@@ -207,7 +207,7 @@ class _Run:
 
         import spadwarp_kernels as sk
 
-        sk.transport(self.spec, self.model, self.data, seed=self.seed, first_id=first, photon_count=count)
+        sk.launch_transport(self.spec, self.model, self.data, seed=self.seed, first_id=first, photon_count=count)
         wp.synchronize_device(self.model.device)
 
     def report(self, done: int, total: int) -> None:

@@ -1,6 +1,6 @@
 """Warp functions and kernels for photon transport, SPAD detection and depth; needs warp and numpy only.
 
-Functions marked `wp.func` go into the caller's own kernels; `transport` walks photons against the caller's own
+Functions marked `wp.func` go into the caller's own kernels; `launch_transport` walks photons against the caller's own
 `wp.Mesh`.
 """
 
@@ -35,6 +35,7 @@ from .transport import (
     Records,
     Surfaces,
     TransportSpec,
+    launch_transport,
     load_transport_kernel,
     make_data,
     make_records,
@@ -42,7 +43,6 @@ from .transport import (
     make_transport_kernel,
     next_event_value,
     read_ledger,
-    transport,
 )
 from .truth import truth_kernel
 
@@ -76,6 +76,7 @@ __all__ = [
     "intersect_mesh",
     "intersect_mesh_aimed",
     "lambert_brdf",
+    "launch_transport",
     "load_transport_kernel",
     "make_data",
     "make_records",
@@ -97,7 +98,6 @@ __all__ = [
     "segment_meets_box",
     "snap_direction",
     "to_fixed_point",
-    "transport",
     "truth_kernel",
     "u01",
     "u01_fine",

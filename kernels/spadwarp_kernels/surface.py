@@ -30,6 +30,34 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 
 
 @wp.func
+def intersect_faces(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
+    """As `intersect_mesh`, by trying every face: faster than a BVH for a handful of them (Möller & Trumbore 1997)."""
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.distance = max_distance
+    faces = wp.mesh_get(mesh)
+    for face in range(faces.indices.shape[0] // 3):
+        p = faces.points[faces.indices[3 * face]]
+        e1 = faces.points[faces.indices[3 * face + 1]] - p
+        e2 = faces.points[faces.indices[3 * face + 2]] - p
+        h = wp.cross(u, e2)
+        inverse = 1.0 / wp.dot(e1, h)  # infinite for a ray in the plane, which then fails the comparisons
+        to_x = x - p
+        a = wp.dot(to_x, h) * inverse
+        q = wp.cross(to_x, e1)
+        b = wp.dot(u, q) * inverse
+        distance = wp.dot(e2, q) * inverse
+        # A hair more than the triangle, so that no ray slips between two.
+        inside = a >= -1.0e-6 and b >= -1.0e-6 and a + b <= 1.000001
+        if inside and distance >= 0.0 and distance < hit.distance:
+            hit.face = face
+            hit.distance = distance
+            normal = wp.normalize(wp.cross(e1, e2))
+            hit.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+    return hit
+
+
+@wp.func
 def intersect_mesh_aimed(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
     """`intersect_mesh` for rays that may be aimed exactly at vertices or edges: a miss is tried again with u nudged by
     1e-5.

@@ -22,7 +22,7 @@ from .laser import Laser, emit_photon
 from .medium import Medium, free_path
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import STREAM_FLIGHT_SAMPLE, STREAM_ROULETTE, STREAM_TRANSPORT, random_block, u01, u01_fine
-from .surface import intersect_mesh, lambert_brdf, offset_from_surface, segment_meets_box
+from .surface import intersect_faces, intersect_mesh, lambert_brdf, offset_from_surface, segment_meets_box
 from .tally import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,
@@ -60,6 +60,9 @@ _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 # they wait for, more in the water.
 WAITING_LANES = (12, 20)
 
+# Meshes of at most this many faces need no BVH.
+FEW_FACES = 12
+
 # Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
 MAX_REGISTERS = (80, 128)
 
@@ -72,6 +75,7 @@ class TransportSpec(NamedTuple):
         phase: Phase function of the water.
         paper_albedo: Draw the albedo uniformly from [0, medium.albedo] at each collision.
         mesh: Trace rays against a mesh.
+        few_faces: Try every face rather than walk the BVH; for meshes of up to FEW_FACES faces.
         bounded: Honour the domain and the lateral limit.
         roulette: Russian roulette in place of the weight cut-off.
         records: Write the terminal state of each photon.
@@ -81,6 +85,7 @@ class TransportSpec(NamedTuple):
     phase: PhaseFunction = HENYEY_GREENSTEIN
     paper_albedo: bool = False
     mesh: bool = True
+    few_faces: bool = False
     bounded: bool = False
     roulette: bool = False
     records: bool = False
@@ -194,7 +199,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     analog = spec.estimator == "analog"
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
-    paper_albedo, has_mesh, bounded, roulette, records = spec[2:]
+    paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:]
+    intersect = intersect_faces if few_faces else intersect_mesh
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
     waiting_lanes = WAITING_LANES[has_mesh]
 
@@ -500,7 +506,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             to = s.lens - origin
                             length = wp.length(to)
                             to = to / length
-                    hit = intersect_mesh(surfaces.mesh, origin, to, length)
+                    hit = intersect(surfaces.mesh, origin, to, length)
                     if s.ray == _SURFACE_RAY:
                         s.surface_queries += 1
                         if hit.face >= 0:
@@ -638,7 +644,7 @@ def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> 
     make_transport_kernel(spec, device.is_cuda).module.load(device, _BLOCK if device.is_cuda else 1)
 
 
-def transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int) -> None:
+def launch_transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int) -> None:
     """Walks the photons first_id ... first_id + photon_count - 1 and adds them to `data`; asynchronous on CUDA.
 
     Args:

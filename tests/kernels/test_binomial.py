@@ -10,7 +10,7 @@ from spadwarp_kernels.binomial import binomial, expm1, log1p
 @wp.kernel(enable_backward=False)
 def _draw(n: int, hazard: wp.float64, seed: wp.uint64, base: wp.uint64, counts: wp.array(dtype=int)):
     i = wp.tid()
-    count, block = binomial(n, hazard, seed, base + wp.uint64(i), wp.uint32(0), wp.uint32(0))
+    count, _block = binomial(n, hazard, seed, base + wp.uint64(i), wp.uint32(0), wp.uint32(0))
     counts[i] = count
 
 

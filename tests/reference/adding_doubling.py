@@ -120,6 +120,21 @@ def cumulative_reflectance(
     return math.exp(a / 2) / path * math.fsum(tail)
 
 
+def reflected_by_order(
+    orders: int, *, anisotropy: float, albedo: float, optical_depth: float = math.inf, nodes: int | None = None
+) -> NDArray[np.float64]:
+    """Fractions reflected after 0, 1, … orders − 1 scatterings: coefficients of R's power series in the albedo, ωⁿRₙ.
+
+    From R on the circle |ω| = albedo; orders beyond twice `orders` alias into the result, so take albedo**(2·orders) ≪ 1.
+    """
+    phases = 2j * math.pi * np.arange(2 * orders) / (2 * orders)
+    values = [
+        slab(anisotropy=anisotropy, albedo=albedo * np.exp(phase), optical_depth=optical_depth, nodes=nodes).reflected
+        for phase in phases[: orders + 1]
+    ]
+    return np.fft.irfft(np.conj(values), 2 * orders)[:orders]
+
+
 def _real(value):
     return value.real if np.all(np.imag(value) == 0) else value
 

@@ -34,6 +34,39 @@ def after_path(path: float, *, scattering: float, anisotropy: float) -> Moments:
     return Moments(decay / rate, 2 * (path - decay / rate) / rate, 1 - decay)
 
 
+def snapped_mean_cosines(count: int, *, anisotropy: float, axis_threshold: float) -> NDArray[np.float64]:
+    """Mean cosine of the direction after 0, 1, … `count` collisions of a beam along +z under the near-axis rule.
+
+    The rule takes an incoming direction with |u_z| >= axis_threshold for the axis itself. The density of the cosine is followed
+    from collision to collision by quadrature: what is snapped scatters from the poles, the rest from where it is.
+    """
+    g, degree = anisotropy, 600
+    node, gauss = np.polynomial.legendre.leggauss(700)
+    mu, weight = axis_threshold * node, axis_threshold * gauss
+    orders = np.arange(degree + 1)
+    coefficients = (2 * orders + 1) / 2 * g**orders  # of Henyey–Greenstein's density in the cosine
+    polynomials = np.polynomial.legendre.legvander(mu, degree)
+    integrals = np.stack([_legendre_integral(axis_threshold, degree), _legendre_integral(-axis_threshold, degree)])
+    means = [1.0]
+    moments = np.ones(degree + 1)  # of the snapped incoming direction: ⟨P_k⟩
+    for _ in range(count):
+        expansion = coefficients * moments
+        means.append(g * moments[1])
+        density = polynomials @ expansion
+        # mass beyond the threshold at either pole: ∫P_k from t to 1, and from −1 to −t
+        forward = expansion @ integrals[0]
+        backward = expansion @ (2 * (orders == 0) - integrals[1])
+        moments = forward + backward * (-1.0) ** orders + (weight * density) @ polynomials
+    return np.array(means)
+
+
+def _legendre_integral(start: float, degree: int) -> NDArray[np.float64]:
+    """∫P_k from `start` to 1 for k = 0 … degree."""
+    p = np.polynomial.legendre.legvander(np.array([start]), degree + 1)[0]
+    k = np.arange(1, degree + 1)
+    return np.concatenate([[1 - start], (p[:-2] - p[2:]) / (2 * k + 1)])
+
+
 def isotropic_radial_cdf(radius: ArrayLike, *, path: float, scattering: float) -> NDArray[np.float64]:
     """Probability that a photon from an isotropic point source is within `radius` [m] after `path`; isotropic
     scattering.
