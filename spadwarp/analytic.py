@@ -230,7 +230,9 @@ def pixel_maps(
     from spadwarp_kernels import analytic_budget as budget
     from spadwarp_kernels import cramer_rao
 
-    device = wp.get_preferred_device() if device is None else wp.get_device(device)
+    from .model import pick_device
+
+    device = pick_device(device)
     start, stop = gate or (scene.gate.start, scene.gate.stop)
     lidar = _lidar(scene, start, stop)
     chosen = scene.analytic
@@ -454,7 +456,9 @@ def _sample(
 
     from spadwarp_kernels import analytic as kernels
 
-    device = wp.get_preferred_device() if device is None else wp.get_device(device)
+    from .model import pick_device
+
+    device = pick_device(device)
     scene, shape = result.scene, result.truth.depth.shape
     pixels = result.truth.depth.size
     speed = SPEED_OF_LIGHT / scene.medium.group_index

@@ -53,6 +53,8 @@ def crlb_from_histogram(
 
     from spadwarp_kernels import cramer_rao
 
+    from .model import pick_device
+
     signal = np.ascontiguousarray(signal_cube, np.float32)
     background = np.asarray(background_cube, np.float32)
     bins = signal.shape[-1] if signal.ndim else 0
@@ -67,7 +69,7 @@ def crlb_from_histogram(
     if law not in ("poisson", "first_photon"):
         raise ValueError(f"law = {law!r} is not one of 'poisson', 'first_photon'")
     taps, slope_taps = _response_taps(irf, bin_width)
-    device = wp.get_preferred_device() if device is None else wp.get_device(device)
+    device = pick_device(device)
     rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
     information = cramer_rao.histogram_information(
         wp.array(signal.reshape(-1, bins), dtype=wp.float32, device=device),
