@@ -121,7 +121,8 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     mesh.apply_transform(_placement(stretch * target.scale, target.rotation_deg, target.translation))
     if len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh has no faces")
-    corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
+    with np.errstate(over="ignore"):  # becomes infinite, which is refused
+        corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
     if not np.isfinite(corners).all():
         bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
         raise MeshError(f"{name}: {bad} of {len(mesh.faces)} faces have coordinates that are not finite")
@@ -132,6 +133,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     if not solid.all():
         warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
         mesh.update_faces(solid)
+    mesh.remove_unreferenced_vertices()
     return mesh
 
 
@@ -157,12 +159,14 @@ def _read_mesh(path: Path, field: str) -> trimesh.Trimesh:
     if not path.is_file():
         raise MeshError(f"{name}: {'is not a file' if path.exists() else 'no such file'}")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)  # processing drops what is not finite without a word
     except Exception as error:  # what trimesh raises depends on the format and its parser
         known = "STL, OBJ, PLY, OFF and GLB can be read"
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"{name}: the file holds no triangles")
+    if np.isfinite(mesh.vertices).all():
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
 
 
