@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .config import SPEED_OF_LIGHT, Camera, Laser, Scene
+from ._frustum import beam_planes, points_inside, view_planes
+from .config import SPEED_OF_LIGHT, Laser, Scene
 from .presets import PURE_WATER_ABSORPTION, WATER_INDICES
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ __all__ = ["CheckMessage", "check", "summary"]
 Points = NDArray[np.float64]
 
 _MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies that is worth a word
-_GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +92,9 @@ class _Shape:
         self.scene = scene
         self.target = np.zeros(0, dtype=np.int32) if mesh is None else mesh.target
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
-        self.view = _view_planes(scene.camera)
-        self.beam = _beam_planes(scene.laser)
-        self.lit = _inside(self.triangles, np.concatenate([self.view, self.beam]))
+        self.view = view_planes(scene.camera)
+        self.beam = beam_planes(scene.laser)
+        self.lit = points_inside(self.triangles, np.concatenate([self.view, self.beam]))
         paths = np.linalg.norm(self.lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(self.lit, axis=1)
         ranges = np.linalg.norm(self.lit, axis=1)
         self.target_range = (float(ranges.min()), float(ranges.max())) if len(ranges) else None
@@ -134,7 +134,7 @@ class _Shape:
 
     @property
     def samples_per_pixel(self) -> float | None:
-        if self.target_range is None:
+        if self.target_range is None or self.target_range[0] == 0.0:
             return None
         distance = self.target_range[0]
         arriving = math.exp(-self.scene.medium.extinction * distance)
@@ -142,7 +142,7 @@ class _Shape:
 
     @property
     def signal_per_pulse(self) -> float | None:
-        if self.target_range is None:
+        if self.target_range is None or self.target_range[0] == 0.0:
             return None
         scene, distance = self.scene, self.target_range[0]
         reflectance = max(target.reflectance for target in scene.targets)
@@ -175,7 +175,7 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
     corners = triangles.reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     where = f"spans x {_span(low[0], high[0])}, y {_span(low[1], high[1])}, z {_span(low[2], high[2])} m"
-    seen = _inside(triangles, shape.view)
+    seen = points_inside(triangles, shape.view)
     if not len(seen):
         half = scene.camera.pixel_tangent / 2.0
         depth = max(float(high[2]), 0.0)
@@ -183,7 +183,12 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
         yield CheckMessage("warning", name, text, {"half_width": wide, "half_height": tall, "depth": depth})
         return
-    lit = _inside(triangles, np.concatenate([shape.view, shape.beam]))
+    nearest = float(np.linalg.norm(seen, axis=1).min())
+    if nearest <= scene.camera.aperture_radius:
+        text = f"reaches the lens ({where}): translation moves it away"
+        yield CheckMessage("warning", name, text, {"nearest": nearest})
+        return
+    lit = points_inside(triangles, np.concatenate([shape.view, shape.beam]))
     if not len(lit):
         angles = _angles(seen, scene.laser)
         text = (
@@ -305,10 +310,9 @@ def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
     if size > _MEMORY_LIMIT:
         text = f"one set of tallies takes {size / 2**30:.3g} GiB, and on the CPU every thread has its own"
         yield CheckMessage("warning", "gate.bins", text, {"bytes": size})
-    if shape.target_range is None:
-        return
     samples, signal = shape.samples_per_pixel, shape.signal_per_pulse
-    assert samples is not None and signal is not None
+    if shape.target_range is None or samples is None or signal is None:
+        return
     depth = scene.medium.extinction * shape.target_range[0]
     text = (
         f"optical depth to the nearest lit point {depth:.3g} one way ({shape.target_range[0]:.4g} m); a pixel on the "
@@ -328,74 +332,6 @@ def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
     elif samples < 10.0:
         text = f"only about {samples:.2g} of {scene.transport.photons:.3g} photons reach what a pixel sees unscattered"
         yield CheckMessage("warning", "transport.photons", text, {"samples_per_pixel": samples})
-
-
-# Geometry: planes are rows (n, d) with n·x + d >= 0 inside, `[P, 4]`; triangles `[F, 3, 3]` [m].
-
-
-def _view_planes(camera: Camera) -> Points:
-    tx, ty = camera.pixel_tangent * camera.width / 2.0, camera.pixel_tangent * camera.height / 2.0
-    return np.array([[1, 0, tx, 0], [-1, 0, tx, 0], [0, 1, ty, 0], [0, -1, ty, 0], [0, 0, 1, 0]], dtype=np.float64)
-
-
-def _beam_planes(laser: Laser) -> Points:
-    """24 planes around the beam, a pyramid or a prism that just holds it; none if it is wider than a half-space."""
-    axis, origin = np.array(laser.axis), np.array(laser.position)
-    if laser.profile != "collimated" and laser.half_angle_deg >= 90.0:
-        return np.zeros((0, 4))
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    b1 = np.cross(axis, helper) / np.linalg.norm(np.cross(axis, helper))
-    phi = np.arange(24) * (2.0 * math.pi / 24)
-    outward = np.cos(phi)[:, None] * b1 + np.sin(phi)[:, None] * np.cross(axis, b1)
-    slope, radius = 0.0, max(laser.beam_radius, 1e-6)
-    if laser.profile != "collimated":
-        slope = math.tan(laser.half_angle) * (_GAUSSIAN_EDGE if laser.profile == "gaussian" else 1.0)
-        radius = 0.0
-    normals = np.concatenate([slope * axis - outward, axis[None]])
-    offsets = -normals @ origin + np.append(np.full(24, radius), 0.0)
-    return np.column_stack([normals, offsets])
-
-
-def _inside(triangles: Points, planes: Points) -> Points:
-    """Points of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
-    whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
-    for plane in planes:
-        distance = triangles @ plane[:3] + plane[3]
-        whole &= (distance >= 0.0).all(axis=1)
-        outside |= (distance < 0.0).all(axis=1)
-    found = [_spread(triangles[whole])]
-    for triangle in triangles[~whole & ~outside]:
-        polygon = _clip(triangle, planes)
-        if len(polygon):
-            fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
-            found.append(_spread(fan))
-            if len(found) > 256:  # enough for every number that is told
-                break
-    return np.concatenate(found)
-
-
-def _spread(triangles: Points) -> Points:
-    """Points spread over each triangle: corners alone where there are many triangles."""
-    steps = 6 if len(triangles) < 2000 else 1
-    weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
-    return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
-
-
-def _clip(polygon: Points, planes: Points) -> Points:
-    """The part of a convex polygon inside all planes (Sutherland & Hodgman 1974), `[K, 3]`, empty if there is none."""
-    for plane in planes:
-        distance = polygon @ plane[:3] + plane[3]
-        kept: list[Points] = []
-        for i, (d, x) in enumerate(zip(distance, polygon, strict=True)):
-            before, y = distance[i - 1], polygon[i - 1]
-            if (d >= 0.0) != (before >= 0.0):
-                kept.append(y + (x - y) * (before / (before - d)))
-            if d >= 0.0:
-                kept.append(x)
-        if len(kept) < 3:
-            return np.zeros((0, 3))
-        polygon = np.array(kept)
-    return polygon
 
 
 def _angles(points: Points, laser: Laser) -> Points:
