@@ -32,7 +32,7 @@ def make_scene(
 
 
 def make_result(scene: Scene, *, photons: int = 10**9, seed: int = 7, empty: bool = False) -> Result:
-    """Ballistic returns by the lidar equation with shot noise, an exponential tail behind them, single backscatter before."""
+    """Ballistic returns by the lidar equation with shot noise, a tail behind them, single backscatter before them."""
     mesh = build_mesh(scene)
     truth = cast_truth(scene, mesh)
     tallies = np.zeros((3, scene.camera.height, scene.camera.width, scene.gate.bins), dtype=np.int64)

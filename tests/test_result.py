@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic_result import UNIT, make_result, make_scene
 
 from spadwarp.result import COMPONENTS, Result, pixel_directions, range_from_path
+from synthetic_result import UNIT, make_result, make_scene
 
 SPEED = 299_792_458.0 / 1.3638
 
@@ -77,7 +77,7 @@ def test_depth_frame_finds_the_target_within_a_bin(laser: tuple[float, float, fl
     seen = np.isfinite(truth)
     assert seen.sum() == 12 * 12  # the plate is 4 m wide and the view 5.25 m
     bin_path = result.path_edges[1] - result.path_edges[0]
-    # A bin centre is at most half a bin of path from the arrival; dr/dL is below 1 / (1 + cos) of the angle at the target.
+    # A bin centre is at most half a bin of path from the arrival, and dr/dL = 1/(1 + cos) of the angle at the target.
     assert np.abs(depth - truth)[seen].max() < 0.6 * bin_path
     distance = result.depth(method="peak", quantity="range")
     np.testing.assert_allclose(distance * pixel_directions(result.scene.camera)[..., 2], depth)
@@ -102,7 +102,7 @@ def test_range_of_a_coaxial_laser_is_half_the_path() -> None:
 
 
 def test_range_on_the_axes_of_the_ellipse() -> None:
-    # Foci 0 and (2e, 0, 0), path L = 2a: vertices at a + e and a − e from the lens, semi-latus rectum (a² − e²)/a across.
+    # Foci 0 and (2e, 0, 0), path L = 2a: vertices at a + e and a − e from the lens, (a² − e²)/a across.
     a, e = 5.0, 1.5
     along, against, across = (range_from_path(2 * a, u, [2 * e, 0.0, 0.0]) for u in ([1, 0, 0], [-1, 0, 0], [0, 1, 0]))
     np.testing.assert_allclose([along, against, across], [a + e, a - e, (a * a - e * e) / a])

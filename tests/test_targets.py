@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from synthetic_result import cast_truth, make_scene
 
 from spadwarp.config import Scene, Target
 from spadwarp.errors import MeshError
 from spadwarp.targets import BUILTINS, build_mesh, load_target
+from synthetic_result import cast_truth, make_scene
 
 FORMATS = ("stl", "obj", "ply", "off", "glb")
 
@@ -133,7 +133,7 @@ def test_rotation_is_about_the_targets_own_axes_x_then_y_then_z() -> None:
     about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
     turned_y = about_x @ [0.0, 1.0, 0.0]
     turned_z = about_x @ [np.sin(y), 0.0, np.cos(y)]
-    expected = turn(turn(corners @ about_x.T, turned_y, y), turned_z, z) + [1.0, 2.0, 3.0]
+    expected = np.array([1.0, 2.0, 3.0]) + turn(turn(corners @ about_x.T, turned_y, y), turned_z, z)
     placed = load_target(
         Target(builtin="box", size=(1.0, 2.0, 3.0), rotation_deg=(20.0, 30.0, 40.0), translation=(1.0, 2.0, 3.0))
     )
