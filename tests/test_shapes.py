@@ -45,6 +45,13 @@ def test_mesh_is_one_closed_outward_oriented_piece(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
+def test_every_face_has_an_area_in_single_precision(name):
+    mesh = make_shape(name)
+    a, b, c = np.moveaxis(mesh.vertices.astype(np.float32)[mesh.faces], 1, 0)
+    assert (np.cross(b - a, c - a) != 0).any(axis=1).all()
+
+
+@pytest.mark.parametrize("name", SHAPES)
 def test_size_is_the_one_stated_and_fits_the_view(name):
     mesh = make_shape(name)
     stated = re.search(r"Size ([\d.]+) × ([\d.]+) × ([\d.]+) m\.", SHAPES[name].__doc__)

@@ -67,7 +67,7 @@ def diver_helmet() -> Manifold:
     rim = lathe([(1.3, -1.42), (1.47, -1.42), (1.47, -1.3), (1.3, -1.22)]).scale((1.1, 1, 0.82))
     bolt = union(rod((0, -0.02, 0), (0, 0.14, 0), 0.04, segments=12), box((0.2, 0.06, 0.06), (0, 0.08, 0)))
     angles = np.radians(np.arange(0, 360, 30) + 15)
-    bolts = union(*(bolt.translate((1.52 * np.cos(a), -1.26, 1.13 * np.sin(a))) for a in angles))
+    bolts = union(*(bolt.translate((1.52 * np.cos(a), -1.27, 1.13 * np.sin(a))) for a in angles))
     port = union(
         lathe([(0.36, 0.75), (0.52, 0.75), (0.52, 1.04), (0.47, 1.1), (0.36, 1.1)], axis="z"),
         rod((0, 0, 0.7), (0, 0, 0.98), 0.4),

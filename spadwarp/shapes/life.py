@@ -28,7 +28,7 @@ from .solids import (
 def fish() -> Manifold:
     """Fish swimming to the left, fins spread.
 
-    Size 3.80 × 2.38 × 1.56 m.
+    Size 3.80 × 2.40 × 1.57 m.
     """
     top = spline(
         [(-1.75, 0.02), (-1.6, 0.16), (-1.2, 0.48), (-0.6, 0.74), (0, 0.74), (0.6, 0.5), (1.05, 0.22), (1.35, 0.18)]
@@ -173,7 +173,8 @@ def _head_and_shoulders(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarr
 
 def _fin(root: tuple[float, float], tips: list[tuple[float, float]]) -> Manifold:
     """Fan of rays in the plane z = 0 from `root` to `tips`, with a web between them."""
-    rays = [rod((*root, 0), (*tip, 0), 0.07, 0.022, segments=10) for tip in spline(tips, 2)]
+    ends = np.asarray(root) + 1.03 * (spline(tips, 2) - root)  # past the web, so that no edges coincide
+    rays = [rod((*root, 0), (*end, 0), 0.07, 0.031, segments=10) for end in ends]
     return union(plate([root, *tips], 0.045), *rays)
 
 

@@ -73,7 +73,7 @@ def anchor() -> Manifold:
 def cannon() -> Manifold:
     """Ship's cannon on a truck carriage, its muzzle towards the lower right.
 
-    Size 3.60 × 2.14 × 2.52 m.
+    Size 3.60 × 2.13 × 2.50 m.
     """
     profile = [
         (0, -0.34), (0.07, -0.33), (0.12, -0.26), (0.12, -0.2), (0.07, -0.13), (0.08, -0.08), (0.25, 0), (0.36, 0.04),
@@ -87,9 +87,9 @@ def cannon() -> Manifold:
          (-0.15, 0.36), (0.5, 0.36), (0.5, -0.55), (0.2, -0.55), (0, -0.4), (-0.7, -0.4), (-0.9, -0.55)], 0.14,
     ).translate((0, 0, 0.4))  # fmt: skip
     wheel = union(rod((0, 0, 0), (0, 0, 0.16), 0.3), rod((0, 0, -0.1), (0, 0, 0.24), 0.09))
-    wheels = union(*(wheel.translate((x, -0.62, 0.47)) for x in (-1.08, 0.3)))
+    wheels = union(*(wheel.translate((x, -0.62, 0.45)) for x in (-1.08, 0.3)))
     axles = union(*(box((0.22, 0.2, 1.1), (x, -0.62, 0)) for x in (-1.08, 0.3)))
-    bed = box((1.75, 0.1, 0.8), (-0.42, -0.5, 0))
+    bed = box((1.75, 0.1, 0.78), (-0.42, -0.485, 0))
     trunnion = rod((0.05, 0.3, -0.52), (0.05, 0.3, 0.52), 0.1)
     cap = box((0.32, 0.06, 0.16), (0.05, 0.42, 0.4))
     quoin = box((0.5, 0.46, 0.3), (-1.0, -0.26, 0))
