@@ -150,7 +150,7 @@ def build_model(scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, c
             bvh_leaf_size=1 if device.is_cuda else None,
         )
         reflectance = wp.array(mesh.reflectance, dtype=float, device=device)
-        surfaces = sk.make_surfaces(device_mesh, reflectance)
+        surfaces = sk.make_surfaces(device_mesh, reflectance, camera=lens if camera else None)
     model = sk.Model(
         device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
     )
@@ -167,6 +167,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         estimator=scene.transport.estimator,
         paper_albedo=scene.medium.albedo == "paper",
         mesh=mesh is not None,
+        few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,
         bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),
         roulette=scene.transport.termination == "roulette",
     )

@@ -7,6 +7,8 @@ import pytest
 
 import spadwarp
 from scenes import scene
+from spadwarp.model import build_model, pick_device, transport_spec
+from spadwarp.targets import build_mesh
 from statistics_of_samples import DEVICES, equal_means_p
 
 SEEDS = 32
@@ -102,3 +104,27 @@ def test_a_blocker_casts_a_shadow(device):
     # The lens is 2 cm wide: half a pixel's percent of penumbra at the screen's edge.
     assert (shaded[:, 2:] <= 0.02 * open_view[:, 2:]).all()
     np.testing.assert_allclose(shaded[:, 0], open_view[:, 0], rtol=0.05)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
+    """A staircase, tilted, close to a wide lens: with and without the map the same tallies, with fewer shadow rays."""
+    one = scene(
+        camera={"width": 16, "height": 16, "aperture_diameter": 0.1},
+        targets=[{"builtin": "staircase", "scale": 0.4, "rotation_deg": [20, -30, 10], "translation": [0, 0, 2.0]}],
+        transport={"estimator": estimator},
+    )
+    mesh = build_mesh(one)
+    model = build_model(one, pick_device(device), mesh)
+    spec = transport_spec(one, mesh)
+    tallies, rays = [], []
+    for surfaces in (model.surfaces, sk.make_surfaces(model.mesh, model.surfaces.reflectance)):
+        data = sk.make_data(model)
+        sk.launch_transport(
+            spec, dataclasses.replace(model, surfaces=surfaces), data, seed=3, first_id=0, photon_count=100_000
+        )
+        tallies.append(data.tally.numpy())
+        rays.append(sk.read_ledger(data)[1]["shadow_queries"])
+    np.testing.assert_array_equal(*tallies)
+    assert tallies[0].any() and rays[0] < 0.8 * rays[1]

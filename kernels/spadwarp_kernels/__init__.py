@@ -4,7 +4,7 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 `wp.Mesh`.
 """
 
-from .camera import Camera, pixel_direction, project, sample_lens
+from .camera import Camera, lens_point, pixel_direction, project
 from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance
 from .gate import C0, Gate, gate_bin
@@ -18,6 +18,7 @@ from .phase import (
     sample_henyey_greenstein,
 )
 from .philox import philox4x32, random_block, u01, u01_fine
+from .shadow import near_depth_map
 from .surface import (
     SurfaceHit,
     intersect_mesh,
@@ -30,6 +31,7 @@ from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
 from .transport import (
     COMPONENTS,
     ESTIMATORS,
+    FEW_FACES,
     Data,
     Model,
     Records,
@@ -51,6 +53,7 @@ __all__ = [
     "COMPONENTS",
     "COUNTERS",
     "ESTIMATORS",
+    "FEW_FACES",
     "HENYEY_GREENSTEIN",
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
@@ -77,11 +80,13 @@ __all__ = [
     "intersect_mesh_aimed",
     "lambert_brdf",
     "launch_transport",
+    "lens_point",
     "load_transport_kernel",
     "make_data",
     "make_records",
     "make_surfaces",
     "make_transport_kernel",
+    "near_depth_map",
     "next_event_value",
     "offset_from_surface",
     "one_minus_cosine",
@@ -94,7 +99,6 @@ __all__ = [
     "rotate_direction",
     "sample_henyey_greenstein",
     "sample_lambert",
-    "sample_lens",
     "segment_meets_box",
     "snap_direction",
     "to_fixed_point",

@@ -3,7 +3,6 @@
 import warp as wp
 
 from .direction import cos_sin_turn
-from .philox import STREAM_LENS, random_block, u01
 
 
 @wp.struct
@@ -52,21 +51,9 @@ def pixel_direction(camera: Camera, column: float, row: float) -> wp.vec3:
     )
 
 
-@wp.struct
-class LensSample:
-    """A point on the aperture disc and a number in [0, 1) for the rounding of what is deposited."""
-
-    point: wp.vec3
-    dither: float
-
-
 @wp.func
-def sample_lens(camera: Camera, seed: wp.uint64, id: wp.uint64, event: wp.uint32) -> LensSample:
-    """A uniform point on the aperture disc, the same for every use within one event of one photon."""
-    block = random_block(seed, id, event, STREAM_LENS)
-    r = camera.aperture_radius * wp.sqrt(u01(block[0]))
-    turn = cos_sin_turn(u01(block[1]))
-    sample = LensSample()
-    sample.point = wp.vec3(r * turn[0], r * turn[1], 0.0)
-    sample.dither = u01(block[2])
-    return sample
+def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
+    """A uniform point on the aperture disc [m], for uniform xi1, xi2 in [0, 1)."""
+    r = camera.aperture_radius * wp.sqrt(xi1)
+    turn = cos_sin_turn(xi2)
+    return wp.vec3(r * turn[0], r * turn[1], 0.0)

@@ -6,6 +6,7 @@ After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joi
 import warp as wp
 
 from .camera import Camera
+from .direction import cotangent
 from .gate import Gate
 
 
@@ -111,48 +112,35 @@ def sample_flight(
     # The cross product, not |x|^2 - t_c^2, which cancels. The floor keeps float32 angles of a coaxial laser apart.
     d = wp.max(wp.length(wp.cross(x, u)), 1.0e-7)
     kept = 1.0 - wp.exp(-extinction * width)
+    thick = extinction * width > 1.0e-4
+    # Angles between the flight and the direction to the lens, or its opposite: measured so that they are small far off.
     away = s0 >= t_c
-
-    begin = float(0.0)
-    end = float(0.0)
-    if away:
-        begin = wp.atan2(d, s0 - t_c)
-        end = wp.atan2(d, s1 - t_c)
-    else:
-        begin = _complement(wp.atan2(d, t_c - s0), a2)
-        end = _complement(wp.atan2(d, t_c - s1), a2)
+    sign = wp.where(away, -1.0, 1.0)
+    first = wp.atan2(d, sign * (t_c - s0))
+    last = wp.atan2(d, sign * (t_c - s1))
+    begin = wp.where(away, first, _complement(first, a2))
+    end = wp.where(away, last, _complement(last, a2))
     span = begin - end
     angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
 
     s = float(0.0)
     if xi_choice < angular:
-        if away:
-            psi = begin - xi * span
-            s = t_c + d * wp.cos(psi) / wp.sin(psi)
-        else:
-            g = begin - xi * span
-            # theta = a F/sqrt(1 - F^2) with F = 1 - g
-            theta = wp.sqrt(a2) * (1.0 - g) / wp.sqrt(g * (2.0 - g))
-            s = t_c - d * wp.cos(theta) / wp.sin(theta)
-    elif extinction * width > 1.0e-4:
-        s = s0 - wp.log(1.0 - xi * kept) / extinction
+        g = begin - xi * span
+        # theta = a F/sqrt(1 - F^2) with F = 1 - g
+        angle = wp.where(away, g, wp.sqrt(a2) * (1.0 - g) / wp.sqrt(g * (2.0 - g)))
+        s = t_c - sign * d * cotangent(angle)
     else:
-        s = s0 + xi * width
+        s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
     s = wp.clamp(s, s0, s1)
 
     along = s - t_c
     r2 = d * d + along * along
-    linear_density = 1.0 / width
-    if extinction * width > 1.0e-4:
-        linear_density = extinction * wp.exp(-extinction * (s - s0)) / kept
-    angular_density = float(0.0)
-    if angular > 0.0:
-        if away:
-            angular_density = d / (r2 * span)
-        else:
-            theta = wp.atan2(d, -along)
-            q = a2 + theta * theta
-            angular_density = a2 / (q * wp.sqrt(q) * span) * d / r2
+    linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
+    theta = wp.atan2(d, -along)
+    q = a2 + theta * theta
+    angular_density = wp.where(away, 1.0, a2 / (q * wp.sqrt(q))) * d / (r2 * wp.max(span, 1.0e-30))
+    if angular == 0.0:
+        angular_density = 0.0
     sample.s = s
     sample.r = wp.sqrt(r2)
     sample.density = (1.0 - angular) * linear_density + angular * angular_density

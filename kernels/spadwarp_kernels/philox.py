@@ -78,6 +78,24 @@ def u01(word: wp.uint32) -> float:
 
 
 @wp.func
+def u01_high(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the upper 16 bits, on the grid (k + 1/2) / 2^16."""
+    return (float(word >> wp.uint32(16)) + 0.5) * 1.52587890625e-05
+
+
+@wp.func
+def u01_low(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the lower 16 bits, on the grid (k + 1/2) / 2^16; independent of `u01_high`."""
+    return (float(word & wp.uint32(0xFFFF)) + 0.5) * 1.52587890625e-05
+
+
+@wp.func
+def u01_last(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the last 8 bits, on the grid (k + 1/2) / 2^8; independent of `u01` of the same word."""
+    return (float(word & wp.uint32(0xFF)) + 0.5) * 0.00390625
+
+
+@wp.func
 def u01_fine(word: wp.uint32) -> float:
     """Uniform float32 in [0, 1 - 2^-24] with the full 32-bit resolution near 0, for densities that peak at 0."""
     return wp.min(float(word) * 2.3283064365386963e-10, 0.99999994)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, project, sample_lens
+from .camera import Camera, lens_point, project
 from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance, exit_face
 from .gate import Gate, gate_bin
@@ -21,7 +21,19 @@ from .guided import Guiding, clip_flight, sample_flight
 from .laser import Laser, emit_photon
 from .medium import Medium, free_path
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
-from .philox import STREAM_FLIGHT_SAMPLE, STREAM_ROULETTE, STREAM_TRANSPORT, random_block, u01, u01_fine
+from .philox import (
+    STREAM_FLIGHT_SAMPLE,
+    STREAM_LENS,
+    STREAM_ROULETTE,
+    STREAM_TRANSPORT,
+    random_block,
+    u01,
+    u01_fine,
+    u01_high,
+    u01_last,
+    u01_low,
+)
+from .shadow import may_be_hidden, near_depth_map
 from .surface import intersect_faces, intersect_mesh, lambert_brdf, offset_from_surface, segment_meets_box
 from .tally import (
     ABSORBED_SURFACE,
@@ -114,12 +126,20 @@ class Records:
 
 @wp.struct
 class Surfaces:
-    """The target: a `wp.Mesh` id, its padded bounding box [m], the reflectance of each face in [0, 1]."""
+    """The target as the kernels take it.
+
+    Attributes:
+        mesh: Id of a `wp.Mesh`.
+        lower, upper: Its bounding box [m], padded against rounding.
+        reflectance: Of each face, in [0, 1].
+        near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
+    """
 
     mesh: wp.uint64
     lower: wp.vec3
     upper: wp.vec3
     reflectance: wp.array(dtype=float)
+    near_depth: wp.array2d(dtype=float)
 
 
 @wp.func
@@ -148,7 +168,7 @@ class _Walk:
     """State of a thread between the stages.
 
     A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
-    values of both branches alive around the loop and doubles the registers; a struct's attributes are assigned in place.
+    values of both branches alive around the loop and doubles the registers; attributes are assigned in place.
     """
 
     stage: int
@@ -165,6 +185,7 @@ class _Walk:
     reason: int  # ledger entry of the history's end
     # Its next event:
     block: wp.vec4ui
+    sample_block: wp.vec4ui
     distance: float  # to the end of the flight
     face: int  # hit there; -1 in the water
     normal: wp.vec3
@@ -254,9 +275,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.albedo = medium.albedo * u01(draw[1])
                     s.stage = _EVENT
                     if wp.static(guided):
-                        sample = sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 2))
-                        s.lens = sample.point
-                        s.dither = sample.dither
+                        s.sample_block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+                        s.lens = lens_point(camera, u01(s.sample_block[2]), u01(s.sample_block[3]))
+                        s.dither = u01_last(s.sample_block[2])
                         s.interval = clip_flight(camera, gate, s.x, s.u, s.path, s.lens, limit)
                         if s.interval[0] < s.interval[1] and medium.extinction > 0.0:
                             s.stage = _FLIGHT_SAMPLE
@@ -269,9 +290,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
                         s.stage = _EVENT
                         if s.interval[0] < s.interval[1]:
-                            flight_block = random_block(
-                                seed, first_id + wp.uint64(s.photon), wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE
-                            )
                             g = medium.anisotropy
                             flight = sample_flight(
                                 s.x - s.lens,
@@ -279,8 +297,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.interval,
                                 medium.extinction,
                                 (1.0 - g) * (1.0 - g) / wp.max(g, 0.05),
-                                u01(flight_block[0]),
-                                u01_fine(flight_block[1]),
+                                u01(s.sample_block[0]),
+                                u01_fine(s.sample_block[1]),
                             )
                             s.along = flight.s
                             y = s.x + s.along * s.u
@@ -319,7 +337,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
                                 if s.surface_count == 1 and s.collisions == 1:
                                     component = BALLISTIC
-                                id = first_id + wp.uint64(s.photon)
                                 s.contributions += 1
                                 deposit(
                                     tally,
@@ -328,7 +345,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     tally_index(camera, gate, pixel, s.path + crossing, component),
                                     s.weight,
                                     scale,
-                                    sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 1)).dither,
+                                    u01_last(s.block[0]),
                                 )
                     if s.distance > limit:
                         s.reason = MAX_PATH
@@ -354,10 +371,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(next_event) or s.face >= 0:
                                 pixel = project(camera, s.x)
                                 if pixel >= 0:
-                                    id = first_id + wp.uint64(s.photon)
-                                    sample = sample_lens(camera, seed, id, wp.uint32(2 * s.collisions + 1))
-                                    s.lens = sample.point
-                                    s.dither = sample.dither
+                                    if wp.static(guided):
+                                        id = first_id + wp.uint64(s.photon)
+                                        draw = random_block(seed, id, wp.uint32(s.collisions), STREAM_LENS)
+                                        s.lens = lens_point(camera, u01(draw[0]), u01(draw[1]))
+                                        s.dither = u01_last(draw[0])
+                                    else:
+                                        # The word that only guided needs otherwise, and bits that the flight left.
+                                        s.lens = lens_point(camera, u01_high(s.block[3]), u01_low(s.block[3]))
+                                        s.dither = u01_last(s.block[0])
                                     to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
@@ -387,7 +409,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         needed = False
                         if wp.static(has_mesh):
                             origin = s.x + s.along * s.u
-                            needed = segment_meets_box(origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper)
+                            needed = may_be_hidden(camera, surfaces.near_depth, origin)
+                            if needed:
+                                needed = segment_meets_box(origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper)
                         if not needed:
                             deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
                             s.ray = _NO_RAY
@@ -602,18 +626,24 @@ def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
 
 
 def make_surfaces(
-    mesh: wp.Mesh | None, reflectance: wp.array | float = 0.5, *, device: wp.DeviceLike = None
+    mesh: wp.Mesh | None,
+    reflectance: wp.array | float = 0.5,
+    *,
+    camera: "Camera | None" = None,
+    device: wp.DeviceLike = None,
 ) -> Surfaces:
     """The kernel's view of a mesh.
 
     Args:
-        mesh: Any `wp.Mesh`; None for no surface at all.
+        mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew.
         reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
+        camera: Saves most of the rays between scattering events and its lens.
         device: Where the empty arrays go if there is no mesh.
     """
     surfaces = Surfaces()
     if mesh is None:
         surfaces.reflectance = wp.zeros(0, dtype=float, device=device)
+        surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
         return surfaces
     face_count = mesh.indices.size // 3
     if isinstance(reflectance, float):
@@ -627,6 +657,10 @@ def make_surfaces(
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     surfaces.reflectance = reflectance
+    if camera is None:
+        surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=mesh.device)
+    else:
+        surfaces.near_depth = near_depth_map(mesh, camera)
     return surfaces
 
 
@@ -644,7 +678,9 @@ def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> 
     make_transport_kernel(spec, device.is_cuda).module.load(device, _BLOCK if device.is_cuda else 1)
 
 
-def launch_transport(spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int) -> None:
+def launch_transport(
+    spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int
+) -> None:
     """Walks the photons first_id ... first_id + photon_count - 1 and adds them to `data`; asynchronous on CUDA.
 
     Args:
