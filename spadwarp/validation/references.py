@@ -1,0 +1,137 @@
+"""Numbers that the cases are held to, each with its source.
+
+Published rows stand with more digits than were published where the float64 references of the test suite
+(`tests/reference/`) give them; the tests hold those references to the published digits and these numbers to the
+references.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+__all__ = [
+    "AFTER_COLLISIONS",
+    "AFTER_PATH",
+    "CUBE60",
+    "CUTOFF",
+    "EXIT_COSINES",
+    "EXIT_COSINE_EDGES",
+    "FLUENCE",
+    "LAMBERTIAN",
+    "NEAR_AXIS",
+    "SINGLE_SCATTER",
+    "SLABS",
+    "TIME_RESOLVED",
+    "Fluence",
+    "Pulse",
+    "Slab",
+]
+
+
+class Slab(NamedTuple):
+    """An index-matched slab, normal incidence; fractions that leave it, `transmitted` with the direct beam."""
+
+    anisotropy: float
+    albedo: float
+    optical_depth: float
+    reflected: float
+    transmitted: float
+
+    @property
+    def text(self) -> str:
+        depth = "half-space" if math.isinf(self.optical_depth) else f"τ {self.optical_depth:g}"
+        return f"g {self.anisotropy:g}, ω {self.albedo:g}, {depth}"
+
+
+# Rows 1–3 and the isotropic half-space: van de Hulst, "Multiple Light Scattering" (1980); Prahl. The others:
+# adding–doubling.
+SLABS = (
+    Slab(0.75, 0.9, 2.0, 0.09739464, 0.66095770),
+    Slab(0.0, 0.5, 1.0, 0.09911919, 0.44605839),
+    Slab(0.924, 0.8, 3.0, 0.01735090, 0.49253490),
+    Slab(0.0, 1.0, 4.0, 0.69092618, 0.30907382),
+    Slab(-0.5, 0.9, 1.0, 0.36729029, 0.50184716),
+    Slab(0.924, 0.97, 7.5, 0.10822358, 0.61149022),
+    Slab(0.0, 0.8, math.inf, 0.28525450, 0.0),
+    Slab(0.924, 0.95, math.inf, 0.10773397, 0.0),
+)
+
+# Diffuse light by the cosine of its direction to the face's normal: adding–doubling.
+EXIT_COSINE_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+EXIT_COSINES = (
+    (SLABS[0], "exit_z_low", (0.00541087, 0.01644196, 0.02370346, 0.02622244, 0.02561590)),
+    (SLABS[0], "exit_z_high", (0.00701837, 0.02727954, 0.05625321, 0.10640841, 0.32866287)),
+    (SLABS[6], "exit_z_low", (0.01317904, 0.03823315, 0.06010053, 0.07883574, 0.09490605)),
+)
+
+
+class Pulse(NamedTuple):
+    """A short pulse on a half-space, normal incidence: fractions reflected by bin of path [m]; coefficients in 1/m."""
+
+    scattering: float
+    absorption: float
+    anisotropy: float
+    edges: tuple[float, ...]
+    fractions: tuple[float, ...]
+
+
+# Doubling at complex absorption, transformed back to path length (Abate & Whitt 1995).
+TIME_RESOLVED = Pulse(
+    0.9, 0.1, 0.5, (0.0, 1.0, 2.0, 4.0, 8.0, 16.0), (0.04104309, 0.03773958, 0.06089517, 0.07164072, 0.04903578)
+)
+
+# Exact: ⟨z⟩ [m], ⟨r²⟩ [m²] for isotropic scattering of 1/m after a path of 5 m; ⟨z⟩, ⟨r²⟩, ⟨cosθ⟩ for g = 0.924 after
+# 5 collisions.
+AFTER_PATH = (0.993262, 8.013476)
+AFTER_COLLISIONS = (4.295598, 27.128079, 0.673535)
+
+# ⟨cosθ⟩ after 5 collisions, g = 0.924, by the rule's threshold (1: off): density of the cosine from collision to
+# collision.
+NEAR_AXIS = {0.9: 0.70988679, 0.97: 0.68573084, 0.9998: 0.67353803, 1.0: 0.67353452}
+
+# Reflectance of the isotropic half-space, ω = 0.8, by weight cut-off (0: none): sums of the orders of scattering that
+# survive.
+CUTOFF = {0.05: 0.28315764, 2e-4: 0.28525224, 0.0: 0.28525450}
+
+
+class Fluence(NamedTuple):
+    """Light of an isotropic point source, isotropic scattering of 1/m, after `path` [m], by shell of radius."""
+
+    absorption: float
+    path: float
+    edges: tuple[float, ...]
+    fractions: tuple[float, ...]
+
+
+# Fourier–Laplace solution of the transport equation; the outermost shell holds the unscattered front.
+FLUENCE = Fluence(0.2, 5.0, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (0.0169338, 0.0877305, 0.1297344, 0.0951447, 0.0383361))
+
+# Fraction absorbed and its standard error, pencil and isotropic source: MCX's `cube60` benchmark, published to 0.01 %.
+_ROUNDED = 1e-4 / math.sqrt(12.0)
+CUBE60 = ((0.1769, _ROUNDED), (0.8857, _ROUNDED))
+
+# Collected fractions by optical path from 2 m on in bins of 1 m: quadrature. Key: what is summed; rows and columns
+# from 0.
+SINGLE_SCATTER: dict[str, tuple[slice, slice, tuple[float, ...]]] = {
+    "whole field": (slice(0, 32), slice(0, 32), (3.442913e-9, 2.050495e-9, 1.021325e-9, 5.080060e-10, 2.684784e-10)),
+    "on axis, 2 × 2 pixels": (slice(15, 17), slice(15, 17), (0.0, 0.0, 7.17902e-12, 9.87632e-12, 5.37423e-12)),
+    "rows 15–16, columns 6–7": (
+        slice(15, 17),
+        slice(6, 8),
+        (9.56975e-11, 4.64951e-11, 2.05836e-11, 1.01402e-11, 5.35647e-12),
+    ),
+    "rows 9–10, columns 8–9": (
+        slice(9, 11),
+        slice(8, 10),
+        (6.44637e-12, 4.02951e-11, 2.05685e-11, 1.01337e-11, 5.35337e-12),
+    ),
+}
+
+# The same for light reflected once by the plane at 5 m: quadrature.
+LAMBERTIAN: dict[str, tuple[slice, slice, float]] = {
+    "whole field": (slice(0, 32), slice(0, 32), 9.9012051e-9),
+    "on axis, 2 × 2 pixels": (slice(15, 17), slice(15, 17), 3.9663101e-11),
+    "upper left corner, 2 × 2 pixels": (slice(0, 2), slice(0, 2), 3.6962522e-11),
+    "lower right corner, 2 × 2 pixels": (slice(30, 32), slice(30, 32), 3.7233195e-11),
+}
