@@ -48,6 +48,7 @@ def arrival_time(
         ValueError: naming the argument, its value and what is allowed.
     """
     import warp as wp
+
     from spadwarp_kernels import depth as kernels
 
     if method not in METHODS:

@@ -1,7 +1,7 @@
 """Exact binomial counts from Philox, in float64.
 
-The success probability is given as a hazard: p = 1 − exp(−hazard), the chance of at least one event in a Poisson process
-of that mean. Small p keeps all its digits, and so does 1 − p where p is near 1.
+The success probability is given as a hazard: p = 1 − exp(−hazard), the chance of at least one event in a Poisson
+process of that mean. Small p keeps all its digits, and so does 1 − p where p is near 1.
 """
 
 import warp as wp
@@ -94,9 +94,9 @@ def binomial(
 ) -> tuple[int, wp.uint32]:
     """A count from Binomial(n, 1 − exp(−hazard)) and the first random block that it has not used.
 
-    n in [0, 2^31), hazard in [0, inf]. Inversion while the mean (of the rarer outcome) is below 10, above it transformed
-    rejection with squeeze, BTRS: W. Hörmann, "The generation of binomial random variates", J. Stat. Comput. Simul. 46,
-    101 (1993).
+    n in [0, 2^31), hazard in [0, inf]. Inversion while the mean (of the rarer outcome) is below 10, above it
+    transformed rejection with squeeze, BTRS: W. Hörmann, "The generation of binomial random variates", J. Stat. Comput.
+    Simul. 46, 101 (1993).
     """
     block = wp.uint32(first_block)
     if n <= 0 or hazard <= wp.float64(0.0):

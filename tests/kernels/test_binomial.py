@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy import stats
+
 from spadwarp_kernels.binomial import binomial, expm1, log1p
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+
 from spadwarp_kernels.depth import PHASES, arrival_bins, first_invalid_row, launch_pixels
 
 BINS = 96

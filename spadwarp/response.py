@@ -1,0 +1,315 @@
+"""The instrument response: laser pulse ⊗ detector jitter, with exact integrals over time bins."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["FWHM_PER_SIGMA", "InstrumentResponse", "SparseResponse", "instrument_response", "response_matrix"]
+
+Floats = NDArray[np.float64]
+
+FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
+_SUPPORT_SIGMAS = 6.0  # 1e-9 of a Gaussian lies beyond on either side
+_SUPPORT_TAILS = 16.0  # 1e-7 of an exponential lies beyond
+
+_erf = np.vectorize(math.erf, otypes=[np.float64])
+_erfc = np.vectorize(math.erfc, otypes=[np.float64])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InstrumentResponse:
+    """Probability density of the delay between a photon's arrival and its time tag, of unit area.
+
+    A Gaussian convolved with an exponential tail, or a measured curve, linear between its points. Everything is in
+    closed form: integrals over bins are exact however narrow the response is. With `sigma` and `tail` 0 it is a delta.
+
+    Attributes:
+        sigma: standard deviation of the Gaussian [s]; time 0 is its centre.
+        tail: time constant of the exponential [s], 0: none.
+        times, values: a measured curve instead: ascending times [s] and values ≥ 0 of any scale.
+    """
+
+    sigma: float = 0.0
+    tail: float = 0.0
+    times: ArrayLike | None = None
+    values: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "tail"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} = {value} s is outside [0, inf)")
+        if (self.times is None) != (self.values is None):
+            raise ValueError("times and values of a measured response go together")
+        if self.times is None:
+            return
+        times, values = np.array(self.times, np.float64), np.array(self.values, np.float64)
+        if times.ndim != 1 or times.size < 2 or values.shape != times.shape:
+            raise ValueError(f"times {times.shape} and values {values.shape} are not two equal lists of two or more")
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise ValueError("times of a measured response must be finite and ascending")
+        if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
+            span = f"{values.min()} … {values.max()}"
+            raise ValueError(f"values of a measured response ({span}) must be finite, not negative and not all 0")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values / np.trapezoid(values, times))
+
+    # The curve
+
+    def density(self, time: ArrayLike) -> Floats:
+        """Probability density [1/s]; a delta has none (ValueError)."""
+        t = np.asarray(time, np.float64)
+        if self.times is not None:
+            return np.interp(t, self._knots, self._heights, left=0.0, right=0.0)
+        if self.tail == 0:
+            if self.sigma == 0:
+                raise ValueError("a response without width has no density")
+            return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
+        return self._tail_density(t)
+
+    def cumulative(self, time: ArrayLike) -> Floats:
+        """Integral of the density up to `time`."""
+        t = np.asarray(time, np.float64)
+        if self.times is not None:
+            i, x = self._segment(t)
+            return self._cumulative_at[i] + x * (self._heights[i] + 0.5 * x * self._slopes[i])
+        gaussian = _gaussian_cumulative(t, self.sigma)
+        return gaussian if self.tail == 0 else gaussian - self.tail * self._tail_density(t)
+
+    def cumulative_integral(self, time: ArrayLike) -> Floats:
+        """Integral of `cumulative` up to `time` [s]."""
+        t = np.asarray(time, np.float64)
+        if self.times is not None:
+            i, x = self._segment(t)
+            inside = x * (self._cumulative_at[i] + x * (0.5 * self._heights[i] + x * self._slopes[i] / 6.0))
+            return self._integral_at[i] + inside + np.maximum(t - self._knots[-1], 0.0)
+        if self.sigma == 0:
+            gaussian = np.maximum(t, 0.0)
+        else:
+            peak = np.exp(-0.5 * (t / self.sigma) ** 2) * (self.sigma / math.sqrt(2 * math.pi))
+            gaussian = t * _gaussian_cumulative(t, self.sigma) + peak
+        return gaussian if self.tail == 0 else gaussian - self.tail * self.cumulative(t)
+
+    def bin_fractions(self, edges: ArrayLike, *, arrival: float = 0.0) -> Floats:
+        """Fraction of the detections of light at time `arrival` in each bin between `edges` [s]: `[edges - 1]`."""
+        return np.diff(self.cumulative(np.asarray(edges, np.float64) - arrival))
+
+    # Its numbers
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """(lower, upper) [s]: all but 1e-7 of the response lies between."""
+        if self.times is not None:
+            return float(self._knots[0]), float(self._knots[-1])
+        side = _SUPPORT_SIGMAS * self.sigma
+        return -side, side + _SUPPORT_TAILS * self.tail
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean delay [s]."""
+        if self.times is None:
+            return self.tail
+        return float(self._knots[-1] - self._integral_at[-1])
+
+    @cached_property
+    def mode(self) -> float:
+        """Delay at which the density is largest [s]."""
+        if self.times is not None:
+            return float(self._knots[self._heights.argmax()])
+        if self.tail == 0 or self.sigma == 0:
+            return 0.0
+        time, density = self._fine()
+        return float(time[density.argmax()])
+
+    @cached_property
+    def fwhm(self) -> float:
+        """Full width at half of the largest density [s]."""
+        if self.times is None and self.tail == 0:
+            return FWHM_PER_SIGMA * self.sigma
+        time, density = self._fine()
+        above = np.flatnonzero(density >= 0.5 * density.max())
+        return float(time[above[-1]] - time[above[0]])
+
+    def _fine(self) -> tuple[Floats, Floats]:
+        time = np.linspace(*self.support, 20_001)
+        return time, self.density(time)
+
+    # The exponential tail
+
+    def _tail_density(self, t: Floats) -> Floats:
+        """Exponentially modified Gaussian: exp(σ²/2τ² − t/τ) · erfc(z) / 2τ, z = (σ/τ − t/σ)/√2."""
+        if self.sigma == 0:
+            return np.where(t >= 0, np.exp(-np.maximum(t, 0.0) / self.tail) / self.tail, 0.0)
+        z = (self.sigma / self.tail - t / self.sigma) / math.sqrt(2.0)
+        gaussian = -0.5 * (t / self.sigma) ** 2
+        # exp(σ²/2τ² − t/τ) = exp(z² + gaussian): huge times tiny where z is large, hence the scaled erfc there.
+        direct = np.exp(np.where(z < 6, z * z + gaussian, 0.0)) * _erfc(np.minimum(z, 6.0))
+        scaled = np.exp(gaussian) * _scaled_erfc(np.maximum(z, 6.0))
+        return np.where(z < 6, direct, scaled) / (2.0 * self.tail)
+
+    # The measured curve
+
+    @property
+    def _knots(self) -> Floats:
+        return np.asarray(self.times)
+
+    @property
+    def _heights(self) -> Floats:
+        return np.asarray(self.values)
+
+    @cached_property
+    def _slopes(self) -> Floats:
+        return np.append(np.diff(self._heights) / np.diff(self._knots), 0.0)
+
+    @cached_property
+    def _cumulative_at(self) -> Floats:
+        return np.append(0.0, np.cumsum(0.5 * np.diff(self._knots) * (self._heights[1:] + self._heights[:-1])))
+
+    @cached_property
+    def _integral_at(self) -> Floats:
+        width, height = np.diff(self._knots), self._heights
+        return np.append(
+            0.0, np.cumsum(width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0))
+        )
+
+    def _segment(self, t: Floats) -> tuple[NDArray[np.intp], Floats]:
+        """Index of the piece that holds `t` and the time since its begin; outside all pieces, the nearer end."""
+        clipped = np.clip(t, self._knots[0], self._knots[-1])
+        i = np.clip(np.searchsorted(self._knots, clipped, side="right") - 1, 0, self._knots.size - 2)
+        return i, clipped - self._knots[i]
+
+
+def _gaussian_cumulative(t: Floats, sigma: float) -> Floats:
+    if sigma == 0:
+        return np.where(t >= 0, 1.0, 0.0)
+    return 0.5 * _erfc(-t / (sigma * math.sqrt(2.0)))
+
+
+def _scaled_erfc(z: Floats) -> Floats:
+    """exp(z²) erfc(z) for z ≥ 6, from its continued fraction (relative error below 1e-12)."""
+    tail = np.zeros_like(z)
+    for k in range(30, 0, -1):
+        tail = 0.5 * k / (z + tail)
+    return 1.0 / (math.sqrt(math.pi) * (z + tail))
+
+
+def instrument_response(
+    *,
+    pulse_fwhm: float,
+    jitter_fwhm: float,
+    shape: Literal["gaussian", "exponentially_modified_gaussian"] | str | Path = "gaussian",
+    tail: float = 0.0,
+) -> InstrumentResponse:
+    """Pulse ⊗ jitter.
+
+    Args:
+        pulse_fwhm, jitter_fwhm: of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
+        shape: `"gaussian"`; `"exponentially_modified_gaussian"`, with `tail`; or the path of a CSV file with columns
+            time_ps and value, a measured response (pulse included, so that the two widths are not used). The file's
+            time 0 is the arrival of the photon; lines that start with # and one line of names are skipped.
+        tail: time constant of the exponential diffusion tail [s].
+
+    Raises:
+        ValueError: naming the argument, or the file and the line.
+    """
+    for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} = {value} s is outside [0, inf)")
+    sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
+    if shape == "gaussian":
+        return InstrumentResponse(sigma=sigma)
+    if shape == "exponentially_modified_gaussian":
+        return InstrumentResponse(sigma=sigma, tail=tail)
+    return _read_csv(Path(shape))
+
+
+def _read_csv(path: Path) -> InstrumentResponse:
+    if not path.is_file():
+        raise ValueError(f"irf = {str(path)!r} is neither a known shape nor a file")
+    rows: list[tuple[float, float]] = []
+    named = False
+    with path.open(newline="") as file:
+        for number, row in enumerate(csv.reader(file), 1):
+            if not row or row[0].lstrip().startswith("#"):
+                continue
+            try:
+                time, value = (float(cell) for cell in row[:2])
+            except ValueError:
+                if rows or named:
+                    raise ValueError(f"{path}, line {number}: {','.join(row)!r} is not time_ps,value") from None
+                named = True
+                continue
+            rows.append((time * 1e-12, value))
+    try:
+        return InstrumentResponse(times=[time for time, _ in rows], values=[value for _, value in rows])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+class SparseResponse(NamedTuple):
+    """Detector bins by source bins in CSR form: entries row_start[k] … row_start[k + 1] belong to detector bin k."""
+
+    row_start: NDArray[np.int32]
+    source_bin: NDArray[np.int32]
+    weight: NDArray[np.float32]
+
+
+def response_matrix(
+    irf: InstrumentResponse,
+    *,
+    source_start: float,
+    source_width: float,
+    source_bins: int,
+    edges: ArrayLike,
+    period: float | None = None,
+) -> SparseResponse:
+    """Fraction of the light of each source bin that is detected in each detector bin.
+
+    Light is even over a source bin; response and bins are integrated exactly, so neither needs to be narrow beside the
+    other. With a period P the detector sees time modulo P: source time t and detector time t − mP are one, for all m.
+
+    Args:
+        source_start, source_width, source_bins: the axis of the source [s].
+        edges: of the detector bins [s], ascending, `[bins + 1]`.
+        period: of the pulses [s]; None: time is not folded.
+    """
+    e = np.asarray(edges, np.float64)
+    lower, upper = irf.support
+    turns = range(1)
+    if period is not None:
+        source_stop = source_start + source_bins * source_width
+        first = math.ceil((source_start + lower - e[-1]) / period)
+        turns = range(first, math.floor((source_stop + upper - e[0]) / period) + 1)
+    rows, columns, weights = [], [], []
+    for turn in turns:
+        shifted = e + (turn * period if period is not None else 0.0)
+        begin = np.clip(np.floor((shifted[:-1] - upper - source_start) / source_width), 0, source_bins)
+        stop = np.clip(np.ceil((shifted[1:] - lower - source_start) / source_width), 0, source_bins)
+        index = begin[:, None] + np.arange(int(np.max(stop - begin)) + 1)
+        corner = source_start + index * source_width
+        after = irf.cumulative_integral(shifted[1:, None] - corner)
+        before = irf.cumulative_integral(shifted[:-1, None] - corner)
+        weight = np.diff(before - after, axis=1) / source_width
+        keep = (weight > 1e-12) & (index[:, :-1] < source_bins)
+        row, tap = np.nonzero(keep)
+        rows.append(row)
+        columns.append(index[row, tap].astype(np.int32))
+        weights.append(weight[keep])
+    if not rows:
+        return SparseResponse(np.zeros(e.size, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
+    every_row = np.concatenate(rows)
+    order = np.argsort(every_row, kind="stable")
+    entries = np.bincount(every_row, minlength=e.size - 1)
+    return SparseResponse(
+        np.append(0, np.cumsum(entries)).astype(np.int32),
+        np.concatenate(columns)[order],
+        np.concatenate(weights)[order].astype(np.float32),
+    )
