@@ -426,14 +426,17 @@ def background_rate(
     profile: wp.array2d(dtype=float),
     i: int,
     view: wp.vec3d,
-    arrival: wp.float64,
+    beyond: int,
     time: wp.float64,
 ) -> wp.float64:
-    """C_dark + C_back at a time inside the gate [1/s]; a profile is interpolated between bin centres."""
+    """C_dark + C_back at a time inside the gate [1/s]; a profile is interpolated between bin centres.
+
+    `beyond` is 1 after the target's arrival, where water behind it scatters nothing back.
+    """
     if lidar.source == 0:
         return lidar.dark + lidar.constant
     if lidar.source == 1:
-        if time > arrival:
+        if beyond == 1:
             return lidar.dark
         return lidar.dark + single_scatter_rate(lidar, phase, view, time)
     row = i % profile.shape[0]

@@ -61,11 +61,17 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
     reach = wp.max(wp.sqrt(_TWO * wp.log(_ONE + ratio)) + wp.float64(3.5), wp.float64(5.0))
     h = reach / wp.float64(24.0)
     spread = wp.float64(0.0)
+    half_way = wp.float64(0.0)
     for j in range(25):
         z = wp.float64(j) * h
         e = ratio * wp.exp(-_HALF * z * z)
         g = wp.log(_ONE + e)
-        spread += wp.where(j == 0, _ONE, _TWO) * (_ONE + e) * g * g
+        w = wp.where(j == 0, _ONE, _TWO)
+        spread += w * (_ONE + e) * g * g
+        half_way += w * (wp.sqrt(_ONE + e) - _ONE)
+    # Signal and background scores overlap most at s = 1/2: exp(2 K(1/2) - K(1)) bounds the probability.
+    if _TWO * level * h * half_way - signal_count + wp.log(window) < wp.float64(-60.0):
+        return _ZERO
     width = wp.float64(7.0) / wp.sqrt(level * h * spread)
     low = wp.max(_ONE - width, -_ONE)
     high = wp.min(_ONE + width, wp.float64(3.0))
@@ -161,8 +167,11 @@ def _statistics(
                 high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
             half = (high - low) / wp.float64(48.0)
             if half > _ZERO:
+                right = background_rate(lidar, phase, profile, i, view[i], side, low)
                 for panel in range(24):
                     middle = low + (_TWO * wp.float64(panel) + _ONE) * half
+                    left = wp.float64(right)
+                    right = background_rate(lidar, phase, profile, i, view[i], side, middle + half)
                     for node in range(5):
                         x = wp.float64(0.0)
                         w = wp.float64(0.5688888888888889)
@@ -177,7 +186,10 @@ def _statistics(
                         t = middle + x * half
                         z = (t - mu) / sigma
                         pulse = s / (sigma * _SQRT_2PI) * wp.exp(-_HALF * z * z)
-                        level = background_rate(lidar, phase, profile, i, view[i], mu, t)
+                        # Straight across a panel; only a profile can have more detail than that.
+                        level = _HALF * (left + right) + _HALF * (right - left) * x
+                        if lidar.source == 2:
+                            level = background_rate(lidar, phase, profile, i, view[i], side, t)
                         rate = level + pulse
                         if rate > _ZERO:
                             information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
