@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, slab
-from reference.moments import after_collisions, after_path, isotropic_radial_cdf, mean_path
+
+from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab
+from reference.moments import after_collisions, after_path, isotropic_radial_cdf, mean_path, snapped_mean_cosines
 from reference.single_scatter import Lidar, henyey_greenstein, lambertian_plane, single_scatter, single_scatter_total
 from reference.walk import Medium, cosine_law_on_box, isotropic, pencil, walk
 
@@ -54,11 +55,10 @@ def test_time_resolved_reflectance_adds_up_to_the_steady_one():
 
 
 def test_time_resolved_reflectance_agrees_with_the_walk():
-    """Absorption is applied along the path of a walk without it: the clock and the weight then belong together."""
     count, rng = 100_000, np.random.default_rng(3)
-    white = walk(Medium(0.8, 1.0, 0.0), pencil(count), rng, lower=(-math.inf, -math.inf, 0), max_path=8.0)
+    photons = walk(Medium(1.0, 0.8, 0.0), pencil(count), rng, lower=(-math.inf, -math.inf, 0), max_path=8.0)
     for path in (1.0, 3.0, 6.0):
-        score = np.exp(-0.2 * white.path) * ((white.reason == "z_low") & (white.path <= path))
+        score = photons.weight * ((photons.reason == "z_low") & (photons.path <= path))
         expected = cumulative_reflectance(path, anisotropy=0.0, scattering=0.8, absorption=0.2, nodes=24)
         assert abs(score.mean() - expected) < 4 * score.std() / math.sqrt(count)
 
@@ -143,17 +143,26 @@ def test_moments_agree_with_the_walk():
 
 
 def test_near_axis_rule_narrows_the_beam():
-    """Snapping drops tilt: the mean cosine after several collisions comes out too high, and right without the rule."""
+    """Snapping drops tilt: the mean cosine after several collisions comes out too high, by as much as predicted."""
     count = 50_000
-    snapped, exact = (
-        walk(
+    for threshold in (0.9, 1.0):
+        photons = walk(
             Medium(1.0, 1.0, 0.924), pencil(count), np.random.default_rng(5), max_collisions=5, axis_threshold=threshold
         )
-        for threshold in (0.97, 1.0)
-    )
-    error = exact.direction[:, 2].std() / math.sqrt(count)
-    assert abs(exact.direction[:, 2].mean() - 0.924**5) < 4 * error
-    assert snapped.direction[:, 2].mean() - 0.924**5 > 6 * error
+        cosine = photons.direction[:, 2]
+        expected = snapped_mean_cosines(5, anisotropy=0.924, axis_threshold=threshold)[5]
+        assert abs(cosine.mean() - expected) < 4 * cosine.std() / math.sqrt(count)
+    exact = snapped_mean_cosines(5, anisotropy=0.924, axis_threshold=1.0)
+    np.testing.assert_allclose(exact, 0.924 ** np.arange(6), rtol=1e-12)
+    assert snapped_mean_cosines(5, anisotropy=0.924, axis_threshold=0.9)[5] > 0.70
+
+
+def test_orders_of_scattering_add_up():
+    """The first order in closed form, of isotropic scattering: ω/2·(1 − ln 2)."""
+    orders = reflected_by_order(30, anisotropy=0.0, albedo=0.8, nodes=32)
+    assert orders[0] == pytest.approx(0.0, abs=1e-7)
+    assert orders[1] == pytest.approx(0.8 / 2 * (1 - math.log(2)), abs=1e-6)
+    assert orders.sum() == pytest.approx(0.285255, abs=5e-5)
 
 
 def test_isotropic_fluence_agrees_with_the_walk_and_its_second_moment():

@@ -125,7 +125,8 @@ def reflected_by_order(
 ) -> NDArray[np.float64]:
     """Fractions reflected after 0, 1, … orders − 1 scatterings: coefficients of R's power series in the albedo, ωⁿRₙ.
 
-    From R on the circle |ω| = albedo; orders beyond twice `orders` alias into the result, so take albedo**(2·orders) ≪ 1.
+    From R on the circle |ω| = albedo; orders beyond twice `orders` alias into the result, so take albedo**(2·orders) ≪
+    1.
     """
     phases = 2j * math.pi * np.arange(2 * orders) / (2 * orders)
     values = [

@@ -37,8 +37,9 @@ def after_path(path: float, *, scattering: float, anisotropy: float) -> Moments:
 def snapped_mean_cosines(count: int, *, anisotropy: float, axis_threshold: float) -> NDArray[np.float64]:
     """Mean cosine of the direction after 0, 1, … `count` collisions of a beam along +z under the near-axis rule.
 
-    The rule takes an incoming direction with |u_z| >= axis_threshold for the axis itself. The density of the cosine is followed
-    from collision to collision by quadrature: what is snapped scatters from the poles, the rest from where it is.
+    The rule takes an incoming direction with |u_z| >= axis_threshold for the axis itself. The density of the cosine is
+    followed from collision to collision by quadrature: what is snapped scatters from the poles, the rest from where it
+    is.
     """
     g, degree = anisotropy, 600
     node, gauss = np.polynomial.legendre.leggauss(700)
