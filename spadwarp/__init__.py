@@ -14,8 +14,8 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "config",
     "Scene": "config",
-    "presets": "presets",
-    "check": "check",
+    "presets": "catalog",
+    "check": "checks",
     "simulate": "simulation",
     "trace": "simulation",
     "PhotonRecords": "simulation",
@@ -33,12 +33,12 @@ _HOMES = {
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
-    from spadwarp.check import check
+    from spadwarp.catalog import presets
+    from spadwarp.checks import check
     from spadwarp.config import Scene, load_scene
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.files import load_result
     from spadwarp.model import truth_maps
-    from spadwarp.presets import presets
     from spadwarp.result import Result, Truth
     from spadwarp.simulation import PhotonRecords, simulate, trace
 

@@ -12,8 +12,8 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from .catalog import PRESETS
 from .errors import ConfigError
-from .presets import PRESETS
 
 Table = dict[str, Any]
 Key = tuple[str | int, ...]

@@ -27,8 +27,8 @@ from pydantic import (
 from . import _layers
 from ._layers import parse_override
 from ._problems import describe
+from .catalog import PRESETS, WATER_INDICES
 from .errors import ConfigError, FileError
-from .presets import PRESETS, WATER_INDICES
 
 __all__ = [
     "SPEED_OF_LIGHT",
@@ -62,6 +62,10 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _sized(value: Any) -> Any:
+    return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else _listed(value)
+
+
 def _three(value: Any) -> Any:
     return (value,) * 3 if isinstance(value, (int, float)) and not isinstance(value, bool) else _listed(value)
 
@@ -70,7 +74,7 @@ Whole = Annotated[int, BeforeValidator(_whole)]
 Vector = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
 Corner = Annotated[tuple[Bound, Bound, Bound], BeforeValidator(_three)]
-Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_listed), Field(min_length=1, max_length=3)]
+Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_sized), Field(min_length=1, max_length=3)]
 Scale = Annotated[tuple[float, float, float], BeforeValidator(_three)]
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from spadwarp.catalog import presets
 from spadwarp.config import SPEED_OF_LIGHT, Camera, Domain, Laser, Medium, Scene, load_scene, parse_override
 from spadwarp.errors import ConfigError, FileError, SpadwarpError
-from spadwarp.presets import presets
 
 SCENES = sorted((Path(__file__).parents[1] / "configs" / "scenes").glob("*.toml"))
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._frustum import beam_planes, points_inside, view_planes
+from .catalog import PURE_WATER_ABSORPTION, WATER_INDICES
 from .config import SPEED_OF_LIGHT, Laser, Scene
-from .presets import PURE_WATER_ABSORPTION, WATER_INDICES
 
 if TYPE_CHECKING:
     from .targets import TriangleMesh

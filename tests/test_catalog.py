@@ -2,8 +2,8 @@
 
 import pytest
 
+from spadwarp.catalog import PRESETS, PURE_WATER_ABSORPTION, presets
 from spadwarp.config import Camera, Medium, Scene
-from spadwarp.presets import PRESETS, PURE_WATER_ABSORPTION, presets
 
 MEDIA = presets("medium")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spadwarp.check import CheckMessage, check, summary
+from spadwarp.checks import CheckMessage, check, summary
 from spadwarp.config import SPEED_OF_LIGHT, Scene, load_scene
 from spadwarp.targets import TriangleMesh
 
