@@ -6,6 +6,7 @@ import warp as wp
 
 from spadwarp.config import Detector, Laser
 from spadwarp.detector import InstrumentResponse, coates, detect, first_photon_probabilities
+from synthetic_result import make_result, make_scene
 
 BIN = 100e-12
 LASER = Laser(repetition_rate=20e6, pulse_fwhm_ps=85.0)  # period 50 ns: 500 bins
@@ -126,6 +127,22 @@ def test_estimators_know_the_background():
     information = np.sum(left * (shape * t / width**2) ** 2 / hazard, axis=-1)
     bound = np.sqrt(np.mean(1 / information))
     assert abs(np.std(likelihood) / bound - 1) < 4 / np.sqrt(2 * likelihood.size)
+
+
+def test_a_result_brings_its_own_axis_laser_detector_and_backscatter():
+    scene = make_scene(laser={"position": [0.1, 0.0, 0.0], "repetition_rate": 1e6, "pulse_fwhm_ps": 300.0})
+    result = make_result(scene)
+    found = detect(result, pulses=1000, frames=20, seed=3, device="cpu")
+    assert found.counts.shape == (20, *result.histogram.shape)
+    assert found.gate_start == scene.gate.start and found.bin_width == scene.gate.bin_width
+    assert found.irf.fwhm == pytest.approx(np.hypot(300e-12, scene.detector.jitter_fwhm_ps * 1e-12))
+    # Shot noise about the result's own numbers; dark counts are nothing here, and the gate's ends cut 0.3 % off.
+    expected = 20_000 * -np.expm1(-result.detections.sum(axis=-1))
+    assert abs(found.counts.sum() - expected.sum()) < 4 * np.sqrt(expected.sum()) + 0.003 * expected.sum()
+    z = (found.intensity.sum(axis=0) - expected) / np.sqrt(expected)
+    assert abs(z.var() - 1) < 4 * np.sqrt(2 / z.size)
+    backscatter = result.component("backscatter").sum() * scene.laser.photons_per_pulse * scene.detector.pde
+    assert found.background.sum() == pytest.approx(backscatter, rel=0.02)
 
 
 def test_pile_up_is_undone():
