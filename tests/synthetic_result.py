@@ -52,8 +52,8 @@ def make_result(scene: Scene, *, photons: int = 10**9, seed: int = 7, empty: boo
     if not empty:
         rng = np.random.default_rng(seed)
         for index, expected in enumerate(_components(result)):
-            samples = rng.poisson(expected * photons * 1e5)  # stands for an estimator's noise
-            tallies[index] = np.round(samples / 1e5 / UNIT)
+            samples = rng.poisson(expected * photons * 1e8)  # stands for an estimator's noise
+            tallies[index] = np.round(samples / 1e8 / UNIT)
     return result
 
 
@@ -73,7 +73,7 @@ def _components(result: Result) -> list[NDArray[np.float64]]:
     delay = centres - path[..., None]
     tail = np.where(delay > 0, np.exp(-np.clip(delay, 0, None) / 0.3), 0.0)
     forward = 0.05 * np.nan_to_num(tail) * weight[..., None]
-    back = 0.2 * area * np.exp(-c * centres) / centres**2 / path.size
+    back = 0.01 * area * np.exp(-c * centres) / centres**2 / path.size
     back = np.where(~(delay > 0), back, 0.1 * back)
     return [ballistic, forward, back]
 
@@ -96,7 +96,8 @@ def cast_truth(scene: Scene, mesh: TriangleMesh | None) -> Truth:
                 u = -(p @ a) / det
                 q = np.cross(-a, b - a)
                 v, t = (rays @ q) / det, (q @ (c - a)) / det
-            hit = (np.abs(det) > 1e-12) & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0) & (t < nearest)
+                inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9)
+            hit = inside & (np.abs(det) > 1e-12) & (t > 0) & (t < nearest)
             nearest[hit], face[hit] = t[hit], index
     seen = face >= 0
     normal = np.full((*shape, 3), np.nan)

@@ -1,0 +1,223 @@
+"""Pictures for a first look at a result, good enough for a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.depth import Method
+from spadwarp.files import atomic_path
+from spadwarp.result import COMPONENTS, Component, Result, pixel_directions, range_from_path
+
+__all__ = ["write_previews"]
+
+_MISSING = "0.85"  # light grey: NaN
+# Okabe and Ito's colours: told apart with every common colour-blindness and, by their lightness, in print.
+_STYLES: dict[Component, dict[str, Any]] = {
+    "ballistic": {"label": "target, ballistic", "color": "#0072B2", "linewidth": 1.6, "zorder": 3},
+    "forward_scattered": {"label": "target, forward-scattered", "color": "#E69F00", "linewidth": 1.0, "zorder": 2.5},
+    "backscatter": {"label": "water, backscatter", "color": "#009E73", "linewidth": 1.0, "zorder": 2},
+}
+_DPI = 150
+
+
+def write_previews(
+    result: Result, directory: str | Path, *, depth: NDArray[np.float64] | None = None, method: Method = "centroid"
+) -> list[Path]:
+    """Writes `depth.png`, `intensity.png`, `histogram.png` and `truth.png`; returns their paths.
+
+    Args:
+        result: What to show; empty frames give empty pictures, not errors.
+        directory: The folder, made if it is not there.
+        depth: Depth frame `[H, W]` [m] to show; `result.depth(method=method)` if not given.
+        method: How the frame was, or is to be, made; named in the picture.
+
+    Raises:
+        FileError: The folder or a file cannot be written.
+    """
+    frame = result.depth(method=method) if depth is None else np.asarray(depth, dtype=np.float64)
+    figures = {
+        "depth.png": _depth_figure(result, frame, method),
+        "intensity.png": _intensity_figure(result),
+        "histogram.png": _histogram_figure(result),
+        "truth.png": _truth_figure(result),
+    }
+    paths = []
+    for name, figure in figures.items():
+        path = Path(directory) / name
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=_DPI, format="png")
+        paths.append(path)
+    return paths
+
+
+# Figures; `Figure` without pyplot keeps no state and needs no display
+
+
+def _depth_figure(result: Result, frame: NDArray[np.float64], method: str) -> Figure:
+    truth = result.truth.depth
+    error = 100.0 * (frame - truth)
+    low, high = _limits(truth if np.isfinite(truth).any() else frame)
+    margin = 0.05 * (high - low)
+    scale: dict[str, Any] = {"label": "depth z [m]", "colours": "viridis_r", "low": low - margin, "high": high + margin}
+    spread = np.abs(error[np.isfinite(error)])
+    reach = max(float(np.percentile(spread, 98)), 0.1) if spread.size else 1.0
+
+    figure, images, bars = _panels(result, 3)
+    _show(images[0], bars[0], frame, title=f"Measured ({method})", **scale)
+    _show(images[1], bars[1], truth, title="Truth", **scale)
+    title = "Measured − truth"
+    _show(images[2], bars[2], error, title=title, label="depth error [cm]", colours="PuOr", low=-reach, high=reach)
+    return figure
+
+
+def _intensity_figure(result: Result) -> Figure:
+    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+    frames = {
+        "All light in the gate": result.intensity * per_pulse,
+        "Ballistic light alone": result.component("ballistic").sum(axis=-1) * per_pulse,
+    }
+    figure, images, bars = _panels(result, len(frames))
+    for image, bar, (title, frame) in zip(images, bars, frames.items(), strict=True):
+        top = float(frame.max())
+        exponent = int(np.floor(np.log10(top))) if top > 0 else 0
+        exponent = 0 if -2 <= exponent <= 3 else exponent
+        label = "expected detections per pulse" + (f" [$10^{{{exponent}}}$]" if exponent else "")
+        frame = frame / 10.0**exponent
+        _show(image, bar, frame, title=title, label=label, colours="cividis", low=0.0, high=float(frame.max()) or 1.0)
+    return figure
+
+
+def _truth_figure(result: Result) -> Figure:
+    truth = result.truth
+    normal = 0.5 + 0.5 * truth.normal * np.array([1.0, -1.0, -1.0])
+    normal = np.where(np.isfinite(normal), normal, float(_MISSING)).clip(0.0, 1.0)
+    low, high = _limits(truth.depth)
+
+    figure, images, bars = _panels(result, 3)
+    _show(images[0], bars[0], truth.depth, title="Depth", label="depth z [m]", colours="viridis_r", low=low, high=high)
+    _decorate(images[1], "Normal")
+    images[1].imshow(normal, interpolation="nearest")
+    bars[1].axis("off")
+    bars[1].text(0.5, 0.0, "red: right, green: up, blue: to the camera", fontsize=9, ha="center", va="center")
+    label = "Lambertian reflectance"
+    _show(images[2], bars[2], truth.reflectance, title="Reflectance", label=label, colours="cividis", low=0.0, high=1.0)
+    return figure
+
+
+def _histogram_figure(result: Result) -> Figure:
+    figure = Figure(figsize=(7.0, 6.4), layout="constrained")
+    _caption(result, figure)
+    axes = figure.subplots(2, 1)
+    intensity = result.intensity
+    order = np.argsort(intensity, axis=None, kind="stable")
+    order = order[intensity.ravel()[order] > 0]
+    handles: dict[str, Any] = {}
+    for axis, name, index in zip(axes, ("Brightest", "Median"), (-1, (len(order) - 1) // 2), strict=True):
+        axis.set(xlabel="time of flight [ns]", xlim=1e9 * result.bin_edges[[0, -1]])
+        if len(order) == 0:
+            axis.text(0.5, 0.5, "nothing returned in the gate", transform=axis.transAxes, ha="center", va="center")
+            axis.set_yticks([])
+        else:
+            row, column = divmod(int(order[index]), intensity.shape[1])
+            axis.set_title(f"{name} pixel of those with a return: row {row}, column {column}", fontsize=10)
+            _plot_pixel(result, axis, row, column)
+            handles |= {line.get_label(): line for line in axis.get_legend_handles_labels()[0]}
+    if handles:
+        figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
+    """Components of one pixel over time of flight, and over the range along its line of sight."""
+    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+    parts = result.tallies[:, row, column] * (result.unit / result.photons * per_pulse)
+    time = 1e9 * result.bin_edges
+    top = parts.max()
+    bottom = np.clip(0.5 * parts[parts > 0].min(), 1e-7 * top, 0.01 * top)
+    for name, values in zip(COMPONENTS, parts, strict=True):
+        # Zeros lie below the axis, so that a single bin still shows as a spike.
+        axis.stairs(np.maximum(values, 0.01 * bottom), time, baseline=None, **_STYLES[name])
+    arrival = 1e9 * result.true_path()[row, column] / result.water_speed
+    if time[0] <= arrival < time[-1]:
+        axis.axvline(arrival, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), label="true arrival")
+    axis.set(yscale="log", ylim=(bottom, 3.0 * top), ylabel="detections per pulse and bin")
+    axis.grid(which="major", color="0.92", linewidth=0.6)
+    axis.set_axisbelow(True)
+
+    speed, laser = 1e-9 * result.water_speed, np.asarray(result.scene.laser.position)
+    direction = pixel_directions(result.scene.camera)[row, column]
+
+    def to_range(at: ArrayLike) -> NDArray[np.float64]:
+        return range_from_path(np.asarray(at) * speed, direction, laser)
+
+    def to_time(at: ArrayLike) -> NDArray[np.float64]:
+        distance = np.asarray(at, dtype=np.float64)
+        return (np.linalg.norm(distance[..., None] * direction - laser, axis=-1) + distance) / speed
+
+    axis.secondary_xaxis("top", functions=(to_range, to_time)).set_xlabel("range [m]")
+
+
+# Parts
+
+
+def _panels(result: Result, count: int) -> tuple[Figure, Sequence[Axes], Sequence[Axes]]:
+    """A figure of `count` images of the camera's aspect ratio in a row, and the places of their colour bars."""
+    camera = result.scene.camera
+    width = 3.4
+    height = float(np.clip(width * camera.height / camera.width, 0.8, 7.0))
+    figure = Figure(figsize=(width * count, height + 1.35), layout="constrained")
+    _caption(result, figure)
+    images, bars = figure.subplots(2, count, squeeze=False, height_ratios=(height, 0.15))
+    return figure, images, bars
+
+
+def _show(
+    axis: Axes, bar: Axes, image: NDArray[Any], *, title: str, label: str, colours: str, low: float, high: float
+) -> None:
+    """An image with its colour bar below; grey where it is NaN, pointed ends where it goes beyond the bar."""
+    _decorate(axis, title)
+    cmap = matplotlib.colormaps[colours].with_extremes(bad=_MISSING)
+    shown = axis.imshow(image, interpolation="nearest", cmap=cmap, vmin=low, vmax=high)
+    below, above = bool((image < low).any()), bool((image > high).any())
+    extend = ("both" if above else "min") if below else ("max" if above else "neither")
+    axis.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+
+
+def _decorate(axis: Axes, title: str) -> None:
+    axis.set_title(title, fontsize=10)
+    axis.set(xlabel="column [pixel]", ylabel="row [pixel]")
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_major_locator(MaxNLocator(nbins=5, integer=True))
+
+
+def _caption(result: Result, figure: Figure) -> None:
+    medium = result.scene.medium
+    albedo = "U(0, 0.97)" if medium.albedo == "paper" else f"{medium.albedo:.3g}"
+    photons = f"{result.photons:.3g}" if result.photons >= 1e6 else str(result.photons)
+    if "e+" in photons:
+        mantissa, power = photons.split("e+")
+        photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"
+    partial = ", stopped early" if result.partial else ""
+    figure.suptitle(
+        f"{photons} photons{partial}; water c = {medium.extinction:.3g} 1/m, albedo {albedo},"
+        f" g = {medium.anisotropy:.3g}; seed {result.seed}",
+        fontsize=9,
+        color="0.25",
+    )
+
+
+def _limits(image: NDArray[Any]) -> tuple[float, float]:
+    """Lowest and highest value that a picture shows: all but the outermost 1 % at each end, at least 1 cm apart."""
+    values = image[np.isfinite(image)]
+    low, high = np.percentile(values, (1, 99)) if values.size else (0.0, 1.0)
+    spare = max(0.0, 0.01 - (high - low)) / 2
+    return float(low - spare), float(high + spare)
