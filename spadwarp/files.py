@@ -43,6 +43,7 @@ _READ_ME = (
     "tallies: [component, height, width, bin]. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
+    "squares, if there: low and high 64 bits of the sum over photons / batch_size batches of the squared tally. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
     "Camera frame: +x right, +y down, +z forward."
 )
@@ -99,6 +100,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )
         file.create_dataset("tallies", data=result.tallies, chunks=(1, rows, columns, bins), **packed)
+        if result.squares is not None:
+            file.create_dataset("squares", data=result.squares, chunks=(1, rows, columns, bins), **packed)
         file.create_dataset("bin_edges", data=result.bin_edges)
         file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
         file.create_dataset("config", data=result.scene.to_toml())
@@ -142,6 +145,8 @@ def load_result(path: str | Path) -> Result:
                 seed=int(file.attrs["seed"]),
                 ledger_unit=float(file.attrs["ledger_unit"]),
                 partial=bool(file.attrs["partial"]),
+                batch_size=int(file.attrs.get("batch_size", 0)),
+                squares=file["squares"][...] if "squares" in file else None,
                 photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
                 truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
                 **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
@@ -166,6 +171,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "seed": str(result.seed),
         "ledger_unit": result.ledger_unit,
         "partial": result.partial,
+        "batch_size": result.batch_size,
         "components": list(COMPONENTS),
         "gate_start": gate.start,
         "bin_width": gate.bin_width,

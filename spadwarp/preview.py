@@ -87,12 +87,12 @@ def _intensity_figure(result: Result) -> Figure:
     }
     figure, images, bars = _panels(result, len(frames))
     for image, bar, (title, frame) in zip(images, bars, frames.items(), strict=True):
-        top = float(frame.max())
-        exponent = int(np.floor(np.log10(top))) if top > 0 else 0
+        top = float(np.percentile(frame, 99.5)) or float(frame.max()) or 1.0  # single bright pixels go beyond the bar
+        exponent = int(np.floor(np.log10(top)))
         exponent = 0 if -2 <= exponent <= 3 else exponent
         label = "expected detections per pulse" + (f" [$10^{{{exponent}}}$]" if exponent else "")
-        frame = frame / 10.0**exponent
-        _show(image, bar, frame, title=title, label=label, colours="cividis", low=0.0, high=float(frame.max()) or 1.0)
+        scaled, high = frame / 10.0**exponent, top / 10.0**exponent
+        _show(image, bar, scaled, title=title, label=label, colours="cividis", low=0.0, high=high)
     return figure
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.config import SPEED_OF_LIGHT
+from spadwarp.errors import ConfigError
 
 if TYPE_CHECKING:
     from spadwarp.config import Camera, Scene
     from spadwarp.depth import Method
 
-__all__ = ["COMPONENTS", "Component", "Result", "Truth", "pixel_directions", "range_from_path"]
+__all__ = ["COMPONENTS", "Component", "Result", "Truth", "merge", "pixel_directions", "range_from_path"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
 COMPONENTS: tuple[Component, ...] = ("ballistic", "forward_scattered", "backscatter")
@@ -66,7 +67,10 @@ class Result:
         timing: Seconds of each stage.
         provenance: Versions, device and date.
         partial: Whether the run was stopped early; `photons` then counts what was done.
-        photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added.
+        photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
+        batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
+        squares: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally, summed
+            over components; None without batches.
     """
 
     scene: Scene
@@ -82,6 +86,8 @@ class Result:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     partial: bool = False
     photon_ranges: Sequence[tuple[int, int]] = ()
+    batch_size: int = 0
+    squares: NDArray[np.uint64] | None = None
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
@@ -95,6 +101,12 @@ class Result:
         counted = sum(stop - start for start, stop in self.photon_ranges)
         if self.photons <= 0 or counted != self.photons:
             raise ValueError(f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed")
+        if self.squares is not None:
+            expected = (2, *shape[1:])
+            if self.squares.dtype != np.uint64 or self.squares.shape != expected:
+                raise ValueError(f"squares are {self.squares.dtype} {self.squares.shape}; uint64 {expected} is needed")
+            if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
+                raise ValueError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
         for name in ("unit", "ledger_unit"):
             value = getattr(self, name)
             if not (value > 0 and math.frexp(value)[0] == 0.5):
@@ -131,6 +143,33 @@ class Result:
 
     def _fraction(self, tallies: NDArray[np.int64]) -> NDArray[np.float64]:
         return tallies * np.float64(self.unit / self.photons)
+
+    # Errors
+
+    @cached_property
+    def standard_error(self) -> NDArray[np.float64]:
+        """Standard error of `histogram` from the spread between batches, float64 `[H, W, T]`.
+
+        Raises:
+            ConfigError: The run kept no batches, or only one.
+        """
+        if self.squares is None or self.photons < 2 * self.batch_size:
+            raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
+        count = self.photons // self.batch_size
+        total = self.tallies.sum(axis=0).astype(np.float64)
+        squares = self.squares[1] * 2.0**64 + self.squares[0]
+        variance = np.maximum(squares - total**2 / count, 0.0) / (count - 1)
+        return np.sqrt(count * variance) * (self.unit / self.photons)
+
+    @property
+    def relative_error(self) -> float:
+        """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
+        the pixels in which anything returned. Infinite if nothing did."""
+        peak = self.histogram.argmax(axis=2)[..., None]
+        value = np.take_along_axis(self.histogram, peak, axis=2)[..., 0]
+        error = np.take_along_axis(self.standard_error, peak, axis=2)[..., 0]
+        returned = value > 0
+        return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
     # The time axis
 
@@ -245,6 +284,67 @@ class Result:
         from spadwarp.files import save_result
 
         return save_result(self, path)
+
+
+def merge(results: Iterable[Result]) -> Result:
+    """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
+
+    Raises:
+        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
+    """
+    parts = list(results)
+    if not parts:
+        raise ConfigError("merge: no results given")
+    first = parts[0]
+    for other in parts[1:]:
+        for name, a, b in (
+            ("scene", _physics(first.scene), _physics(other.scene)),
+            ("seed", first.seed, other.seed),
+            ("tally unit", first.unit, other.unit),
+            ("batch size", first.batch_size, other.batch_size),
+        ):
+            if a != b:
+                detail = f" ({a} and {b})" if name != "scene" else ": only photons and output may differ"
+                raise ConfigError(f"merge: the {name} of the results differs{detail}")
+    ranges = sorted(r for part in parts for r in part.photon_ranges)
+    joined: list[tuple[int, int]] = []
+    for start, stop in ranges:
+        if joined and start < joined[-1][1]:
+            raise ConfigError(
+                f"merge: photon ids {start} to {min(stop, joined[-1][1]) - 1} are in more than one result"
+            )
+        if joined and start == joined[-1][1]:
+            joined[-1] = (joined[-1][0], stop)
+        else:
+            joined.append((start, stop))
+    squares = first.squares
+    if squares is not None:
+        for part in parts[1:]:
+            assert squares is not None and part.squares is not None
+            squares = _add_128(squares, part.squares)
+    return replace(
+        first,
+        tallies=np.sum([part.tallies for part in parts], axis=0, dtype=np.int64),
+        photons=sum(part.photons for part in parts),
+        ledger={name: sum(part.ledger[name] for part in parts) for name in first.ledger},
+        counters={name: sum(part.counters[name] for part in parts) for name in first.counters},
+        timing={name: sum(part.timing.get(name, 0.0) for part in parts) for name in first.timing},
+        partial=any(part.partial for part in parts),
+        photon_ranges=tuple(joined),
+        squares=squares,
+    )
+
+
+def _physics(scene: Scene) -> Scene:
+    """The scene without what does not change a photon's history."""
+    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
+    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})
+
+
+def _add_128(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Sum of 128-bit numbers given as [low, high]."""
+    low = a[0] + b[0]
+    return np.stack([low, a[1] + b[1] + (low < a[0])])
 
 
 def pixel_directions(camera: Camera) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from spadwarp.config import Scene, Target
 
-__all__ = ["BUILTINS", "TriangleMesh", "build_mesh", "load_target"]
+__all__ = ["BUILTINS", "SIZED_BUILTINS", "TriangleMesh", "build_mesh", "builtin_names", "load_target"]
 
 MAX_FACES = 2**31 - 1
 
@@ -102,10 +102,13 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     """
     if target.mesh is not None:
         name, mesh = f"{field}.mesh = {target.mesh!r}", _read_mesh(Path(target.mesh), field)
-    elif target.builtin in BUILTINS:
-        name, mesh = f"{field}.builtin = {target.builtin!r}", BUILTINS[target.builtin]()
     else:
-        raise MeshError(f"{field}.builtin = {target.builtin!r} is not one of {', '.join(map(repr, BUILTINS))}")
+        name, mesh = f"{field}.builtin = {target.builtin!r}", _make_builtin(str(target.builtin), field)
+        if target.size is not None and target.builtin not in SIZED_BUILTINS:
+            raise MeshError(
+                f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
+                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
+            )
     if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
         raise MeshError(
             f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"
@@ -135,6 +138,24 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
         mesh.update_faces(solid)
     mesh.remove_unreferenced_vertices()
     return mesh
+
+
+def builtin_names() -> tuple[str, ...]:
+    """Names that `builtin` can take."""
+    from spadwarp.shapes import SHAPES
+
+    return (*BUILTINS, *SHAPES)
+
+
+def _make_builtin(name: str, field: str) -> trimesh.Trimesh:
+    """A new mesh of a built-in in its own frame [m]."""
+    if name in BUILTINS:
+        return BUILTINS[name]()
+    if name not in builtin_names():
+        raise MeshError(f"{field}.builtin = {name!r} is not one of {', '.join(map(repr, builtin_names()))}")
+    from spadwarp.shapes import make_shape
+
+    return make_shape(name)
 
 
 def _placement(
@@ -224,7 +245,10 @@ BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "box": _box,
     "sphere": _sphere,
 }
-"""The built-in targets by name: functions without arguments that make a new mesh in the target's own frame [m].
+"""The geometric built-ins: functions without arguments that make a new mesh in its own frame [m].
 
-`size` stretches plane, box and sphere, which are 1 m large.
+The objects of `spadwarp.shapes` join them; `builtin_names` has all.
 """
+
+SIZED_BUILTINS = ("plane", "box", "sphere")
+"""Built-ins of 1 m that `size` stretches; the others have sizes of their own."""

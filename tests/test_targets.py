@@ -10,7 +10,7 @@ import trimesh
 
 from spadwarp.config import Scene, Target
 from spadwarp.errors import MeshError
-from spadwarp.targets import BUILTINS, build_mesh, load_target
+from spadwarp.targets import BUILTINS, build_mesh, builtin_names, load_target
 from synthetic_result import cast_truth, make_scene
 
 FORMATS = ("stl", "obj", "ply", "off", "glb")
@@ -122,6 +122,13 @@ def test_subdivision_makes_four_faces_of_one(name: str) -> None:
     np.testing.assert_allclose(fine.bounds, plain.bounds, atol=1e-6)
     if name != "sphere":
         assert fine.area == pytest.approx(plain.area)
+
+
+def test_objects_are_placed_like_every_other_target() -> None:
+    own = load_target(Target(builtin="anchor"))
+    placed = load_target(Target(builtin="anchor", scale=(2.0, 2.0, 2.0), translation=(0.0, 0.0, 10.0)))
+    np.testing.assert_allclose(placed.vertices, 2.0 * own.vertices + [0.0, 0.0, 10.0])
+    assert placed.is_watertight
 
 
 # Placement
@@ -294,6 +301,18 @@ def test_faces_without_area_are_dropped_and_counted(tmp_path: Path) -> None:
         mesh = build_mesh(scene_of({"mesh": str(path)}))
     assert mesh is not None
     assert mesh.face_count == len(mesh.reflectance) == len(mesh.target) == 1
+
+
+def test_built_ins_that_do_not_exist_are_refused_with_the_names_of_those_that_do() -> None:
+    text = error_of({"builtin": "stairs"})
+    assert text.startswith("targets[1].builtin = 'stairs' is not one of 'staircase', 'plane', 'box', 'sphere', ")
+    assert all(repr(name) in text for name in builtin_names())
+
+
+def test_size_goes_with_those_that_have_none_of_their_own() -> None:
+    assert "targets[1].size = [2.0, 2.0] does not go with builtin = 'staircase'" in error_of(
+        {"builtin": "staircase", "size": [2.0, 2.0]}
+    )
 
 
 def test_too_many_subdivisions_are_refused_before_they_are_made() -> None:
