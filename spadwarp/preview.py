@@ -65,7 +65,7 @@ def write_previews(
 def _depth_figure(result: Result, frame: NDArray[np.float64], method: str) -> Figure:
     truth = result.truth.depth
     error = 100.0 * (frame - truth)
-    low, high = _limits(truth if np.isfinite(truth).any() else frame)
+    low, high = _limits(truth) if np.isfinite(truth).any() else _limits(frame, beyond=1.0)
     margin = 0.05 * (high - low)
     scale: dict[str, Any] = {"label": "depth z [m]", "colours": "viridis_r", "low": low - margin, "high": high + margin}
     spread = np.abs(error[np.isfinite(error)])
@@ -215,9 +215,9 @@ def _caption(result: Result, figure: Figure) -> None:
     )
 
 
-def _limits(image: NDArray[Any]) -> tuple[float, float]:
-    """Lowest and highest value that a picture shows: all but the outermost 1 % at each end, at least 1 cm apart."""
+def _limits(image: NDArray[Any], *, beyond: float = 0.0) -> tuple[float, float]:
+    """Lowest and highest value, at least 1 cm apart, leaving out `beyond` percent at each end."""
     values = image[np.isfinite(image)]
-    low, high = np.percentile(values, (1, 99)) if values.size else (0.0, 1.0)
+    low, high = np.percentile(values, (beyond, 100.0 - beyond)) if values.size else (0.0, 1.0)
     spare = max(0.0, 0.01 - (high - low)) / 2
     return float(low - spare), float(high + spare)
