@@ -20,7 +20,9 @@ _HOMES = {
     "trace": "simulation",
     "PhotonRecords": "simulation",
     "truth_maps": "model",
+    "devices": "hardware",
     "Result": "result",
+    "merge": "result",
     "Truth": "result",
     "load_result": "files",
     "SpadwarpError": "errors",
@@ -38,8 +40,9 @@ if TYPE_CHECKING:
     from spadwarp.config import Scene, load_scene
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.files import load_result
+    from spadwarp.hardware import devices
     from spadwarp.model import truth_maps
-    from spadwarp.result import Result, Truth
+    from spadwarp.result import Result, Truth, merge
     from spadwarp.simulation import PhotonRecords, simulate, trace
 
 

@@ -1,15 +1,15 @@
-"""From a scene to what the kernels take: devices, parameter structs, the mesh's BVH, the unit of the tallies."""
+"""From a scene to what the kernels take: parameter structs, the mesh's BVH, the unit of the tallies."""
 
 from __future__ import annotations
 
 import math
-import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spadwarp.config import SPEED_OF_LIGHT, Scene
 from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.hardware import physical_memory, pick_device
 from spadwarp.result import COMPONENTS, Truth
 
 if TYPE_CHECKING:
@@ -25,27 +25,6 @@ PHOTON_CAPACITY = 2**40
 PAPER_ALBEDO = 0.97
 
 _UNLIMITED = 1.0e30
-
-
-def pick_device(name: str | None = None) -> wp.Device:
-    """The Warp device of that name; by default the first GPU, else the CPU.
-
-    Raises:
-        DeviceError: There is no such device; names those there are.
-    """
-    import warp as wp
-
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    wp.init()
-    names = [device.alias for device in wp.get_devices()]
-    if name is None:
-        name = next((alias for alias in names if alias.startswith("cuda")), "cpu")
-    if name == "cuda" and "cuda:0" in names:
-        name = "cuda:0"
-    if name not in names:
-        hint = "" if len(names) > 1 else "; Warp sees no NVIDIA GPU with driver R580 or newer"
-        raise DeviceError(f"device = {name!r} is not one of {', '.join(names)}{hint}")
-    return wp.get_device(name)
 
 
 def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
@@ -82,13 +61,16 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     return 2.0 ** min(exponent, 52)
 
 
-def build_model(scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True) -> Model:
+def build_model(
+    scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: int = 1
+) -> Model:
     """The scene on a device.
 
     Args:
         scene: What to simulate.
         device: From `pick_device`.
         mesh: From `spadwarp.targets.build_mesh`.
+        copies: Histograms that the run will hold on the device, for the check of its memory.
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
     Raises:
@@ -155,7 +137,7 @@ def build_model(scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, c
         device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
     )
     if camera:
-        _check_size(scene, model)
+        _check_size(scene, model, copies)
     return model
 
 
@@ -215,7 +197,7 @@ def _check_domain(scene: Scene) -> None:
             raise ConfigError(problem, source=_source(scene))
 
 
-def _check_size(scene: Scene, model: Model) -> None:
+def _check_size(scene: Scene, model: Model, copies: int) -> None:
     """Refuses what cannot fit before anything is computed."""
     shape = (
         f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
@@ -223,16 +205,14 @@ def _check_size(scene: Scene, model: Model) -> None:
     if model.tally_size >= 2**31:
         problem = f"camera and gate: {shape} = {model.tally_size} is outside [1, {2**31 - 1}]"
         raise ConfigError(problem, source=_source(scene))
-    needed = 8 * model.tally_size
+    needed = 8 * model.tally_size * copies
     if model.device.is_cuda:
-        there = model.device.free_memory
-    elif hasattr(os, "sysconf"):
+        there: int | None = model.device.free_memory
+    else:
         # Counts on the device, their copy in the result, and the total of the components.
         needed *= 2
-        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    else:
-        return
-    if needed > there:
+        there = physical_memory()
+    if there is not None and needed > there:
         raise DeviceError(
             f"{shape} need {needed / 2**30:.1f} GiB on {model.device.alias}; there are {there / 2**30:.1f} GiB"
         )

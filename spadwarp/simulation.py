@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from spadwarp.config import Scene
 from spadwarp.errors import ConfigError, SpadwarpError
-from spadwarp.model import build_model, pick_device, trace_truth, transport_spec
-from spadwarp.result import COMPONENTS, Result
+from spadwarp.hardware import core_count, pick_device
+from spadwarp.model import build_model, trace_truth, transport_spec
+from spadwarp.result import COMPONENTS, Result, merge
 
 if TYPE_CHECKING:
     from spadwarp_kernels import Data, Model
@@ -42,6 +43,10 @@ def simulate(
     threads: int | None = None,
     pass_size: int | None = None,
     progress: Progress | None = None,
+    uncertainty: bool = False,
+    relative_error: float | None = None,
+    first_photon: int = 0,
+    resume: Result | None = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
@@ -49,15 +54,23 @@ def simulate(
 
     Args:
         scene: From `spadwarp.load_scene`.
-        photons: Emitted photons, > 0; by default `scene.transport.photons`.
-        seed: 0 ... 2^64 - 1; by default `scene.transport.seed`.
+        photons: Emitted photons in all, > 0; by default `scene.transport.photons`.
+        seed: 0 ... 2^64 - 1; by default `scene.transport.seed`, or that of the run to resume.
         device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
         threads: CPU threads; by default one a core. A GPU takes none.
         pass_size: Photons in one launch, up to 2^26.
         progress: Called from the caller's thread.
+        uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
+            at
+            most 1/32; the histogram takes twice the memory.
+        relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
+            `uncertainty`, and `photons` is the most that are traced.
+        first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
+        resume: A result of the same scene, to which photons are added until it has `photons`; the outcome is that of
+            one long run.
 
     Returns:
-        The result. After Ctrl-C it holds the photons that were done and is marked `partial`.
+        The result. After Ctrl-C it holds the photons (or batches) that were done and is marked `partial`.
 
     Raises:
         ConfigError, MeshError, DeviceError: The scene cannot be simulated; nothing was computed.
@@ -66,49 +79,98 @@ def simulate(
     from spadwarp.targets import build_mesh
 
     photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
     _check_range("photons", photons, 1, 10**12)
+    if resume is not None:
+        if len(resume.photon_ranges) != 1:
+            raise ConfigError(f"resume: the photon ids {resume.photon_ranges} have gaps; merge the missing ones first")
+        first_photon = resume.photon_ranges[0][1]
+        seed = resume.seed if seed is None else seed
+        photons -= resume.photons
+        if photons <= 0:
+            raise ConfigError(f"photons = {photons + resume.photons} is outside [{resume.photons + 1}, {10**12}]")
+    seed = scene.transport.seed if seed is None else seed
     _check_range("seed", seed, 0, 2**64 - 1)
+    _check_range("first_photon", first_photon, 0, 2**62)
+    if relative_error is not None and not 0 < relative_error < 1:
+        raise ConfigError(f"relative_error = {relative_error} is outside (0, 1)")
+    batch_size = 0
+    if resume is not None:
+        batch_size = resume.batch_size
+        if batch_size == 0 and (uncertainty or relative_error):
+            raise ConfigError("uncertainty: the run to resume kept no batches")
+    elif uncertainty or relative_error is not None:
+        # At least 32 batches; with a stopping rule up to 1024, so that it can act early.
+        batch_size = 1 << max(0, (photons // (32 if relative_error is None else 1024)).bit_length() - 1)
+    if batch_size:
+        photons = -(-photons // batch_size) * batch_size
+        if first_photon % batch_size:
+            raise ConfigError(
+                f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
+            )
+
     began = time.perf_counter()
     wp_device = pick_device(device)
     mesh = build_mesh(scene)
-    model = build_model(scene, wp_device, mesh)
+    model = build_model(scene, wp_device, mesh, copies=2 if batch_size else 1)
     ready = time.perf_counter()
-    run = _Run(model, transport_spec(scene, mesh), seed=seed, progress=progress)
+    run = _Run(model, transport_spec(scene, mesh), seed=seed, progress=progress, batch_size=batch_size)
     compiled = time.perf_counter()
     truth = trace_truth(scene, model)
     traced = time.perf_counter()
-    done = run.trace(0, photons, threads=threads, pass_size=pass_size)
-    tallies = run.data.tally.numpy().reshape(len(COMPONENTS), scene.camera.height, scene.camera.width, scene.gate.bins)
-    finished = time.perf_counter()
+    result: Result | None = None
+
+    def collect(done: int) -> Result:
+        tallies, squares = run.tallies()
+        if tallies.min() < 0 or tallies.max() >= 2**62:
+            raise SpadwarpError(
+                f"a histogram bin overflowed after {done} photons: the scene is brighter than the tally's unit allows "
+                "for; run fewer photons at a time and add up their histograms"
+            )
+        ledger, counters = run.accounts()
+        part = Result(
+            scene=scene,
+            tallies=tallies,
+            unit=1.0 / model.scale,
+            photons=done,
+            seed=seed,
+            ledger=ledger,
+            ledger_unit=run.ledger_unit,
+            counters=counters,
+            truth=truth,
+            timing={
+                "setup": ready - began,
+                "compile": compiled - ready,
+                "truth": traced - compiled,
+                "trace": time.perf_counter() - traced,
+            },
+            provenance=provenance(wp_device),
+            partial=False,
+            photon_ranges=((first_photon, first_photon + done),),
+            batch_size=batch_size,
+            squares=squares,
+        )
+        return part if resume is None else merge([replace(resume, partial=False), part])
+
+    def enough(done: int) -> bool:
+        nonlocal result
+        batches = done // batch_size
+        if relative_error is None or batches < 8 or batches & (batches - 1):
+            return False
+        result = collect(done)
+        return result.relative_error <= relative_error
+
+    done = run.trace(
+        first_photon,
+        first_photon + photons,
+        threads=threads,
+        pass_size=pass_size,
+        enough=enough if batch_size else None,
+    )
     if done == 0:
         raise KeyboardInterrupt
-    if tallies.min() < 0 or tallies.max() >= 2**62:
-        raise SpadwarpError(
-            f"a histogram bin overflowed after {done} photons: the scene is brighter than the tally's unit allows for; "
-            "run fewer photons at a time and merge the results"
-        )
-    ledger, counters = run.accounts()
-    return Result(
-        scene=scene,
-        tallies=tallies,
-        unit=1.0 / model.scale,
-        photons=done,
-        seed=seed,
-        ledger=ledger,
-        ledger_unit=run.ledger_unit,
-        counters=counters,
-        truth=truth,
-        timing={
-            "setup": ready - began,
-            "compile": compiled - ready,
-            "truth": traced - compiled,
-            "trace": finished - traced,
-        },
-        provenance=provenance(wp_device),
-        partial=done < photons,
-        photon_ranges=((0, done),),
-    )
+    if result is None or not run.stopped_early:
+        result = collect(done)
+    return replace(result, partial=done < photons and not run.stopped_early)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,12 +252,16 @@ def trace(
 class _Run:
     """One model, its tallies, and the passes over photon ids."""
 
-    def __init__(self, model: Model, spec: Any, *, seed: int, progress: Progress | None) -> None:
+    def __init__(self, model: Model, spec: Any, *, seed: int, progress: Progress | None, batch_size: int = 0) -> None:
         import spadwarp_kernels as sk
 
         self.model, self.spec, self.seed, self.progress = model, spec, seed, progress
         self.ledger_unit = sk.LEDGER_UNIT
         self.data: Data = sk.make_data(model)
+        self.batch_size = batch_size
+        self.batches = sk.Batches(self.data.tally, len(COMPONENTS)) if batch_size else None
+        self.stopped_early = False
+        self._accounts: list[tuple[dict[str, int], dict[str, int]]] = []
         if progress is not None:
             progress("compile", 0, 0)
         # Compiles, or loads from Warp's cache, before the clock of the passes starts.
@@ -215,29 +281,95 @@ class _Run:
             self.progress("trace", done, total)
 
     def accounts(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Ledger and counters of what `tallies` holds."""
         import spadwarp_kernels as sk
 
-        return sk.read_ledger(self.data)
+        parts = self._accounts if self.batches is not None else [sk.read_ledger(self.data)]
+        ledger, counters = ({name: sum(p[i][name] for p in parts) for name in parts[0][i]} for i in range(2))
+        return ledger, counters
 
-    def trace(self, start: int, stop: int, *, threads: int | None = None, pass_size: int | None = None) -> int:
-        """Walks the photons start ... stop - 1; returns how many were done before an interrupt, always a prefix."""
+    def tallies(self) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
+        """Tallies [component, height, width, bin] and the sums of squares, if there are batches."""
+        camera, gate = self.model.camera, self.model.gate
+        shape = (camera.height, camera.width, gate.bins)
+        if self.batches is None:
+            return self.data.tally.numpy().reshape(len(COMPONENTS), *shape), None
+        squares = np.stack([half.numpy().reshape(shape) for half in self.batches.squares])
+        return self.batches.total.numpy().reshape(len(COMPONENTS), *shape).copy(), squares
+
+    def trace(
+        self,
+        start: int,
+        stop: int,
+        *,
+        threads: int | None = None,
+        pass_size: int | None = None,
+        enough: Callable[[int], bool] | None = None,
+    ) -> int:
+        """Walks the photons start ... stop - 1; returns how many were done before an interrupt, always a prefix.
+
+        With batches only whole ones count, and `enough(done)` is asked after each whether to stop.
+        """
+        import spadwarp_kernels as sk
+
         cuda = self.model.device.is_cuda
         size = (CUDA_PASS if cuda else CPU_PASS) if pass_size is None else pass_size
         _check_range("pass_size", size, 1, CUDA_PASS)
-        workers = 1 if cuda else min(_core_count() if threads is None else threads, -(-(stop - start) // size))
+        workers = 1 if cuda else core_count() if threads is None else threads
         _check_range("threads", workers, 1, 4096)
+        total = stop - start
         with _interruptible() as interrupted:
-            if workers == 1:
-                done = start
-                while done < stop and not interrupted.is_set():
-                    count = min(size, stop - done)
-                    self.launch(done, count)
-                    done += count
-                    self.report(done - start, stop - start)
-                return done - start
-            return self._trace_in_threads(start, stop, size, workers, interrupted)
+            if self.batches is None:
+                return self._passes(start, stop, size, workers, interrupted, lambda done: self.report(done, total))
+            for first in range(start, stop, self.batch_size):
+                before = first - start
+                part = self._passes(
+                    first,
+                    first + self.batch_size,
+                    size,
+                    workers,
+                    interrupted,
+                    lambda done, before=before: self.report(before + done, total),  # type: ignore[misc]
+                )
+                if part < self.batch_size:
+                    return before
+                self.batches.close(self.data.tally)
+                self._accounts.append(sk.read_ledger(self.data))
+                self.data.ledger.zero_()
+                if enough is not None and enough(before + part):
+                    self.stopped_early = True
+                    return before + part
+            return total
 
-    def _trace_in_threads(self, start: int, stop: int, size: int, workers: int, interrupted: threading.Event) -> int:
+    def _passes(
+        self,
+        start: int,
+        stop: int,
+        size: int,
+        workers: int,
+        interrupted: threading.Event,
+        report: Callable[[int], None],
+    ) -> int:
+        workers = min(workers, -(-(stop - start) // size))
+        if workers > 1:
+            return self._trace_in_threads(start, stop, size, workers, interrupted, report)
+        done = start
+        while done < stop and not interrupted.is_set():
+            count = min(size, stop - done)
+            self.launch(done, count)
+            done += count
+            report(done - start)
+        return done - start
+
+    def _trace_in_threads(
+        self,
+        start: int,
+        stop: int,
+        size: int,
+        workers: int,
+        interrupted: threading.Event,
+        report: Callable[[int], None],
+    ) -> int:
         """CPU passes on several threads; all add to one tally, with atomics of their own."""
         queue = iter(range(start, stop, size))
         lock = threading.Condition()
@@ -268,10 +400,10 @@ class _Run:
             with lock:
                 lock.wait(timeout=0.1)
                 done = finished
-            self.report(done, stop - start)
+            report(done)
         if errors:
             raise errors[0]
-        self.report(finished, stop - start)
+        report(finished)
         # Every pass that was begun was finished, and they are begun in order: what was done is a prefix.
         return finished
 
@@ -312,12 +444,6 @@ def provenance(device: Any) -> dict[str, Any]:
         "device_name": device.name if device.is_cuda else platform.processor() or platform.machine(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def _core_count() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _check_range(name: str, value: int, low: int, high: int) -> None:

@@ -4,6 +4,7 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 `wp.Mesh`.
 """
 
+from .batches import Batches
 from .camera import Camera, lens_point, pixel_direction, project
 from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance
@@ -58,6 +59,7 @@ __all__ = [
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
+    "Batches",
     "Camera",
     "Data",
     "Gate",

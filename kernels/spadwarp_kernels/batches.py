@@ -1,0 +1,70 @@
+"""Batch means: exact sums and sums of squares over equal batches of photons, for the error of every bin."""
+
+import warp as wp
+
+_LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
+
+
+@wp.kernel(enable_backward=False)
+def close_batch_kernel(
+    component_count: int,
+    batch: wp.array(dtype=wp.int64),
+    # Out:
+    total: wp.array(dtype=wp.int64),
+    squares_low: wp.array(dtype=wp.uint64),
+    squares_high: wp.array(dtype=wp.uint64),
+):
+    """Adds a batch to the total and the square of its sum over components to a 128-bit sum, and empties it.
+
+    Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
+    Launch: voxels of one component.
+    """
+    voxel = wp.tid()
+    voxels = squares_low.shape[0]
+    t = wp.int64(0)
+    for component in range(component_count):
+        index = component * voxels + voxel
+        t += batch[index]
+        total[index] = total[index] + batch[index]
+        batch[index] = wp.int64(0)
+    # t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with t < 2^63.
+    low = wp.uint64(t) & _LOW32
+    high = wp.uint64(t) >> wp.uint64(32)
+    middle = wp.uint64(2) * low * high
+    square_low = low * low + (middle << wp.uint64(32))
+    square_high = high * high + (middle >> wp.uint64(32))
+    if square_low < low * low:
+        square_high += wp.uint64(1)
+    sum_low = squares_low[voxel] + square_low
+    if sum_low < square_low:
+        square_high += wp.uint64(1)
+    squares_low[voxel] = sum_low
+    squares_high[voxel] = squares_high[voxel] + square_high
+
+
+class Batches:
+    """Totals and squares on the device of a tally.
+
+    Attributes:
+        total: int64, as the tally.
+        squares: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
+        count: Batches closed.
+    """
+
+    def __init__(self, tally: wp.array, component_count: int) -> None:
+        self._component_count = component_count
+        voxels = tally.size // component_count
+        self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device)
+        self.squares = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
+        self.count = 0
+
+    def close(self, tally: wp.array) -> None:
+        """Takes the tally over as one batch and sets it to zero."""
+        wp.launch(
+            close_batch_kernel,
+            dim=self.squares[0].size,
+            inputs=[self._component_count, tally],
+            outputs=[self.total, *self.squares],
+            device=tally.device,
+        )
+        self.count += 1
