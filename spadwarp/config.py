@@ -404,7 +404,7 @@ class Transport(Section):
     photons: Whole = Field(1_000_000, ge=1, le=10**12, description="photons to emit")
     seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of the random numbers; one seed gives the same bits")
     estimator: Literal["analog", "next_event", "guided"] = Field(
-        "next_event", description="what scores: the photon itself, every event, or guided flights"
+        "guided", description="what scores: the photon itself, every event, or guided flights"
     )
     termination: Literal["cutoff", "roulette"] = Field(
         "cutoff", description="drop light photons (biased), or Russian roulette"
