@@ -1,0 +1,5 @@
+"""`python -m spadwarp` is the `spadwarp` command."""
+
+from spadwarp.cli import main
+
+main()

@@ -1,0 +1,9 @@
+"""The command line. A command is a function in one of these files, hung on `app`; importing the file adds it.
+
+Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
+"""
+
+from . import inspect, simulate
+from ._app import app, main
+
+__all__ = ["app", "inspect", "main", "simulate"]

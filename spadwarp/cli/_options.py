@@ -1,0 +1,145 @@
+"""Options that commands share, each meaning the same wherever it appears, and what is done with them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import spadwarp
+from spadwarp.errors import FileError
+
+if TYPE_CHECKING:
+    from spadwarp import Scene
+
+
+def whole_number(text: str | int) -> int:
+    """An integer from `2000000`, `2_000_000`, `2e6` or `2.0e6`."""
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        value = Decimal("nan")
+    if not value.is_finite() or value.adjusted() > 30 or value != value.to_integral_value():
+        raise typer.BadParameter(f"{text!r} is not a whole number, such as 2000000 or 2e6")
+    return int(value)
+
+
+ScenePath = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (TOML).", show_default=False)]
+Mesh = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="A mesh (STL, OBJ, PLY, OFF, GLB) in place of the scene's first target, at its place, turned as it is and "
+        "with its reflectance; in metres unless --set 'targets[0].scale=0.001' says otherwise.",
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the scene; may be repeated."),
+]
+Photons = Annotated[
+    int | None,
+    typer.Option(parser=whole_number, metavar="N", help="Photons to emit; 2e9 will do. By default the scene's."),
+]
+Seed = Annotated[
+    int | None,
+    typer.Option(parser=whole_number, metavar="N", help="Key of the random numbers. By default the scene's."),
+]
+Device = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help='"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
+]
+Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threads; by default one for each core.")]
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Allow an output directory that is not empty.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write what is told here as JSON.")]
+
+
+def read_scene(
+    path: Path, *, mesh: Path | None, overrides: list[str] | None, photons: int | None = None, seed: int | None = None
+) -> Scene:
+    """The scene as the options make it; `--set` lies over `--mesh`, the options of their own over both."""
+    scene = spadwarp.load_scene(path)
+    if mesh is not None:
+        # What sized the old target says nothing about the new one.
+        scene = scene.with_overrides({"targets[0]": {"mesh": str(mesh), "scale": None, "subdivisions": None}})
+    scene = scene.with_overrides(overrides or [])
+    given = {"photons": photons, "seed": seed}
+    return scene.with_overrides(transport={name: value for name, value in given.items() if value is not None})
+
+
+def prepare_directory(out: Path, *, overwrite: bool, needed: int) -> None:
+    """Makes the output directory, and finds out now whether `needed` bytes can be written to it.
+
+    Raises `FileError`, and `typer.BadParameter` where the directory is in use.
+    """
+    if out.exists() and not out.is_dir():
+        raise typer.BadParameter(f"{out} is a file; a directory is needed", param_hint="--out")
+    if out.is_dir() and any(out.iterdir()) and not overwrite:
+        raise typer.BadParameter(f"{out} is not empty; --overwrite replaces results in it", param_hint="--out")
+    check_writable(out)
+    free = shutil.disk_usage(out).free
+    if free < needed:
+        raise FileError(f"{out}: up to {in_bytes(needed)} will be written; {in_bytes(free)} are free there")
+
+
+def check_writable(directory: Path) -> None:
+    """Raises `FileError` where no file can be made in the directory, which is made if it is not there."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise FileError(f"{directory}: cannot be written: {error.strerror}") from error
+
+
+def write_json(summary: dict[str, Any], path: Path | None) -> None:
+    """The machine-readable twin of what a command tells; numbers that are not finite become null."""
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+# Numbers for people
+
+
+def count(number: float) -> str:
+    """2 000 000"""
+    return f"{number:,.0f}".replace(",", " ")
+
+
+def in_bytes(number: float) -> str:
+    """1.5 GiB"""
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if number < 1000:
+            return f"{number:.3g} {unit}"
+        number /= 1024
+    return f"{number:.3g} TiB"
+
+
+def rows(table: dict[str, str], *, indent: str = "") -> str:
+    """Names and values in two columns."""
+    width = max(map(len, table), default=0)
+    return "\n".join(f"{indent}{name:<{width}}  {value}".rstrip() for name, value in table.items())

@@ -1,0 +1,197 @@
+"""`spadwarp simulate`: a scene in, a directory of results out."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import spadwarp
+from spadwarp.errors import ConfigError, FileError
+
+from ._app import INTERRUPTED, app, complain, fail, say
+from ._options import (
+    Device,
+    Json,
+    Mesh,
+    Out,
+    Overrides,
+    Overwrite,
+    Photons,
+    Quiet,
+    ScenePath,
+    Seed,
+    Threads,
+    check_writable,
+    count,
+    prepare_directory,
+    read_scene,
+    rows,
+    write_json,
+)
+from ._progress import progress
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from spadwarp import Result, Scene
+
+_RECORD_BYTES = 52  # of one photon's terminal state, id included
+_OTHER_BYTES = 16 << 20  # pictures, maps, text
+_NAMES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr")
+_PICTURES = ("depth.png", "intensity.png", "histogram.png", "truth.png")
+
+
+@app.command()
+def simulate(
+    scene_path: ScenePath,
+    out: Out,
+    mesh: Mesh = None,
+    device: Device = None,
+    photons: Photons = None,
+    seed: Seed = None,
+    overrides: Overrides = None,
+    threads: Threads = None,
+    records: Annotated[
+        bool, typer.Option("--records", help="Also write the terminal state of every photon: records.h5.")
+    ] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Trace photons through a scene into histograms.
+
+    Writes to the output directory: result.h5 (everything, for `spadwarp info` and `spadwarp.load_result`), scene.toml
+    (the full scene as it was run), depth.exr, truth.exr and pictures. Ctrl-C ends the run and writes what is done.
+
+    \b
+    Examples:
+      spadwarp simulate configs/scenes/staircase_15m.toml --out out/
+      spadwarp simulate configs/scenes/harbour_5m.toml --mesh bust.stl --device cuda:0 \\
+          --photons 2e9 --seed 7 --out run1/ --set medium.extinction=0.9
+    """
+    scene = read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
+    if records and scene.transport.photons >= 2**31:
+        raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
+    for message in spadwarp.check(scene):
+        if message.level == "warning":
+            complain(str(message))
+    prepare_directory(out, overwrite=overwrite, needed=_bytes_needed(scene, records))
+    if json_path is not None:
+        check_writable(json_path.parent)
+
+    with progress(quiet=quiet) as report:
+        result = spadwarp.simulate(scene, device=device, threads=threads, progress=report)
+    written, frame = _write(result, out, device=device)
+    if records and not result.partial:
+        written.append(_write_records(scene, out, device=device, quiet=quiet))
+    for name in (*_NAMES, *_PICTURES):  # left from an earlier run, they would be taken for this one's
+        if out / name not in written:
+            (out / name).unlink(missing_ok=True)
+
+    if not quiet:
+        say(_described(result, frame, written))
+    write_json({**result.summary(), "files": written}, json_path)
+    if result.partial:
+        left_out = "; no records were written" if records else ""
+        fail(
+            f"interrupted after {count(result.photons)} of {count(scene.transport.photons)} photons, "
+            f"which are written and marked partial{left_out}",
+            INTERRUPTED,
+        )
+
+
+def _bytes_needed(scene: Scene, records: bool) -> int:
+    """Upper bound of what a run writes; compression takes off most of it."""
+    tallies = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+    return tallies + _OTHER_BYTES + (_RECORD_BYTES * scene.transport.photons if records else 0)
+
+
+def _write(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
+    """Files of a result as its `[output]` asks for, the one that nothing can replace first, and the depth frame."""
+    from spadwarp.files import save_depth_exr, save_truth_exr
+    from spadwarp.preview import write_previews
+
+    scene, output = result.scene, result.scene.output
+    written: list[Path] = []
+    if output.result:
+        written.append(_save(result, out / "result.h5"))
+    text = out / "scene.toml"
+    try:
+        text.write_text(scene.to_toml())
+    except OSError as error:
+        raise FileError(f"{text}: cannot be written: {error.strerror}") from error
+    written.append(text)
+    options: dict[str, Any] = {}
+    if output.depth_method == "matched":
+        from spadwarp.detector import instrument_response
+
+        options["irf"] = instrument_response(
+            pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
+            jitter_fwhm=scene.detector.jitter_fwhm_ps * 1e-12,
+            shape=scene.detector.irf,
+            tail=scene.detector.irf_tail_ps * 1e-12,
+        )
+    frame = result.depth(method=output.depth_method, device=device, **options)
+    if output.exr:
+        written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_exr(result, out / "truth.exr")]
+    if output.png:
+        written += write_previews(result, out, depth=frame, method=output.depth_method)
+    return written, frame
+
+
+def _save(result: Result, path: Path) -> Path:
+    """Saves the result, if need be elsewhere: hours of photons are not given up because a disk has become full."""
+    try:
+        return result.save(path)
+    except FileError as error:
+        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{os.getpid()}-result.h5"
+        result.save(refuge)
+        raise FileError(f"{error}\n{refuge}: the result is here instead") from error
+
+
+def _write_records(scene: Scene, out: Path, *, device: str | None, quiet: bool) -> Path:
+    from spadwarp.records import save_records
+
+    if not quiet:
+        complain("the photons again, for their records")
+    with progress(quiet=quiet) as report:
+        records = spadwarp.trace(scene, device=device, progress=report)
+    return save_records(records, out / "records.h5", scene=scene)
+
+
+def _described(result: Result, frame: NDArray[np.float64], written: list[Path]) -> str:
+    """A run in a few lines."""
+    import numpy as np
+
+    summary, truth = result.summary(), result.truth.depth
+    seconds = result.timing["trace"]
+    collected = summary["collected_fraction"]
+    ledger = summary["ledger"]
+    returned = np.isfinite(frame)
+    lines = {
+        "photons": f"{count(result.photons)}, seed {result.seed}, on {result.provenance['device']} in {seconds:.3g} s "
+        f"({result.photons / seconds:.3g}/s)",
+        "collected": f"{sum(collected.values()):.3g} of the emitted light: "
+        + ", ".join(f"{name.replace('_', '-')} {part:.3g}" for name, part in collected.items()),
+        "detections": f"{summary['detections_per_pulse']:.3g} a pulse, all pixels together",
+        "depth": f"{returned.sum()} of {frame.size} pixels"
+        + (f", {np.nanmin(frame):.2f} to {np.nanmax(frame):.2f} m" if returned.any() else ""),
+    }
+    both = returned & np.isfinite(truth)
+    if both.any():
+        error = np.median(np.abs(frame - truth)[both])
+        lines["truth"] = (
+            f"{np.isfinite(truth).sum()} of {frame.size} pixels, {np.nanmin(truth):.2f} to {np.nanmax(truth):.2f} m; "
+            f"median error of the depth {1000 * error:.3g} mm"
+        )
+    parts = sorted(ledger["fractions"].items(), key=lambda entry: -abs(entry[1]))
+    lines["ledger"] = ("closes exactly: " if ledger["exact"] else f"OFF BY {ledger['difference']} UNITS: ") + ", ".join(
+        f"{name} {100 * part:.3g} %" for name, part in parts if part
+    )
+    lines["written"] = ", ".join(path.name for path in written) + f" in {written[0].parent}"
+    return rows(lines)

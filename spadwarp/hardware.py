@@ -1,0 +1,112 @@
+"""What photons can be traced on: devices, cores, memory."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import platform
+from typing import TYPE_CHECKING, Any
+
+from spadwarp.errors import DeviceError
+
+if TYPE_CHECKING:
+    import warp as wp
+
+__all__ = ["core_count", "devices", "physical_memory", "pick_device", "start_warp"]
+
+
+def pick_device(name: str | None = None) -> wp.Device:
+    """The Warp device of that name; by default the first GPU, else the CPU.
+
+    Raises:
+        DeviceError: There is no such device; names those there are.
+    """
+    import warp as wp
+
+    start_warp()
+    names = [device.alias for device in wp.get_devices()]
+    if name is None:
+        name = next((alias for alias in names if alias.startswith("cuda")), "cpu")
+    if name == "cuda" and "cuda:0" in names:
+        name = "cuda:0"
+    if name not in names:
+        hint = "" if len(names) > 1 else "; Warp sees no NVIDIA GPU with driver R580 or newer"
+        raise DeviceError(f"device = {name!r} is not one of {', '.join(names)}{hint}")
+    return wp.get_device(name)
+
+
+def devices() -> list[dict[str, Any]]:
+    """What `device=` may be, in plain values.
+
+    Returns:
+        For each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for the
+        CPU), `threads` (CPU; None for a GPU) and `default`.
+    """
+    import warp as wp
+
+    default = pick_device().alias
+    found = []
+    for device in wp.get_devices():
+        cuda = device.is_cuda
+        threads = None if cuda else core_count()
+        found.append(
+            {
+                "name": device.alias,
+                "description": device.name
+                if cuda
+                else f"{threads} threads, {platform.processor() or platform.machine()}",
+                "memory": device.total_memory if cuda else physical_memory(),
+                "compute_capability": f"{device.arch // 10}.{device.arch % 10}" if cuda else None,
+                "threads": threads,
+                "default": device.alias == default,
+            }
+        )
+    return found
+
+
+@functools.cache
+def start_warp() -> None:
+    """`wp.init()` without Warp's greeting, and on a machine without a GPU without its warning that there is none."""
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if _has_cuda_driver():
+        wp.init()
+        return
+    # The warning is written by native code, past Python's streams.
+    try:
+        stderr = os.dup(2)
+    except OSError:  # a program without one
+        wp.init()
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+def _has_cuda_driver() -> bool:
+    """Whether the system's loader finds NVIDIA's driver library."""
+    for library in ("nvcuda.dll",) if os.name == "nt" else ("libcuda.so", "libcuda.so.1"):
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return True
+    return False
+
+
+def core_count() -> int:
+    """CPU cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def physical_memory() -> int | None:
+    """[bytes]; None where the system does not tell."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
