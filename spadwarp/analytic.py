@@ -47,6 +47,7 @@ class AnalyticResult:
         fisher: F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate.
         sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
         sigma_depth: The bound of planar depth [m].
+        background_level: Background detections per pulse and σ of the response, as the outlier model takes it.
         sbnr: Signal over backscatter, both within a pulse's gate; infinite where there is no backscatter.
         outlier_probability: That a maximum-likelihood fit locks on background, where `sigma_time` is out of reach.
         stray_probability: That a frame's pixel reports a background photon.
@@ -65,6 +66,7 @@ class AnalyticResult:
     sigma_time: Map
     sigma_depth: Map
     sbnr: Map
+    background_level: Map
     outlier_probability: Map
     stray_probability: Map
     depth: NDArray[np.float32]
@@ -111,6 +113,7 @@ _MAP_UNITS = {
     "sigma_time": "s",
     "sigma_depth": "m",
     "sbnr": "1",
+    "background_level": "1",
     "outlier_probability": "1",
     "stray_probability": "1",
 }
@@ -282,7 +285,7 @@ def pixel_maps(
         pulses_per_frame=per_frame,
     )
     signal, arrival, backscatter = signal_d.numpy(), arrival_d.numpy(), total_d.numpy()
-    alpha, fisher, sigma_time, outlier = (one.numpy() for one in statistics)
+    alpha, fisher, sigma_time, level, outlier = (one.numpy() for one in statistics)
     if chosen.count_law == "per_frame_paper" and alpha.max(initial=0.0) > 1.0:
         raise ConfigError(
             f"analytic.count_law = 'per_frame_paper' needs alpha < 1; it reaches {alpha.max():.4g} detections per "
@@ -300,6 +303,7 @@ def pixel_maps(
         "sigma_time": sigma_time,
         "sigma_depth": sigma_time * _depth_per_time(scene, views, distances),
         "sbnr": sbnr,
+        "background_level": level,
         "outlier_probability": outlier,
     }
     return maps, (paths, cumulative)
@@ -467,10 +471,13 @@ def _sample(
     def flat(values: NDArray[Any]) -> Any:
         return wp.array(np.ascontiguousarray(values.reshape(-1), np.float32), **to)
 
+    view = pixel_directions(scene.camera)
+    # No bound is worse than a guess anywhere in the gate.
+    guess = 0.5 * speed * (scene.gate.stop - scene.gate.start) / math.sqrt(12.0) * view[..., 2]
     inputs = [
-        wp.array(pixel_directions(scene.camera).reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device),
+        wp.array(view.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device),
         flat(np.where(np.isnan(result.sigma_depth), np.nan, result.truth.depth)),
-        flat(result.sigma_depth),
+        flat(np.minimum(result.sigma_depth, guess)),
         flat(result.stray_probability),
         flat(result._stray.flat_share),
         wp.array(result._stray.paths, **to),

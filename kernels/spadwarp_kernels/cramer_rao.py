@@ -53,8 +53,10 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
         level: Expected background counts per sigma, b.
         window: Gate over sigma.
     """
+    # A fit that knows nothing is anywhere in the window.
+    blind = wp.max(_ONE - wp.float64(8.0) / window, _ZERO)
     if signal_count <= _ZERO:
-        return _ONE
+        return blind
     if level <= _ZERO:
         return _ZERO
     ratio = signal_count / (level * _SQRT_2PI)
@@ -108,7 +110,9 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
         weight = k2 * wp.exp(wp.min(log_density + k1 - signal_count, wp.float64(50.0)))
         mass += weight
         lost += weight * one_minus_exp(most)
-    return lost / mass
+    if not (mass > _ZERO):
+        return blind  # too faint for the sums
+    return wp.min(lost / mass, blind)
 
 
 @wp.func
@@ -140,6 +144,7 @@ def _statistics(
     alpha: wp.array(dtype=wp.float64),
     fisher: wp.array(dtype=wp.float64),
     sigma_time: wp.array(dtype=wp.float64),
+    level: wp.array(dtype=wp.float64),
     outlier: wp.array(dtype=wp.float64),
 ):
     """α (integral of eq 8), Fisher information per photon (eq 9), σ* and outlier probability. Launch grid: pixels."""
@@ -187,30 +192,31 @@ def _statistics(
                         z = (t - mu) / sigma
                         pulse = s / (sigma * _SQRT_2PI) * wp.exp(-_HALF * z * z)
                         # Straight across a panel; only a profile can have more detail than that.
-                        level = _HALF * (left + right) + _HALF * (right - left) * x
+                        noise_rate = _HALF * (left + right) + _HALF * (right - left) * x
                         if lidar.source == 2:
-                            level = background_rate(lidar, phase, profile, i, view[i], side, t)
-                        rate = level + pulse
+                            noise_rate = background_rate(lidar, phase, profile, i, view[i], side, t)
+                        rate = noise_rate + pulse
                         if rate > _ZERO:
                             information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
-                        local += w * half * pulse * level
+                        local += w * half * pulse * noise_rate
                         local_weight += w * half * pulse
     counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
     f = wp.float64(0.0)
     sigma_star = wp.float64(wp.nan)
     p = wp.float64(wp.nan)
+    # The flat background of the outlier model: harmonic mean of the level under the pulse and the mean over the gate.
+    mean = noise / gate
+    under = local / wp.max(local_weight, wp.float64(1.0e-300))
+    flat = wp.float64(0.0)
+    if mean > _ZERO and under > _ZERO:
+        flat = _TWO * mean * under / (mean + under)
     if information > _ZERO:
         f = information / a
         sigma_star = _ONE / wp.sqrt(counts * f)
-        # The flat background of the model: harmonic mean of the level under the pulse and the mean over the gate.
-        mean = noise / gate
-        under = local / wp.max(local_weight, wp.float64(1.0e-300))
-        flat = wp.float64(0.0)
-        if mean > _ZERO and under > _ZERO:
-            flat = _TWO * mean * under / (mean + under)
         p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
     fisher[i] = f
     sigma_time[i] = sigma_star
+    level[i] = flat * sigma
     outlier[i] = p
 
 
@@ -288,8 +294,10 @@ def statistics_maps(
     count_law: str,
     acquisitions: float,
     pulses_per_frame: float = 1.0,
-) -> tuple[wp.array, wp.array, wp.array, wp.array]:
-    """Detections per pulse α, Fisher information per photon [1/s²], σ* [s], outlier probability: float64 `[pixel]`.
+) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
+    """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
+
+    α and the background level, which the outlier model takes as flat, are in detections per pulse.
 
     Args:
         lidar, phase, view: As for `single_scatter_table`.
@@ -303,7 +311,7 @@ def statistics_maps(
     Where no signal falls into the gate, F is 0, and σ* and the outlier probability are NaN.
     """
     count, device = view.shape[0], view.device
-    out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(4))
+    out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
     counting = [COUNT_LAWS.index(count_law), wp.float64(acquisitions), wp.float64(pulses_per_frame)]
     inputs = [lidar, phase, profile, view, signal, arrival, backscatter, *counting, *out]
     launch_pixels(_statistics, count, inputs, device=device)
