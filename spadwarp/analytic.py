@@ -47,7 +47,7 @@ class AnalyticResult:
         fisher: F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate.
         sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
         sigma_depth: The bound of planar depth [m].
-        background_level: Background detections per pulse and σ of the response, as the outlier model takes it.
+        background_level: Background detections per pulse and σ of the response, under the return.
         sbnr: Signal over backscatter, both within a pulse's gate; infinite where there is no backscatter.
         outlier_probability: That a maximum-likelihood fit locks on background, where `sigma_time` is out of reach.
         stray_probability: That a frame's pixel reports a background photon.

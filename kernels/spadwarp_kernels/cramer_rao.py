@@ -204,12 +204,9 @@ def _statistics(
     f = wp.float64(0.0)
     sigma_star = wp.float64(wp.nan)
     p = wp.float64(wp.nan)
-    # The flat background of the outlier model: harmonic mean of the level under the pulse and the mean over the gate.
-    mean = noise / gate
-    under = local / wp.max(local_weight, wp.float64(1.0e-300))
-    flat = wp.float64(0.0)
-    if mean > _ZERO and under > _ZERO:
-        flat = _TWO * mean * under / (mean + under)
+    # The outlier model takes the background as flat, at the level under the pulse: what is brighter elsewhere weighs
+    # less in a fit that knows the background.
+    flat = local / wp.max(local_weight, wp.float64(1.0e-300))
     if information > _ZERO:
         f = information / a
         sigma_star = _ONE / wp.sqrt(counts * f)
@@ -297,7 +294,9 @@ def statistics_maps(
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
-    α and the background level, which the outlier model takes as flat, are in detections per pulse.
+    α and the background level, which is that under the pulse and which the outlier model takes as flat, are in
+    detections per pulse. For backscatter that decays before the target the probability comes out right to up to twice
+    as large.
 
     Args:
         lidar, phase, view: As for `single_scatter_table`.

@@ -371,6 +371,35 @@ def test_outlier_probability_within_a_fifth_of_monte_carlo(signal, level, window
     assert abs(predicted - measured) < 0.2 * measured + 2 * math.sqrt(measured * (1 - measured) / trials)
 
 
+def test_outliers_of_a_decaying_background_are_bounded_by_the_model():
+    """Backscatter decays up to the return, dark counts follow, the fit knows both: right to twice as large."""
+    step, window, delay, trials = 0.1, 200, 120.0, 800
+    t = (np.arange(int(window / step)) + 0.5) * step
+    level = np.where(t < delay, 5 * np.exp(-t / delay * math.log(25)), 0.02)  # counts per σ
+    reach = 80
+    near = np.arange(len(t))[:, None] + np.arange(-reach, reach + 1)
+    shape = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step) ** 2) / math.sqrt(2 * math.pi)
+    rng = np.random.default_rng(4)
+    for signal in (4.0, 6.0):
+        weight = np.where(
+            (near >= 0) & (near < len(t)), np.log1p(signal * shape / level[np.clip(near, 0, len(t) - 1)]), 0
+        )
+        missed = signal * (stats.norm.cdf(-t) + stats.norm.cdf(t - window))  # of the pulse, beyond the window
+        outliers = 0
+        for _ in range(trials):
+            counts = rng.poisson(level * step).astype(float)
+            hits = (delay + rng.standard_normal(rng.poisson(signal))) / step
+            np.add.at(counts, hits.astype(int), 1)
+            score = (weight * counts[np.clip(near, 0, len(t) - 1)]).sum(axis=1) + missed
+            outliers += abs(t[np.argmax(score)] - delay) > 4
+        under = (level * np.exp(-0.5 * (t - delay) ** 2)).sum() / math.sqrt(2 * math.pi) * step
+        one = [wp.array([float(value)], dtype=wp.float64, device="cpu") for value in (signal, under, window)]
+        predicted = cramer_rao.outlier_probabilities(*one).numpy()[0]
+        measured = outliers / trials
+        error = math.sqrt(measured * (1 - measured) / trials)
+        assert measured - 2 * error < predicted < 2 * (measured + 2 * error)
+
+
 def test_maximum_likelihood_meets_the_bound_where_it_is_reachable():
     """300 signal photons on 150 a σ: no outliers, and an error within 5 % of σ*."""
     trials = 3000
