@@ -36,6 +36,12 @@ def test_quantities_without_error_are_held_to_equality():
     assert Quantity("", Estimate(1e-12, 0.0), 0.0).z == math.inf
 
 
+def test_a_rounded_reference_is_an_interval():
+    near, far = (Quantity("", Estimate(value, 0.1), 1.0, rounding=0.05) for value in (1.04, 0.75))
+    assert near.z == 0.0
+    assert far.z == pytest.approx(-2.0)
+
+
 def test_means_in_blocks_are_those_of_the_whole():
     scores = np.random.default_rng(0).random((1000, 2))
     means = ScoreMeans()

@@ -29,13 +29,15 @@ class Quantity:
         name: What was measured, with its unit.
         estimate: The engine's value.
         reference: What it should be.
-        reference_error: Standard error of the reference; a published value rounded to u has u/√12.
+        reference_error: Standard error of the reference, 0 where it is known.
+        rounding: Half a unit of the last published digit: the reference lies within it, and z counts from its edge.
     """
 
     name: str
     estimate: Estimate
     reference: float
     reference_error: float = 0.0
+    rounding: float = 0.0
 
     @property
     def standard_error(self) -> float:
@@ -45,7 +47,8 @@ class Quantity:
     @property
     def z(self) -> float:
         """Standard normal deviate of the difference; without any error 0 for equality and ±inf else."""
-        difference = self.estimate.value - self.reference
+        distance = self.estimate.value - self.reference
+        difference = math.copysign(max(abs(distance) - self.rounding, 0.0), distance)
         if self.standard_error == 0.0:
             return math.copysign(math.inf, difference) if difference else 0.0
         return _normal_from_t(difference / self.standard_error, self.estimate.degrees)

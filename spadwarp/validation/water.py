@@ -162,10 +162,10 @@ def _cube60(run: Run) -> list[Quantity]:
     }
     gate = 5e-9 * 299_792_458.0 / 1.37
     quantities = []
-    for (name, source), (reference, error) in zip(sources.items(), known.CUBE60, strict=True):
+    for (name, source), reference in zip(sources.items(), known.CUBE60, strict=True):
         tables = scene(medium, source, domain=cube, max_path=gate)
         (absorbed,) = _measure(run, tables, lambda r: [1.0 - r.weight.astype(np.float64)])
-        quantities.append(Quantity(f"absorbed, {name}", absorbed, reference, error))
+        quantities.append(Quantity(f"absorbed, {name}", absorbed, reference, rounding=known.CUBE60_ROUNDING))
     return quantities
 
 
