@@ -133,8 +133,8 @@ def count(number: float) -> str:
 def in_bytes(number: float) -> str:
     """1.5 GiB"""
     for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if number < 1000:
-            return f"{number:.3g} {unit}"
+        if number < 1024:
+            return f"{number:.4g} {unit}"
         number /= 1024
     return f"{number:.3g} TiB"
 

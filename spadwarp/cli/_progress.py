@@ -26,12 +26,12 @@ def progress(*, quiet: bool, unit: str = "photons") -> Iterator[Callable[[str, i
 
 
 def _lines(unit: str) -> Callable[[str, int, int], None]:
-    """A line at every tenth, but not more often than every second, and every half minute."""
+    """A line at every tenth, but not more often than every second; in a long run soon, then ever more seldom."""
     began = told = time.monotonic()
-    told_done = 0
+    told_done, patience = 0, 2.0
 
     def report(stage: str, done: int, total: int) -> None:
-        nonlocal began, told, told_done
+        nonlocal began, told, told_done, patience
         now = time.monotonic()
         if stage == "compile":
             complain(_COMPILING)
@@ -40,12 +40,12 @@ def _lines(unit: str) -> Callable[[str, int, int], None]:
             told_done = 0
             return
         waited = now - told
-        due = (done - told_done >= 0.1 * total and waited >= 1.0) or waited >= 30.0
+        due = (done - told_done >= 0.1 * total and waited >= 1.0) or waited >= patience
         if done > told_done and (due or done == total):
             rate = done / max(now - began, 1e-9)
             left = f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(now - began)}"
             complain(f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}, {rate:.3g} {unit}/s{left}")
-            told, told_done = now, done
+            told, told_done, patience = now, done, min(2.0 * patience, 60.0)
 
     return report
 
