@@ -70,13 +70,13 @@ _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 # A warp leaves the water when this many of its 32 lanes wait, without and with a mesh: fewer leave lanes idle in what
 # they wait for, more in the water.
-WAITING_LANES = (12, 20)
+WAITING_LANES = (6, 20)
 
 # Meshes of at most this many faces need no BVH.
 FEW_FACES = 12
 
 # Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
-MAX_REGISTERS = (80, 128)
+MAX_REGISTERS = (80, 96)
 
 
 class TransportSpec(NamedTuple):
