@@ -489,11 +489,10 @@ def _sample(
     part = max(frames, 1) if device.is_cpu else max((1 << 31) // pixels, 2)
     for start in range(0, frames, part):
         stop = min(start + part, frames)
-        rows = [values[start:stop].reshape(stop - start, pixels) for values in (depth, labels)]
-        out: Any = None
-        if device.is_cpu:
-            kinds = (wp.float32, wp.bool)
-            out = [wp.array(row, dtype=kind, device=device, copy=False) for row, kind in zip(rows, kinds, strict=True)]
+        rows: list[Any] = [
+            wp.array(values[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
+            for values, kind in ((depth, wp.float32), (labels, wp.bool))
+        ]
         drawn = kernels.sample_frames(
             *inputs,
             laser=scene.laser.position,
@@ -501,11 +500,12 @@ def _sample(
             first_frame=first + start,
             frames=stop - start,
             seed=seed,
-            out=out,
+            out=(rows[0], rows[1]) if device.is_cpu else None,
         )
         if not device.is_cpu:
             for row, array in zip(rows, drawn, strict=True):
-                row[...] = array.numpy()
+                wp.copy(row, array)
+            wp.synchronize_device(device)
     return depth, labels
 
 

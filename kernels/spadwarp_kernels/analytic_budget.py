@@ -10,7 +10,8 @@ import warp as wp
 
 from .depth import launch_pixels
 
-wp.set_module_options({"enable_backward": False})
+# Unrolled loops would make the compilation for a GPU take a minute.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _PI = wp.constant(wp.float64(3.141592653589793))
 _ZERO = wp.constant(wp.float64(0.0))

@@ -11,7 +11,8 @@ import warp as wp
 from .analytic_budget import Lidar, background_rate
 from .depth import launch_pixels
 
-wp.set_module_options({"enable_backward": False})
+# Unrolled loops would make the compilation for a GPU take a minute.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _PI = wp.constant(wp.float64(3.141592653589793))
 _SQRT2 = wp.constant(wp.float64(1.4142135623730951))
