@@ -131,8 +131,11 @@ def build_model(
             bvh_constructor="cubql" if device.is_cuda else None,
             bvh_leaf_size=1 if device.is_cuda else None,
         )
-        reflectance = wp.array(mesh.reflectance, dtype=float, device=device)
-        surfaces = sk.make_surfaces(device_mesh, reflectance, camera=lens if camera else None)
+        surfaces = sk.make_surfaces(
+            device_mesh,
+            wp.array(mesh.reflectance, dtype=float, device=device),
+            camera=lens if camera else None,
+        )
     model = sk.Model(
         device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
     )
