@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import ConfigError
+from .response import FWHM_PER_SIGMA
 from .result import SPEED_OF_LIGHT, Result, Truth, pixel_directions
 
 if TYPE_CHECKING:
     from .config import Scene
 
 __all__ = ["AnalyticResult", "analytic", "pixel_maps", "response_sigma"]
-
-FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 Map = NDArray[np.float64]
 

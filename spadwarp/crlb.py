@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .analytic import FWHM_PER_SIGMA, dark_rate, response_sigma
+from .analytic import dark_rate
+from .response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response
 
 if TYPE_CHECKING:
     from .result import Result
@@ -24,7 +25,7 @@ def crlb_from_histogram(
     *,
     bin_width: float,
     pulses: float,
-    irf: float | ArrayLike | None = None,
+    irf: InstrumentResponse | float | ArrayLike | None = None,
     law: Literal["poisson", "first_photon"] = "poisson",
     device: Any = None,
 ) -> Map:
@@ -38,8 +39,8 @@ def crlb_from_histogram(
         background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
         bin_width: [s], > 0.
         pulses: Pulses of one depth frame, > 0.
-        irf: Response still to be applied to both cubes: FWHM of a Gaussian [s], or response per bin (odd length,
-            centred); None if they hold it already. A bin's photons count as spread evenly over the bin.
+        irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
+            value per bin (odd number, centred); None if they hold it already. A bin's photons are spread evenly over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
         device: Warp device; default: the first GPU, else the CPU.
 
@@ -93,11 +94,18 @@ def crlb_map(
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
-    The scene's Gaussian response is applied. `pulses`: the scene's `analytic.pulses` if not given. See
+    The scene's instrument response is applied. `pulses`: the scene's `analytic.pulses` if not given. See
     `crlb_from_histogram`.
     """
     scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detector.pde
+    detector = scene.detector
+    response = instrument_response(
+        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
+        jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
+        shape=detector.irf,
+        tail=detector.irf_tail_ps * 1e-12,
+    )
+    scale = scene.laser.photons_per_pulse * detector.pde
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
     background = result.component("backscatter") * scale + dark_rate(scene) * scene.gate.bin_width
     return crlb_from_histogram(
@@ -105,27 +113,29 @@ def crlb_map(
         background,
         bin_width=scene.gate.bin_width,
         pulses=scene.analytic.pulses if pulses is None else pulses,
-        irf=response_sigma(scene) * FWHM_PER_SIGMA,
+        irf=response,
         law=law,
         device=device,
     )
 
 
-def _response_taps(irf: float | ArrayLike | None, bin_width: float) -> tuple[Map, Map]:
+def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width: float) -> tuple[Map, Map]:
     """Response per bin, and the derivative by the delay in bins of what one bin's photons leave in the others."""
     stencil = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0  # fourth order
     if irf is None:
         return np.ones(1), stencil
-    if np.ndim(irf) == 0:
+    if not isinstance(irf, InstrumentResponse) and np.ndim(irf) == 0:
         fwhm = float(irf)  # type: ignore[arg-type]
         if not (fwhm > 0 and math.isfinite(fwhm)):
             raise ValueError(f"irf = {irf} s is outside (0, inf)")
-        sigma = fwhm / FWHM_PER_SIGMA / bin_width
-        reach = math.ceil(8.0 * sigma) + 2
-        x = np.arange(-reach - 1, reach + 2)
-        cdf = np.array([0.5 * math.erfc(-one / (sigma * math.sqrt(2.0))) for one in x])
-        area = x * cdf + sigma * np.exp(-0.5 * (x / sigma) ** 2) / math.sqrt(2.0 * math.pi)  # integral of cdf
-        return np.diff(area, 2), -np.diff(cdf, 2)
+        irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
+    if isinstance(irf, InstrumentResponse):
+        if irf.times is None and irf.sigma == 0:
+            raise ValueError("irf has no width: a step has no derivative")
+        reach = math.ceil(max(map(abs, irf.support)) / bin_width) + 2
+        edges = np.arange(-reach - 1, reach + 2) * bin_width
+        # Light spread evenly over a bin, through the response, collected in bins: second differences of the integrals.
+        return np.diff(irf.cumulative_integral(edges), 2) / bin_width, -np.diff(irf.cumulative(edges), 2)
     taps = np.asarray(irf, np.float64)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and (taps >= 0).all() and taps.sum() > 0):
         raise ValueError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")

@@ -13,6 +13,7 @@ from scenes import scene
 from spadwarp.analytic import analytic
 from spadwarp.crlb import crlb_from_histogram, crlb_map
 from spadwarp.errors import ConfigError
+from spadwarp.response import InstrumentResponse
 from spadwarp.result import Truth
 
 GATE = {"start_ns": 5.0, "bin_width_ps": 100.0, "bins": 200}
@@ -298,6 +299,17 @@ def test_the_response_is_applied_exactly():
     assert crlb_from_histogram(before, 2.0, bin_width=1e-11, pulses=1, irf=samples) == pytest.approx(expected, rel=2e-3)
 
 
+def test_an_exponential_tail_is_applied_as_the_response_says():
+    """Taps from the response's integrals against the same response by quadrature over each bin."""
+    before, _ = gaussian_cube(3.0)
+    irf = InstrumentResponse(sigma=4e-11, tail=1e-10)
+    light = np.repeat(before, 100) / 100  # in hundredths of a bin
+    response = irf.density(np.arange(-300, 6000) * 1e-13) * 1e-13
+    after = np.convolve(light, response)[300 : 300 + 24000].reshape(240, 100).sum(axis=1)
+    bound = crlb_from_histogram(before, 2.0, bin_width=1e-11, pulses=1, irf=irf)
+    assert bound == pytest.approx(crlb_from_histogram(after, 2.0, bin_width=1e-11, pulses=1), rel=2e-3)
+
+
 def test_pile_up_loses_information():
     signal, level = gaussian_cube(5.0, counts=2.0, level=0.01)
     poisson = crlb_from_histogram(signal, level, bin_width=1e-11, pulses=100)
@@ -320,6 +332,7 @@ def test_pile_up_loses_information():
         ({"pulses": -1}, r"pulses = -1 is outside"),
         ({"irf": -1.0}, r"irf = -1.0 s is outside"),
         ({"irf": [1.0, 1.0]}, "odd number"),
+        ({"irf": InstrumentResponse(tail=1e-10)}, "irf has no width"),
         ({"law": "coates"}, "law = 'coates' is not one of"),
     ],
 )
