@@ -484,8 +484,8 @@ def _sample(
     ]
     depth = np.empty((frames, *shape), np.float32)
     labels = np.empty((frames, *shape), np.bool_)
-    # On the CPU kernels write into the result itself; a GPU works in parts that leave room for others.
-    part = max(frames, 1) if device.is_cpu else max((1 << 31) // pixels, 2)
+    # On the CPU kernels write into the result itself; a GPU works in parts of 1.3 GB.
+    part = max(frames, 1) if device.is_cpu else max((1 << 28) // pixels, 2)
     for start in range(0, frames, part):
         stop = min(start + part, frames)
         rows: list[Any] = [

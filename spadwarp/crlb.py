@@ -40,7 +40,7 @@ def crlb_from_histogram(
         bin_width: [s], > 0.
         pulses: Pulses of one depth frame, > 0.
         irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
-            value per bin (odd number, centred); None if they hold it already. A bin's photons are spread evenly over it.
+            value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
         device: Warp device; default: the first GPU, else the CPU.
 
