@@ -11,6 +11,16 @@ from .domain import Limits, exit_distance
 from .gate import C0, Gate, gate_bin
 from .guided import Guiding
 from .laser import LASER_PROFILES, Laser, emit_photon
+from .launch import (
+    Data,
+    Model,
+    launch_transport,
+    load_transport_kernel,
+    make_data,
+    make_records,
+    make_surfaces,
+    read_ledger,
+)
 from .medium import Medium, free_path
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -33,19 +43,11 @@ from .transport import (
     COMPONENTS,
     ESTIMATORS,
     FEW_FACES,
-    Data,
-    Model,
     Records,
     Surfaces,
     TransportSpec,
-    launch_transport,
-    load_transport_kernel,
-    make_data,
-    make_records,
-    make_surfaces,
     make_transport_kernel,
     next_event_value,
-    read_ledger,
 )
 from .truth import truth_kernel
 

@@ -1,0 +1,183 @@
+"""Launching the transport kernel: what it takes (Model), what it writes (Data), and the call itself."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from .camera import Camera
+from .domain import Limits
+from .gate import Gate
+from .guided import Guiding
+from .laser import Laser
+from .medium import Medium
+from .shadow import near_depth_map
+from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH
+from .transport import COMPONENTS, Records, Surfaces, TransportSpec, make_transport_kernel
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is transported through: immutable, on one device.
+
+    Attributes:
+        device: Warp device that holds the arrays.
+        medium, laser, camera, gate, limits, guiding: Parameter structs.
+        mesh: Target, or None for water alone; kept here so that its BVH lives as long as the model.
+        surfaces: The struct that kernels take, made from the mesh by `make_surfaces`.
+        scale: Tally units per emitted photon.
+    """
+
+    device: wp.Device
+    medium: Medium
+    laser: Laser
+    camera: Camera
+    gate: Gate
+    limits: Limits
+    guiding: Guiding
+    mesh: wp.Mesh | None
+    surfaces: Surfaces
+    scale: float
+
+    @property
+    def tally_size(self) -> int:
+        return len(COMPONENTS) * self.camera.width * self.camera.height * self.gate.bins
+
+
+@dataclass
+class Data:
+    """What transport writes: mutable, on one device; several launches may add to one.
+
+    Attributes:
+        tally: int64 [component * height * width * bin], fixed point.
+        ledger: int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`.
+        records: Terminal states of the last launch's photons.
+    """
+
+    tally: wp.array
+    ledger: wp.array
+    records: Records
+
+
+def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0) -> Data:
+    """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to."""
+    size = model.tally_size
+    if tally is None:
+        tally = wp.zeros(size, dtype=wp.int64, device=model.device)
+    elif tally.dtype is not wp.int64 or tally.size != size or not tally.is_contiguous or tally.ndim != 1:
+        raise ValueError(f"tally is {tally.dtype.__name__} {tally.shape}; contiguous int64 ({size},) is needed")
+    return Data(
+        tally=tally,
+        ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
+        records=make_records(record_count, device=model.device),
+    )
+
+
+def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
+    """Room for the terminal states of `count` photons."""
+    records = Records()
+    records.position = wp.zeros(count, dtype=wp.vec3, device=device)
+    records.direction = wp.zeros(count, dtype=wp.vec3, device=device)
+    records.weight = wp.zeros(count, dtype=float, device=device)
+    records.path = wp.zeros(count, dtype=float, device=device)
+    records.collisions = wp.zeros(count, dtype=int, device=device)
+    records.reason = wp.zeros(count, dtype=int, device=device)
+    return records
+
+
+def make_surfaces(
+    mesh: wp.Mesh | None,
+    reflectance: wp.array | float = 0.5,
+    *,
+    camera: "Camera | None" = None,
+    device: wp.DeviceLike = None,
+) -> Surfaces:
+    """The kernel's view of a mesh.
+
+    Args:
+        mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew.
+        reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
+        camera: Saves most of the rays between scattering events and its lens.
+        device: Where the empty arrays go if there is no mesh.
+    """
+    surfaces = Surfaces()
+    if mesh is None:
+        surfaces.reflectance = wp.zeros(0, dtype=float, device=device)
+        surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
+        return surfaces
+    face_count = mesh.indices.size // 3
+    if isinstance(reflectance, float):
+        reflectance = wp.full(face_count, reflectance, dtype=float, device=mesh.device)
+    if reflectance.size != face_count:
+        raise ValueError(f"reflectance has {reflectance.size} entries; the mesh has {face_count} faces")
+    points = mesh.points.numpy()
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    padding = 1e-6 * abs(points).max() + 1e-6
+    surfaces.mesh = mesh.id
+    surfaces.lower = wp.vec3(*(lower - padding))
+    surfaces.upper = wp.vec3(*(upper + padding))
+    surfaces.reflectance = reflectance
+    if camera is None:
+        surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=mesh.device)
+    else:
+        surfaces.near_depth = near_depth_map(mesh, camera)
+    return surfaces
+
+
+# Threads of a CUDA launch: enough to fill any GPU, few enough that each walks many photons and flushes its tallies
+# seldom.
+CUDA_THREADS = 1 << 19
+
+
+_BLOCK = 128
+
+
+def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
+    """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
+    device = wp.get_device(device)
+    make_transport_kernel(spec, device.is_cuda).module.load(device, _BLOCK if device.is_cuda else 1)
+
+
+def launch_transport(
+    spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int
+) -> None:
+    """Walks the photons first_id ... first_id + photon_count - 1 and adds them to `data`; asynchronous on CUDA.
+
+    Args:
+        spec: Compile-time choices; each new one compiles a kernel (seconds), cached on disk.
+        model, data: On the same device.
+        seed: 0 ... 2^64 - 1. A photon's history depends on (seed, id) alone.
+        first_id: 64-bit.
+        photon_count: 1 ... 2^26 in one launch.
+    """
+    if not 0 < photon_count <= 1 << 26:
+        raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
+    threads = min(-(-photon_count // _BLOCK) * _BLOCK, CUDA_THREADS) if model.device.is_cuda else 1
+    wp.launch(
+        make_transport_kernel(spec, model.device.is_cuda),
+        dim=threads,
+        inputs=[
+            model.medium,
+            model.laser,
+            model.camera,
+            model.gate,
+            model.limits,
+            model.guiding,
+            model.surfaces,
+            seed,
+            first_id,
+            photon_count,
+            threads,
+            model.scale,
+        ],
+        outputs=[data.tally, data.ledger, data.records],
+        device=model.device,
+        block_dim=_BLOCK,
+    )
+
+
+def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
+    """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device."""
+    totals = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS).sum(axis=1)
+    names = LEDGER_ENTRIES + COUNTERS
+    values = {name: int(total) for name, total in zip(names, totals, strict=True)}
+    return {n: values[n] for n in LEDGER_ENTRIES}, {n: values[n] for n in COUNTERS}
