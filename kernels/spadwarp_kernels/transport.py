@@ -216,15 +216,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
     paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:]
-    intersect = intersect_faces if few_faces else intersect_mesh
+    # A handful of faces is tried on the spot; rays for a BVH wait until the warp has enough of them.
+    has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
-    waiting_lanes = WAITING_LANES[has_mesh]
+    waiting_lanes = WAITING_LANES[has_bvh]
 
     @wp.kernel(
         module="unique",
         module_options={"fast_math": cuda},
         enable_backward=False,
-        cuda_max_registers=MAX_REGISTERS[has_mesh],
+        cuda_max_registers=MAX_REGISTERS[has_bvh],
     )
     def transport(
         # Model:
@@ -279,7 +280,17 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.reach = wp.max(s.reach, s.interval[1])
                     if wp.static(has_mesh):
                         if segment_meets_box(s.x, s.u, s.reach, surfaces.lower, surfaces.upper):
-                            s.ray = _SURFACE_RAY
+                            if wp.static(has_bvh):
+                                s.ray = _SURFACE_RAY
+                            else:
+                                hit = intersect_faces(surfaces.mesh, s.x, s.u, s.reach)
+                                s.surface_queries += 1
+                                if hit.face >= 0:
+                                    s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
+                                    if hit.distance < s.distance:
+                                        s.distance = hit.distance
+                                        s.face = hit.face
+                                        s.normal = hit.normal
 
                 if wp.static(guided):
                     if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
@@ -401,13 +412,22 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
                 if wp.static(next_event or guided):
                     if s.ray == _SHADOW_RAY:
-                        needed = False
+                        origin = s.x + s.along * s.u
+                        seen = True
                         if wp.static(has_mesh):
-                            origin = s.x + s.along * s.u
-                            needed = may_be_hidden(camera, surfaces.near_depth, origin)
-                            if needed:
-                                needed = segment_meets_box(origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper)
-                        if not needed:
+                            if may_be_hidden(camera, surfaces.near_depth, origin):
+                                seen = not segment_meets_box(
+                                    origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper
+                                )
+                        if wp.static(few_faces):
+                            if not seen:
+                                s.shadow_queries += 1
+                                to = s.lens - origin
+                                length = wp.length(to)
+                                seen = intersect_faces(surfaces.mesh, origin, to / length, length).face < 0
+                                if not seen:
+                                    s.ray = _NO_RAY
+                        if seen:
                             deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
                             s.ray = _NO_RAY
 
@@ -514,7 +534,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.stage = _FLIGHT
 
             # ---- Surfaces: the warp traces its rays together
-            if wp.static(has_mesh):
+            if wp.static(has_bvh):
                 if s.ray != _NO_RAY:
                     origin = s.x
                     to = s.u
@@ -525,12 +545,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             to = s.lens - origin
                             length = wp.length(to)
                             to = to / length
-                    hit = intersect(surfaces.mesh, origin, to, length)
+                    hit = intersect_mesh(surfaces.mesh, origin, to, length)
                     if s.ray == _SURFACE_RAY:
                         s.surface_queries += 1
                         if hit.face >= 0:
-                            if wp.static(guided):
-                                s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
+                            s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
                             if hit.distance < s.distance:
                                 s.distance = hit.distance
                                 s.face = hit.face
