@@ -157,7 +157,8 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     direction = pixel_directions(result.scene.camera)[row, column]
 
     def to_range(at: ArrayLike) -> NDArray[np.float64]:
-        return range_from_path(np.asarray(at) * speed, direction, laser)
+        # Range 0 before light could have gone from laser to lens: an axis cannot begin with NaN.
+        return np.nan_to_num(range_from_path(np.asarray(at) * speed, direction, laser))
 
     def to_time(at: ArrayLike) -> NDArray[np.float64]:
         distance = np.asarray(at, dtype=np.float64)

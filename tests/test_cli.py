@@ -129,6 +129,13 @@ def test_output_follows_the_scene(scene, tmp_path):
     assert {path.name for path in out.iterdir()} == {"result.h5", "scene.toml"}
 
 
+def test_gate_that_opens_with_the_pulse(scene, tmp_path):
+    """Its first bins are earlier than light can go from the laser to the lens: no range belongs to them."""
+    out = tmp_path / "out"
+    run("simulate", scene, "--out", out, "--quiet", "--device", "cpu", "--set", "gate.start_ns=0")
+    assert {path.name for path in out.iterdir()} == FILES
+
+
 def test_directory_in_use_is_refused_unless_overwritten(scene, tmp_path):
     out = tmp_path / "out"
     out.mkdir()

@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from ._app import complain
 from ._options import count
 
+Report = Callable[[str, int, int], None]
+
 _COMPILING = "loading kernels; the first run of a kind compiles them, which takes a while"
 
 
 @contextmanager
-def progress(*, quiet: bool, unit: str = "photons") -> Iterator[Callable[[str, int, int], None] | None]:
+def progress(*, quiet: bool, unit: str = "photons") -> Iterator[Report | None]:
     """What `spadwarp.simulate` takes as `progress`; None where nothing is to be said."""
     if quiet:
         yield None
@@ -25,33 +27,47 @@ def progress(*, quiet: bool, unit: str = "photons") -> Iterator[Callable[[str, i
         yield _lines(unit)
 
 
-def _lines(unit: str) -> Callable[[str, int, int], None]:
+class _Pace:
+    """What is done per second, since the first report: kernels are loaded and truth maps made before it."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def __call__(self, done: int) -> tuple[float, float]:
+        """Rate [1/s], 0 where it is not known yet, and seconds since the first report."""
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now, done
+        seconds = now - self._first[0]
+        return (done - self._first[1]) / seconds if seconds > 0.05 else 0.0, seconds
+
+
+def _lines(unit: str) -> Report:
     """A line at every tenth, but not more often than every second; in a long run soon, then ever more seldom."""
-    began = told = time.monotonic()
-    told_done, patience = 0, 2.0
+    pace = _Pace()
+    told, told_done, patience = time.monotonic(), 0, 2.0
 
     def report(stage: str, done: int, total: int) -> None:
-        nonlocal began, told, told_done, patience
-        now = time.monotonic()
+        nonlocal told, told_done, patience
         if stage == "compile":
             complain(_COMPILING)
-        if done == 0:
-            began = told = now
-            told_done = 0
             return
-        waited = now - told
+        rate, seconds = pace(done)
+        waited = time.monotonic() - told
         due = (done - told_done >= 0.1 * total and waited >= 1.0) or waited >= patience
         if done > told_done and (due or done == total):
-            rate = done / max(now - began, 1e-9)
-            left = f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(now - began)}"
-            complain(f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}, {rate:.3g} {unit}/s{left}")
-            told, told_done, patience = now, done, min(2.0 * patience, 60.0)
+            line = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
+            if rate:
+                line += f", {rate:.3g} {unit}/s"
+                line += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
+            complain(line)
+            told, told_done, patience = time.monotonic(), done, min(2.0 * patience, 60.0)
 
     return report
 
 
 @contextmanager
-def _bar(unit: str) -> Iterator[Callable[[str, int, int], None]]:
+def _bar(unit: str) -> Iterator[Report]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -64,17 +80,14 @@ def _bar(unit: str) -> Iterator[Callable[[str, int, int], None]]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=None)
-        began = time.monotonic()
+        pace = _Pace()
 
         def report(stage: str, done: int, total: int) -> None:
-            nonlocal began
             if stage == "compile":
                 bar.update(task, description=_COMPILING, total=None)
-            if done == 0:
-                began = time.monotonic()
                 return
-            rate = done / max(time.monotonic() - began, 1e-9)
-            text = f"{count(done)} {unit}, {rate:.3g} {unit}/s"
+            rate, _ = pace(done)
+            text = f"{count(done)} {unit}" + (f", {rate:.3g} {unit}/s" if rate else "")
             bar.update(task, description=text, completed=done, total=total)
 
         yield report
