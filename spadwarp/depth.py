@@ -108,6 +108,9 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """
     import warp as wp
 
+    from spadwarp.hardware import start_warp
+
+    start_warp()
     if isinstance(array, wp.array):
         result = array if device is None else array.to(device)
     elif type(array).__module__.partition(".")[0] == "torch":
