@@ -121,6 +121,8 @@ def build_model(
     guiding = sk.Guiding()
     guiding.probability = guiding.surface_probability = 0.3
     guiding.anisotropy = 0.97
+    guiding.return_probability = 0.1
+    guiding.return_anisotropy = 0.8
 
     device_mesh, surfaces = None, sk.make_surfaces(None, device=device)
     if mesh is not None:

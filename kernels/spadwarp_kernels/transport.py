@@ -472,22 +472,39 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             on_surface = s.face >= 0
                         snapped = snap_direction(s.u, medium.axis_threshold)
                         if wp.static(guided):
-                            # Towards the lens with some probability; the weight makes up for it.
+                            # Towards the lens, or back into the view, with some chance; the weight makes up for it.
                             v = -wp.normalize(s.x)
-                            chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
-                            axis = wp.where(u01(s.block[3]) < chance, v, snapped)
-                            if u01(s.block[3]) >= chance and on_surface:
+                            inward = wp.vec3(-s.x[0], -s.x[1], 0.0)
+                            to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
+                            to_view_chance = float(0.0)
+                            if project(camera, s.x) < 0 and wp.dot(inward, inward) > 0.0:
+                                to_view_chance = guiding.return_probability
+                                inward = wp.normalize(inward)
+                            choice = u01(s.block[3])
+                            t = phase_sample(u01_fine(s.block[1]), medium)
+                            axis = snapped
+                            if choice < to_lens_chance:
+                                axis = v
+                                t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.anisotropy)
+                            elif choice < to_lens_chance + to_view_chance:
+                                axis = inward
+                                t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.return_anisotropy)
+                            if on_surface and choice >= to_lens_chance + to_view_chance:
                                 s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
-                                t = phase_sample(u01_fine(s.block[1]), medium)
-                                if u01(s.block[3]) < chance:
-                                    t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.anisotropy)
                                 s.u = rotate_direction(axis, t, u01(s.block[2]))
                             density = phase_pdf(one_minus_cosine(snapped, s.u), medium)
                             if on_surface:
                                 density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
-                            lobe = henyey_greenstein_pdf(one_minus_cosine(v, s.u), guiding.anisotropy)
-                            s.weight *= density / wp.max((1.0 - chance) * density + chance * lobe, 1.0e-30)
+                            mixture = (1.0 - to_lens_chance - to_view_chance) * density
+                            mixture += to_lens_chance * henyey_greenstein_pdf(
+                                one_minus_cosine(v, s.u), guiding.anisotropy
+                            )
+                            if to_view_chance > 0.0:
+                                mixture += to_view_chance * henyey_greenstein_pdf(
+                                    one_minus_cosine(inward, s.u), guiding.return_anisotropy
+                                )
+                            s.weight *= density / wp.max(mixture, 1.0e-30)
                             after = to_ledger(s.weight)
                             s.directed += s.ledger_weight - after
                             s.ledger_weight = after
