@@ -37,14 +37,6 @@ def test_python_blocks_run(readme, roots, told, tmp_path):
     assert told in process.stdout
 
 
-@pytest.mark.parametrize("readme", ["README.md", "kernels/README.md"])
-def test_relative_links_lead_somewhere(readme):
-    text = (ROOT / readme).read_text()
-    links = re.findall(r"\]\(([^)#]+)[^)]*\)", text) + re.findall(r'src="([^"]+)"', text)
-    for link in links:
-        assert "://" in link or (ROOT / readme).parent.joinpath(link).exists(), link
-
-
 def test_shell_commands_name_what_there_is():
     """The options and the scenes that the README shows are those of the command line."""
     from typer.testing import CliRunner
