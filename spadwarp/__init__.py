@@ -16,6 +16,7 @@ _HOMES = {
     "Scene": "config",
     "presets": "catalog",
     "check": "checks",
+    "bench": "benchmark",
     "simulate": "simulation",
     "trace": "simulation",
     "PhotonRecords": "simulation",
@@ -35,6 +36,7 @@ _HOMES = {
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
+    from spadwarp.benchmark import bench
     from spadwarp.catalog import presets
     from spadwarp.checks import check
     from spadwarp.config import Scene, load_scene

@@ -1,0 +1,147 @@
+"""`spadwarp bench`: how fast this machine is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import spadwarp
+
+from ._app import app, complain, fail, say
+from ._options import Device, Json, Photons, Quiet, check_writable, in_bytes, write_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spadwarp.benchmark import BenchResult
+
+
+@app.command()
+def bench(
+    cases: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="CASE", help='Names of cases, or "scaling"; all cases if left out.', show_default=False),
+    ] = None,
+    device: Device = None,
+    photons: Photons = None,
+    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest counts.")] = 3,
+    list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and leave.")] = False,
+    quiet: Quiet = False,
+    json_path: Json = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also print the ratio of the rates to those that --json wrote earlier."),
+    ] = None,
+) -> None:
+    """Measure the speed of named cases.
+
+    Compile time is apart from run time. "error" is the relative standard error of the brightest bins after one second
+    of transport. Ends with code 1 where a mean that is known from elsewhere is missed.
+
+    \b
+    Examples:
+      spadwarp bench water staircase_5m --json before.json
+      spadwarp bench water staircase_5m --compare before.json
+      spadwarp bench scaling --device cpu
+    """
+    from spadwarp.benchmark import CASES, load_report, ratios, report
+
+    if list_cases:
+        for case in CASES.values():
+            say(f"{case.name:<20}  {case.about}")
+        say(f"{'scaling':<20}  how cost and memory grow with photons, faces and bins")
+        return
+    before = None if compare is None else load_report(compare)
+    if json_path is not None:
+        check_writable(json_path.parent)
+    results = spadwarp.bench(
+        cases or None,
+        device=device,
+        photons=photons,
+        repeats=repeats,
+        progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
+    )
+    summary = report(results)
+    if not quiet:
+        made = summary["provenance"]
+        _show(_table(results), f"{made['device_name']} ({made['device']}), {made['date']}")
+        for result in results:
+            if result.check is not None:
+                say(_checked(result.case, result.check))
+    if before is not None:
+        faster = ratios(results, before)
+        summary["ratios"] = faster
+        if not quiet:
+            made = before["provenance"]
+            _show(_ratio_table(faster), f"over {compare}: {made['device_name']}, {made['date']}")
+    write_json(summary, json_path)
+    missed = [result.case for result in results if result.check is not None and not result.check["passed"]]
+    if missed:
+        fail(f"{', '.join(missed)}: a mean is not what it should be")
+
+
+def _table(results: Sequence[BenchResult]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("case", no_wrap=True)
+    for title in ("faces", "setup", "compile", "run", "per second", "collisions/s", "queries/s", "memory", "error"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for result in results:
+        unit, rate = next(iter(result.rates.items()))
+        memory = result.tally_bytes if result.memory is None else result.memory
+        table.add_row(
+            result.case,
+            str(result.faces or "-"),
+            f"{result.setup:.3g} s",
+            f"{result.compile:.3g} s",
+            f"{min(result.seconds):.3g} s",
+            f"{rate:.3g} {unit}",
+            _rate(result.rates.get("collisions")),
+            _rate(result.rates.get("queries")),
+            "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
+            "-" if result.error_per_root_second is None else f"{100 * result.error_per_root_second:.3g} %",
+        )
+    if any(result.memory is None and result.tally_bytes for result in results):
+        table.caption = "* histograms alone; Warp does not count memory on the CPU"
+    return table
+
+
+def _ratio_table(faster: Mapping[str, Mapping[str, float]]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("case", no_wrap=True)
+    units = list(dict.fromkeys(unit for rates in faster.values() for unit in rates))
+    for unit in units:
+        table.add_column(f"{unit}/s", justify="right")
+    for case, rates in faster.items():
+        table.add_row(case, *(f"× {rates[unit]:.3f}" if unit in rates else "-" for unit in units))
+    return table
+
+
+def _show(table: Table, title: str) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)
+    say(title)
+    console.print(table)
+
+
+def _rate(value: float | None) -> str:
+    return f"{value:.3g}" if value else "-"
+
+
+def _checked(case: str, check: Mapping[str, Any]) -> str:
+    verdict = "agrees with" if check["passed"] else "MISSES"
+    return (
+        f"{case}: {check['name']} {100 * check['value']:.3f} ± {100 * check['standard_error']:.3f} %, "
+        f"{verdict} {100 * check['reference']:.2f} %"
+    )
