@@ -26,6 +26,19 @@ _HOMES = {
     "merge": "result",
     "Truth": "result",
     "load_result": "files",
+    "detect": "detector",
+    "Detection": "detector",
+    "coates": "detector",
+    "InstrumentResponse": "response",
+    "instrument_response": "response",
+    "arrival_time": "depth",
+    "crlb_map": "crlb",
+    "analytic": "analytic_model",
+    "AnalyticResult": "analytic_model",
+    "load_truth_exr": "truth_exr",
+    "budget": "budgets",
+    "sweep": "budgets",
+    "validate": "validation",
     "SpadwarpError": "errors",
     "ConfigError": "errors",
     "DeviceError": "errors",
@@ -36,16 +49,24 @@ _HOMES = {
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
+    from spadwarp.analytic_model import AnalyticResult, analytic
     from spadwarp.benchmark import bench
+    from spadwarp.budgets import budget, sweep
     from spadwarp.catalog import presets
     from spadwarp.checks import check
     from spadwarp.config import Scene, load_scene
+    from spadwarp.crlb import crlb_map
+    from spadwarp.depth import arrival_time
+    from spadwarp.detector import Detection, coates, detect
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.files import load_result
     from spadwarp.hardware import devices
     from spadwarp.model import truth_maps
+    from spadwarp.response import InstrumentResponse, instrument_response
     from spadwarp.result import Result, Truth, merge
     from spadwarp.simulation import PhotonRecords, simulate, trace
+    from spadwarp.truth_exr import load_truth_exr
+    from spadwarp.validation import validate
 
 
 def __getattr__(name: str) -> Any:

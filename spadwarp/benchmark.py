@@ -404,7 +404,7 @@ class _Memory:
 
 
 def _analytic(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
-    from spadwarp.analytic import analytic
+    from spadwarp.analytic_model import analytic
     from spadwarp.model import truth_maps
 
     frames = 512 if device.is_cuda else 32

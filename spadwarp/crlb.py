@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .analytic import dark_rate
+from .analytic_model import dark_rate
 from .response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ HEAVY = {"warp", "spadwarp_kernels", "torch", "matplotlib", "h5py", "rich", "tri
 # Folder or file, and what it must not know of.
 ARROWS = {
     "spadwarp/cli": {"warp", "spadwarp_kernels", "torch"},
-    "spadwarp/analytic.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
-    "spadwarp/budget.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
+    "spadwarp/analytic_model.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
+    "spadwarp/budgets.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
     "spadwarp/detector.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
     "spadwarp/depth.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
     "spadwarp/config.py": {"spadwarp.simulation", "spadwarp.result", "spadwarp.model"},

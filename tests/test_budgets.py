@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scenes import scene
-from spadwarp.analytic import analytic
-from spadwarp.budget import BudgetRow, DepthErrorRow, budget, parse_vary, plot_budget, plot_sweep, sweep
+from spadwarp.analytic_model import analytic
+from spadwarp.budgets import BudgetRow, DepthErrorRow, budget, parse_vary, plot_budget, plot_sweep, sweep
 from spadwarp.errors import ConfigError
 
 SCENE = scene(

@@ -1,6 +1,6 @@
 """Photon budgets: what a lidar gets back over range, water and any field of the scene, before anything is simulated.
 
-Built on the analytic model (`spadwarp.analytic`), whose limits hold here too: light scattered more than once is left
+Built on the analytic model (`spadwarp.analytic_model`), whose limits hold here too: light scattered more than once is left
 out, which in turbid water is most of the backscatter.
 """
 
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .analytic import analytic, dark_rate, pixel_maps
+from .analytic_model import analytic, dark_rate, pixel_maps
 from .errors import ConfigError
 from .result import SPEED_OF_LIGHT
 
@@ -271,7 +271,7 @@ def _pulses_needed(
 
     from spadwarp_kernels.cramer_rao import outlier_probabilities
 
-    from .analytic import response_sigma
+    from .analytic_model import response_sigma
     from .model import pick_device
 
     target = pick_device(device)

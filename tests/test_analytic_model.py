@@ -10,7 +10,7 @@ import pytest
 import spadwarp
 from reference import crlb
 from scenes import scene
-from spadwarp.analytic import analytic
+from spadwarp.analytic_model import analytic
 from spadwarp.crlb import crlb_from_histogram, crlb_map
 from spadwarp.errors import ConfigError
 from spadwarp.response import InstrumentResponse
