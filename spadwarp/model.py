@@ -118,8 +118,8 @@ def build_model(
     limits.weight_cutoff = scene.transport.weight_cutoff
     limits.max_collisions = scene.transport.max_collisions
 
-    # Measured on the plane, staircase, harbour and 7.5-attenuation-length scenes. Each event divides the weight of light
-    # that was left alone by 1 - probability, so that thick water, where events are many, wants less.
+    # Measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long. Each event divides the weight of
+    # light that was left alone by 1 - probability, so that thick water, where events are many, wants less.
     thickness = max(scene.medium.extinction * limits.max_path, 1e-6)
     guiding = sk.Guiding()
     guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))

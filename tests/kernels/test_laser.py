@@ -9,7 +9,7 @@ import warp as wp
 from spadwarp_kernels import LASER_PROFILES, Laser, emit_photon
 from statistics_of_samples import DEVICES, chi2_p
 
-COUNT = 2_000_000
+COUNT = 10_000_000
 AXIS = np.array([0.36, -0.48, 0.8])
 
 
