@@ -1,0 +1,157 @@
+"""Where multiple scattering makes the analytic model wrong: Monte Carlo over analytic, against optical depth.
+
+python docs/figures/analytic_limits.py
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import spadwarp
+
+# One-way optical depths from laser to target.
+OPTICAL_DEPTHS = (0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+DISTANCE = 5.0  # of the target [m]
+ALBEDO = 0.833  # Petzold's harbour
+RUNS = 8  # independent, behind each error bar
+METRE = 1e9 / 299_792_458.0  # time in which light goes a metre at index 1 [ns]
+
+# What is compared, in the order of `ratios`.
+BALLISTIC, TARGET, TARGET_SOON, BACKSCATTER, BACKSCATTER_GATED = range(5)
+SOON = 0.1  # path [m] by which the target's light may be late: 5 cm of range
+GATED = (9.0, 11.0)  # path [m]: half a metre of range before and behind the target
+
+
+def scene(optical_depth: float, *, gate: tuple[float, float] = (1.0, 15.0)) -> spadwarp.Scene:
+    """A grey wall at 5 m, lit by a cone that overfills the view; `gate` in metres of path."""
+    width = 0.05  # of a bin [m]
+    return spadwarp.Scene.from_dict(
+        {
+            "medium": {
+                "extinction": optical_depth / DISTANCE,
+                "albedo": ALBEDO,
+                "anisotropy": 0.924,
+                "group_index": 1.0,
+                "phase_index": 1.0,
+            },
+            "laser": {"position": [-0.1, 0.0, 0.0], "half_angle_deg": 10.0},
+            "camera": {"width": 16, "height": 16, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01},
+            "gate": {
+                "start_ns": gate[0] * METRE,
+                "bin_width_ps": width * METRE * 1e3,
+                "bins": round((gate[1] - gate[0]) / width),
+            },
+            "targets": [
+                {"builtin": "plane", "size": [8.0, 8.0], "translation": [0.0, 0.0, DISTANCE], "reflectance": 0.5}
+            ],
+            "transport": {"max_collisions": 200, "axis_threshold": 1.0},
+        }
+    )
+
+
+def monte_carlo(optical_depth: float, *, photons: int, seed: int) -> NDArray[np.float64]:
+    """Detections per pulse, sums over the image `[5]`."""
+    wet = scene(optical_depth)
+    result = spadwarp.simulate(wet, photons=photons, seed=seed, device="cpu")
+    ballistic, water = result.component("ballistic"), result.component("backscatter")
+    target = ballistic + result.component("forward_scattered")
+    path = result.path_edges[:-1] + 1e-6
+    soon = path < result.true_path()[..., None] + SOON
+    gated = (path > GATED[0]) & (path < GATED[1])
+    sums = [ballistic.sum(), target.sum(), target[soon].sum(), water.sum(), water[..., gated].sum()]
+    return np.array(sums) * wet.laser.photons_per_pulse * wet.detector.pde
+
+
+def analytic(optical_depth: float) -> NDArray[np.float64]:
+    """The same sums by the analytic model."""
+    whole = spadwarp.analytic(scene(optical_depth), frames=0, device="cpu")
+    gated = spadwarp.analytic(scene(optical_depth, gate=GATED), frames=0, device="cpu")
+    signal = whole.signal.sum()
+    return np.array([signal, signal, signal, whole.backscatter.sum(), gated.backscatter.sum()])
+
+
+def ratios(optical_depth: float, *, photons: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Monte Carlo over analytic and its standard error, `[5]` each."""
+    # Turbid water needs more: fewer photons reach the target.
+    count = int(photons * max(optical_depth, 0.5) / 2.0) // RUNS
+    first = RUNS * OPTICAL_DEPTHS.index(optical_depth)  # random numbers of its own for each depth
+    batches = np.stack([monte_carlo(optical_depth, photons=count, seed=first + run) for run in range(RUNS)])
+    batches /= analytic(optical_depth)
+    return batches.mean(axis=0), batches.std(axis=0, ddof=1) / np.sqrt(RUNS)
+
+
+def draw(mean: NDArray[np.float64], error: NDArray[np.float64]) -> Any:
+    """The figure from ratios and errors, `[optical depth, 5]`."""
+    from matplotlib.figure import Figure
+
+    # Okabe and Ito's colours, which the colour-blind tell apart.
+    curves = (
+        (
+            "Target return",
+            "Monte Carlo / signal S of eq 7",
+            (
+                (BALLISTIC, "ballistic", "#000000", "o"),
+                (TARGET_SOON, "all that is less than 5 cm late", "#0072B2", "s"),
+                (TARGET, "all", "#D55E00", "^"),
+            ),
+        ),
+        (
+            "Water backscatter",
+            "Monte Carlo / single scattering",
+            (
+                (BACKSCATTER, "gate from 0.5 m to 7.5 m of range", "#009E73", "o"),
+                (BACKSCATTER_GATED, "gate ±0.5 m about the target", "#CC79A7", "s"),
+            ),
+        ),
+    )
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    for axes, (title, label, rows) in zip(figure.subplots(1, 2, sharey=True), curves, strict=True):
+        axes.axhline(1.0, color="0.6", lw=0.8)
+        if rows[0][0] == BALLISTIC:
+            # What the target would return if light scattered once or more went on as if nothing had happened.
+            depths = np.array((0.0, OPTICAL_DEPTHS[-1]))
+            axes.plot(
+                depths,
+                np.exp(2.0 * ALBEDO * depths),
+                color="0.5",
+                ls="--",
+                lw=1.0,
+                label="exp(2ωτ): no loss by scattering",
+            )
+        for k, name, colour, marker in rows:
+            axes.errorbar(
+                OPTICAL_DEPTHS,
+                mean[:, k],
+                yerr=error[:, k],
+                label=name,
+                color=colour,
+                marker=marker,
+                ms=4,
+                lw=1.2,
+                capsize=2,
+            )
+        axes.set(title=title, xlabel="one-way optical depth τ of the target", ylabel=label, yscale="log")
+        axes.legend(frameon=False, fontsize=8, loc="upper left")
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--photons", type=int, default=2_000_000, help="at an optical depth of 2")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images" / "analytic_limits.png")
+    arguments = parser.parse_args()
+    points = [ratios(depth, photons=arguments.photons) for depth in OPTICAL_DEPTHS]
+    mean, error = (np.stack(part) for part in zip(*points, strict=True))
+    print("depth  ballistic         target, on time   target            backscatter       gated")
+    for depth, m, e in zip(OPTICAL_DEPTHS, mean, error, strict=True):
+        columns = (BALLISTIC, TARGET_SOON, TARGET, BACKSCATTER, BACKSCATTER_GATED)
+        print(f"{depth:5.1f}  " + "  ".join(f"{m[k]:8.4f} ±{e[k]:7.4f}" for k in columns))
+    draw(mean, error).savefig(arguments.out, dpi=200)
+
+
+if __name__ == "__main__":
+    main()

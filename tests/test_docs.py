@@ -1,0 +1,79 @@
+"""The documentation: links lead somewhere, its Python runs against the interface, figures can be drawn."""
+
+import ast
+import importlib.util
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import spadwarp
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+FIGURES = sorted((ROOT / "docs" / "figures").glob("*.py"))
+
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def anchors(text):
+    """Anchors that the headings of a Markdown page get, code blocks left out."""
+    headings = re.findall(r"^#+ (.*)$", _FENCE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def by_name(path):
+    return path.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_relative_links_and_images_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for link in _LINK.findall(_FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        if anchor:
+            assert anchor in anchors(target.read_text(encoding="utf-8")), f"{page.name}: {link}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_python_in_the_text_uses_names_that_exist(page):
+    for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
+        if language == "python":
+            for node in ast.walk(ast.parse(code)):
+                if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spadwarp":
+                    assert hasattr(spadwarp, node.attr) or importlib.util.find_spec(f"spadwarp.{node.attr}")
+
+
+def test_every_image_is_shown_somewhere():
+    shown = "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"])
+    unused = [path.name for path in (ROOT / "docs" / "images").glob("*.png") if path.name not in shown]
+    assert not unused
+
+
+@pytest.mark.parametrize("path", FIGURES, ids=by_name)
+def test_figure_scripts_import_and_say_how_to_run_them(path):
+    module = load(path)
+    assert callable(module.main)
+    assert f"python docs/figures/{path.name}" in module.__doc__
+
+
+def test_ballistic_light_of_the_figure_is_the_analytic_signal():
+    figure = load(ROOT / "docs" / "figures" / "analytic_limits.py")
+    mean, error = figure.ratios(0.4, photons=160_000)
+    ballistic, target = figure.BALLISTIC, figure.TARGET
+    assert abs(mean[ballistic] - 1.0) < 4.5 * error[ballistic] < 0.1
+    # Light that scatters forward still comes back; it cannot be more than without any loss by scattering.
+    assert 1.2 < mean[target] < np.exp(2.0 * figure.ALBEDO * 0.4)
