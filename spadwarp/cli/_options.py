@@ -7,6 +7,8 @@ import math
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-from spadwarp.errors import FileError
+from spadwarp.errors import ConfigError, FileError
 
 if TYPE_CHECKING:
-    from spadwarp import Scene
+    from rich.table import Table
+
+    from spadwarp import Result, Scene
 
 
 def whole_number(text: str | int) -> int:
@@ -74,6 +78,20 @@ def read_scene(
     scene = scene.with_overrides(overrides or [])
     given = {"photons": photons, "seed": seed}
     return scene.with_overrides(transport={name: value for name, value in given.items() if value is not None})
+
+
+def load_run(place: Path) -> Result:
+    """The result in a file, or in the directory of a run."""
+    return spadwarp.load_result(place / "result.h5" if place.is_dir() else place)
+
+
+@contextmanager
+def arguments_checked() -> Iterator[None]:
+    """A value that the API refuses is wrong use of the command."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def prepare_directory(out: Path, *, overwrite: bool, needed: int) -> None:
@@ -143,3 +161,13 @@ def rows(table: dict[str, str], *, indent: str = "") -> str:
     """Names and values in two columns."""
     width = max(map(len, table), default=0)
     return "\n".join(f"{indent}{name:<{width}}  {value}".rstrip() for name, value in table.items())
+
+
+def show_table(table: Table) -> None:
+    """A table on stdout, as wide as the terminal; 160 columns elsewhere."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=160)
+    console.print(table)

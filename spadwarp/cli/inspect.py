@@ -12,7 +12,7 @@ import typer
 import spadwarp
 
 from ._app import app, say
-from ._options import Json, Mesh, Overrides, Quiet, ScenePath, count, in_bytes, read_scene, rows, write_json
+from ._options import Json, Mesh, Overrides, Quiet, ScenePath, count, in_bytes, load_run, read_scene, rows, write_json
 
 
 @app.command()
@@ -87,7 +87,7 @@ def info(
     Example:
       spadwarp info out/result.h5
     """
-    result = spadwarp.load_result(path / "result.h5" if path.is_dir() else path)
+    result = load_run(path)
     summary = result.summary()
     outside = {name: result.counters[name] * result.unit / result.photons for name in ("before_gate", "after_gate")}
     say("\n\n".join(f"{title}\n{rows(lines, indent='  ')}" for title, lines in _told(summary, outside).items()))

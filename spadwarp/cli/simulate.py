@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,19 +19,19 @@ from ._options import (
     Device,
     Json,
     Mesh,
-    Out,
     Overrides,
     Overwrite,
     Photons,
     Quiet,
-    ScenePath,
     Seed,
     Threads,
     check_writable,
     count,
+    load_run,
     prepare_directory,
     read_scene,
     rows,
+    whole_number,
     write_json,
 )
 from ._progress import progress
@@ -48,8 +50,13 @@ _PICTURES = ("depth.png", "intensity.png", "histogram.png", "truth.png")
 
 @app.command()
 def simulate(
-    scene_path: ScenePath,
-    out: Out,
+    scene_path: Annotated[
+        Path | None,
+        typer.Argument(metavar="SCENE", help="Scene file (TOML); none with --resume.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)
+    ] = None,
     mesh: Mesh = None,
     device: Device = None,
     photons: Photons = None,
@@ -59,6 +66,30 @@ def simulate(
     records: Annotated[
         bool, typer.Option("--records", help="Also write the terminal state of every photon: records.h5.")
     ] = False,
+    uncertainty: Annotated[
+        bool,
+        typer.Option("--uncertainty", help="Keep batches, for the standard error of every bin; twice the memory."),
+    ] = False,
+    relative_error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="X",
+            help="Stop when the bins that decide the depth are known this well (0.02: 2 %); --photons is then the most "
+            "that are traced.",
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Add photons to the finished or interrupted run in DIR until it has --photons in all (by default its "
+            "scene's), and write it back there.",
+        ),
+    ] = None,
+    first_photon: Annotated[
+        int,
+        typer.Option(parser=whole_number, metavar="ID", help="Id of the first photon; `spadwarp merge` adds the runs."),
+    ] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json_path: Json = None,
@@ -73,29 +104,65 @@ def simulate(
       spadwarp simulate configs/scenes/staircase_15m.toml --out out/
       spadwarp simulate configs/scenes/harbour_5m.toml --mesh bust.stl --device cuda:0 \\
           --photons 2e9 --seed 7 --out run1/ --set medium.extinction=0.9
+      spadwarp simulate configs/scenes/plane_5m.toml --relative-error 0.02 --photons 1e8 --out run2/
+      spadwarp simulate --resume run1/ --photons 4e9
     """
-    scene = read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
+    earlier = None
+    if resume is not None:
+        given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
+        given |= {
+            "--first-photon": first_photon or None,
+            "--records": records or None,
+            "--overwrite": overwrite or None,
+        }
+        if clash := [name for name, value in given.items() if value]:
+            raise typer.BadParameter(f"goes without {', '.join(clash)}: the run knows them", param_hint="--resume")
+        out = resume if resume.is_dir() else resume.parent
+        earlier = _earlier(resume, photons)
+        scene = earlier.scene
+    else:
+        if scene_path is None or out is None:
+            raise typer.BadParameter("is missing", param_hint="SCENE" if scene_path is None else "--out")
+        scene = read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
+    if records and first_photon:
+        raise typer.BadParameter("goes without --first-photon: records begin at photon 0", param_hint="--records")
     if records and scene.transport.photons >= 2**31:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
     for message in spadwarp.check(scene):
         if message.level == "warning":
             complain(str(message))
-    prepare_directory(out, overwrite=overwrite, needed=_bytes_needed(scene, records))
+    batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
+    needed = bytes_needed(scene, records=records, batches=batches)
+    prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
     if json_path is not None:
         check_writable(json_path.parent)
 
     with progress(quiet=quiet) as report:
-        result = spadwarp.simulate(scene, device=device, threads=threads, progress=report)
-    written, frame = _write(result, out, device=device)
+        result = spadwarp.simulate(
+            scene,
+            device=device,
+            threads=threads,
+            progress=report,
+            uncertainty=uncertainty,
+            relative_error=relative_error,
+            first_photon=first_photon,
+            resume=earlier,
+        )
+    written, frame = write_run(result, out, device=device)
     if records and not result.partial:
-        written.append(_write_records(scene, out, device=device, quiet=quiet))
-    for name in (*_NAMES, *_PICTURES):  # left from an earlier run, they would be taken for this one's
+        written.append(_write_records(scene, result.photons, out, device=device, quiet=quiet))
+    kept = {"records.h5"} if earlier is not None else set()
+    for name in {*_NAMES, *_PICTURES} - kept:  # left from an earlier run, they would be taken for this one's
         if out / name not in written:
             (out / name).unlink(missing_ok=True)
 
     if not quiet:
-        say(_described(result, frame, written))
-    write_json({**result.summary(), "files": written}, json_path)
+        say(described(result, frame, written))
+    error = result.relative_error if _has_errors(result) else None
+    write_json({**result.summary(), "relative_error": error, "files": written}, json_path)
+    if relative_error is not None and not result.partial and (error is None or error > relative_error):
+        reached = "is not known" if error is None else f"is {100 * error:.3g} %"
+        complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
     if result.partial:
         left_out = "; no records were written" if records else ""
         fail(
@@ -105,13 +172,26 @@ def simulate(
         )
 
 
-def _bytes_needed(scene: Scene, records: bool) -> int:
+def _earlier(place: Path, photons: int | None) -> Result:
+    """The run to resume, its scene asking for as many photons as it shall have."""
+    earlier = load_run(place)
+    wanted = earlier.scene.transport.photons if photons is None else photons
+    if wanted <= earlier.photons:
+        raise ConfigError(f"--photons: {wanted} is no more than the {earlier.photons} that {place} has")
+    return replace(earlier, scene=earlier.scene.with_overrides(transport={"photons": wanted}))
+
+
+def _has_errors(result: Result) -> bool:
+    return result.squares is not None and result.photons >= 2 * result.batch_size
+
+
+def bytes_needed(scene: Scene, *, records: bool, batches: bool) -> int:
     """Upper bound of what a run writes; compression takes off most of it."""
-    tallies = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+    tallies = (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
     return tallies + _OTHER_BYTES + (_RECORD_BYTES * scene.transport.photons if records else 0)
 
 
-def _write(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
+def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
     """Files of a result as its `[output]` asks for, the one that nothing can replace first, and the depth frame."""
     from spadwarp.files import save_depth_exr, save_truth_exr
     from spadwarp.preview import write_previews
@@ -154,17 +234,17 @@ def _save(result: Result, path: Path) -> Path:
         raise FileError(f"{error}\n{refuge}: the result is here instead") from error
 
 
-def _write_records(scene: Scene, out: Path, *, device: str | None, quiet: bool) -> Path:
+def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None, quiet: bool) -> Path:
     from spadwarp.records import save_records
 
     if not quiet:
         complain("the photons again, for their records")
     with progress(quiet=quiet) as report:
-        records = spadwarp.trace(scene, device=device, progress=report)
+        records = spadwarp.trace(scene, photons=photons, device=device, progress=report)
     return save_records(records, out / "records.h5", scene=scene)
 
 
-def _described(result: Result, frame: NDArray[np.float64], written: list[Path]) -> str:
+def described(result: Result, frame: NDArray[np.float64], written: list[Path]) -> str:
     """A run in a few lines."""
     import numpy as np
 
@@ -188,6 +268,10 @@ def _described(result: Result, frame: NDArray[np.float64], written: list[Path]) 
         lines["truth"] = (
             f"{np.isfinite(truth).sum()} of {frame.size} pixels, {np.nanmin(truth):.2f} to {np.nanmax(truth):.2f} m; "
             f"median error of the depth {1000 * error:.3g} mm"
+        )
+    if _has_errors(result) and math.isfinite(result.relative_error):
+        lines["error"] = (
+            f"{100 * result.relative_error:.3g} % in the bins that decide the depth, or less, in 95 % of the pixels"
         )
     parts = sorted(ledger["fractions"].items(), key=lambda entry: -abs(entry[1]))
     lines["ledger"] = ("closes exactly: " if ledger["exact"] else f"OFF BY {ledger['difference']} UNITS: ") + ", ".join(
