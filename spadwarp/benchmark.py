@@ -77,8 +77,8 @@ class BenchResult:
         setup: Seconds for meshes, BVH and arrays.
         compile: Seconds to compile the kernel or, if it was compiled before, to load it.
         seconds: Of each timed run.
-        rates: Per second, from the fastest run: photons, collisions, queries (of surfaces, with shadow rays); or frames,
-            bins.
+        rates: Per second, from the fastest run: photons, collisions, queries (of surfaces, with shadow rays); or
+            frames, bins.
         memory: Most memory of the device that the case held at a time [bytes]; None where Warp cannot tell (the CPU).
         tally_bytes: Of it the histograms, known everywhere; None without a camera.
         error_per_root_second: Relative standard error of the bins that decide the depth (`Result.relative_error`) after
@@ -439,7 +439,7 @@ def _detect(case: Case, device: wp.Device, _: int | None, repeats: int) -> Bench
     row, column, k = np.ogrid[:height, :width, :bins]
     place = 300.0 + 400.0 * row / height
     light = 1e-5 + 0.01 * (1 + column) / width * np.exp(-0.5 * ((k - place) / 2.0) ** 2)
-    source = wp.array(light.astype(np.float32), dtype=wp.float32, device=device)
+    source: Any = wp.array(light.astype(np.float32), dtype=wp.float32, device=device)
     options: dict[str, Any] = {
         "pulses": pulses,
         "detector": Detector(fold=False),
