@@ -50,7 +50,9 @@ def test_standard_error_is_the_spread_between_seeds(device):
     assert bright.sum() > 20
     assert np.sqrt(claimed / spread).mean() == pytest.approx(1.0, abs=0.1)
     z = (values - values.mean(axis=0))[:, bright] / np.array([run.standard_error for run in runs])[:, bright]
-    assert stats.norm.sf(2) / 2 < (z > 2).mean() < 4 * stats.norm.sf(2)
+    # Coverage, both sides together: a bin's sum is skewed, and its error rises and falls with it.
+    beyond = 2 * stats.norm.sf(2)
+    assert beyond / 2 < (np.abs(z) > 2).mean() < 2 * beyond
 
 
 def test_batches_do_not_depend_on_how_the_run_is_cut_up():
