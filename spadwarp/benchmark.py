@@ -252,7 +252,7 @@ def bench(
         cases: Names out of `CASES`, or "scaling" for a table of how cost grows; by default all of `CASES`.
         device: As for `spadwarp.simulate`.
         photons: Of one timed run of a transport case, > 0; by default 2^26 on a GPU and 2^18 a core on a CPU.
-            "analytic" and "detect" have sizes of their own.
+            "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
         repeats: Timed runs of each case, > 0; rates are those of the fastest.
         progress: Called with each case before it is run.
 
@@ -282,8 +282,7 @@ def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int)
     from spadwarp.model import build_model, transport_spec
     from spadwarp.targets import build_mesh
 
-    if photons is None:
-        photons = case.photons or (CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count())
+    photons = case.photons or photons or (CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count())
     scene = Scene.from_dict(case.scene)
     memory = _Memory(device)
     began = time.perf_counter()
