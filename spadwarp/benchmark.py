@@ -282,7 +282,8 @@ def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int)
     from spadwarp.model import build_model, transport_spec
     from spadwarp.targets import build_mesh
 
-    photons = case.photons or photons or (CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count())
+    usual = CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count()
+    photons = case.photons or photons or usual
     scene = Scene.from_dict(case.scene)
     memory = _Memory(device)
     began = time.perf_counter()
@@ -328,7 +329,7 @@ def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int)
         rates=rates,
         memory=held,
         tally_bytes=tally_bytes,
-        error_per_root_second=None if blind else _error(scene, device, photons, rates["photons"]),
+        error_per_root_second=None if blind else _error(scene, device, min(photons, usual), rates["photons"]),
         check=None if case.absorbed is None else _absorbed(scene, device, photons, *case.absorbed),
     )
 
