@@ -82,10 +82,11 @@ class AnalyticResult:
         """
         return _sample(self, frames, first=first, seed=self.seed if seed is None else seed, device=device)
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, frames: int | None = None, device: Any = None) -> Path:
         """Writes maps, truth, frames and scene to one HDF5 file, whole or not at all; returns its path.
 
-        Raises `FileError` where it cannot be written.
+        `frames`: this many are drawn and written in parts, whatever the memory, instead of those held. Raises
+        `FileError` where it cannot be written.
         """
         import h5py
 
@@ -98,8 +99,19 @@ class AnalyticResult:
                 _dataset(file, f"maps/{name}", getattr(self, name), unit)
             for name, unit in {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}.items():
                 _dataset(file, f"truth/{name}", getattr(self.truth, name), unit)
-            _dataset(file, "depth", self.depth, "m")
-            _dataset(file, "labels", self.labels, "1")
+            if frames is None:
+                _dataset(file, "depth", self.depth, "m")
+                _dataset(file, "labels", self.labels, "1")
+                return Path(path)
+            shape = self.truth.depth.shape
+            packed = {"chunks": (1, *shape), **_PACKED}
+            depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
+            labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
+            depth.attrs["unit"], labels.attrs["unit"] = "m", "1"
+            part = max(1, (1 << 28) // (5 * self.truth.depth.size))
+            for first in range(0, frames, part):
+                stop = min(first + part, frames)
+                depth[first:stop], labels[first:stop] = self.sample(stop - first, first=first, device=device)
         return Path(path)
 
 
@@ -300,7 +312,7 @@ def pixel_maps(
         "alpha": alpha,
         "fisher": fisher,
         "sigma_time": sigma_time,
-        "sigma_depth": sigma_time * _depth_per_time(scene, views, distances),
+        "sigma_depth": sigma_time * depth_per_time(scene, views, distances),
         "sbnr": sbnr,
         "background_level": level,
         "outlier_probability": outlier,
@@ -391,7 +403,7 @@ def _phase_table(scene: Scene) -> Map:
     return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
 
 
-def _depth_per_time(scene: Scene, view: Map, distance: Map) -> Map:
+def depth_per_time(scene: Scene, view: Map, distance: Map) -> Map:
     """dz/dt along lines of sight u [m/s]: path = |r·u − p| + r, so that d path/dr = 1 + (direction of the light)·u."""
     laser = scene.laser
     if laser.profile == "collimated":
@@ -508,9 +520,11 @@ def _sample(
     return depth, labels
 
 
+_PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
+
+
 def _dataset(file: Any, name: str, values: NDArray[Any], unit: str) -> None:
-    options = {"compression": "gzip", "shuffle": True, "compression_opts": 1} if values.size else {}
-    file.create_dataset(name, data=values, **options).attrs["unit"] = unit
+    file.create_dataset(name, data=values, **(_PACKED if values.size else {})).attrs["unit"] = unit
 
 
 _READ_ME = (

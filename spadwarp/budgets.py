@@ -1,7 +1,7 @@
 """Photon budgets: what a lidar gets back over range, water and any field of the scene, before anything is simulated.
 
-Built on the analytic model (`spadwarp.analytic_model`), whose limits hold here too: light scattered more than once is left
-out, which in turbid water is most of the backscatter.
+Built on the analytic model (`spadwarp.analytic_model`), whose limits hold here too: light scattered more than once is
+left out, which in turbid water is most of the backscatter.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -17,7 +17,7 @@ from spadwarp.depth import Method
 from spadwarp.files import atomic_path
 from spadwarp.result import COMPONENTS, Component, Result, pixel_directions, range_from_path
 
-__all__ = ["write_previews"]
+__all__ = ["image_panels", "show_image", "shown_limits", "write_previews"]
 
 _MISSING = "0.85"  # light grey: NaN
 # Okabe and Ito's colours: told apart with every common colour-blindness and, by their lightness, in print.
@@ -65,17 +65,17 @@ def write_previews(
 def _depth_figure(result: Result, frame: NDArray[np.float64], method: str) -> Figure:
     truth = result.truth.depth
     error = 100.0 * (frame - truth)
-    low, high = _limits(truth) if np.isfinite(truth).any() else _limits(frame, beyond=1.0)
+    low, high = shown_limits(truth) if np.isfinite(truth).any() else shown_limits(frame, beyond=1.0)
     margin = 0.05 * (high - low)
     scale: dict[str, Any] = {"label": "depth z [m]", "colours": "viridis_r", "low": low - margin, "high": high + margin}
     spread = np.abs(error[np.isfinite(error)])
     reach = max(float(np.percentile(spread, 98)), 0.1) if spread.size else 1.0
 
     figure, images, bars = _panels(result, 3)
-    _show(images[0], bars[0], frame, title=f"Measured ({method})", **scale)
-    _show(images[1], bars[1], truth, title="Truth", **scale)
+    show_image(images[0], bars[0], frame, title=f"Measured ({method})", **scale)
+    show_image(images[1], bars[1], truth, title="Truth", **scale)
     title = "Measured − truth"
-    _show(images[2], bars[2], error, title=title, label="depth error [cm]", colours="PuOr", low=-reach, high=reach)
+    show_image(images[2], bars[2], error, title=title, label="depth error [cm]", colours="PuOr", low=-reach, high=reach)
     return figure
 
 
@@ -92,7 +92,7 @@ def _intensity_figure(result: Result) -> Figure:
         exponent = 0 if -2 <= exponent <= 3 else exponent
         label = "expected detections per pulse" + (f" [$10^{{{exponent}}}$]" if exponent else "")
         scaled, high = frame / 10.0**exponent, top / 10.0**exponent
-        _show(image, bar, scaled, title=title, label=label, colours="cividis", low=0.0, high=high)
+        show_image(image, bar, scaled, title=title, label=label, colours="cividis", low=0.0, high=high)
     return figure
 
 
@@ -100,16 +100,20 @@ def _truth_figure(result: Result) -> Figure:
     truth = result.truth
     normal = 0.5 + 0.5 * truth.normal * np.array([1.0, -1.0, -1.0])
     normal = np.where(np.isfinite(normal), normal, float(_MISSING)).clip(0.0, 1.0)
-    low, high = _limits(truth.depth)
+    low, high = shown_limits(truth.depth)
 
     figure, images, bars = _panels(result, 3)
-    _show(images[0], bars[0], truth.depth, title="Depth", label="depth z [m]", colours="viridis_r", low=low, high=high)
+    show_image(
+        images[0], bars[0], truth.depth, title="Depth", label="depth z [m]", colours="viridis_r", low=low, high=high
+    )
     _decorate(images[1], "Normal")
     images[1].imshow(normal, interpolation="nearest")
     bars[1].axis("off")
     bars[1].text(0.5, 0.0, "red: right, green: up, blue: to the camera", fontsize=9, ha="center", va="center")
     label = "Lambertian reflectance"
-    _show(images[2], bars[2], truth.reflectance, title="Reflectance", label=label, colours="cividis", low=0.0, high=1.0)
+    show_image(
+        images[2], bars[2], truth.reflectance, title="Reflectance", label=label, colours="cividis", low=0.0, high=1.0
+    )
     return figure
 
 
@@ -171,26 +175,60 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
 
 
 def _panels(result: Result, count: int) -> tuple[Figure, Sequence[Axes], Sequence[Axes]]:
-    """A figure of `count` images of the camera's aspect ratio in a row, and the places of their colour bars."""
-    camera = result.scene.camera
-    width = 3.4
-    height = float(np.clip(width * camera.height / camera.width, 0.8, 7.0))
-    figure = Figure(figsize=(width * count, height + 1.35), layout="constrained")
+    """A figure of `count` images in a row with the run in its title, and the places of their colour bars."""
+    figure, images, bars = image_panels((result.scene.camera.height, result.scene.camera.width), count)
     _caption(result, figure)
-    images, bars = figure.subplots(2, count, squeeze=False, height_ratios=(height, 0.15))
     return figure, images, bars
 
 
-def _show(
-    axis: Axes, bar: Axes, image: NDArray[Any], *, title: str, label: str, colours: str, low: float, high: float
+def image_panels(
+    shape: tuple[int, int], columns: int, *, lines: int = 1, below: float = 0.0
+) -> tuple[Figure, Sequence[Axes], Sequence[Axes]]:
+    """A figure of images of `shape` (height, width), line after line, and the places of their colour bars.
+
+    `below`: height of one more axis over the whole width, the last of `figure.axes` [inch].
+    """
+    width = 3.4
+    height = float(np.clip(width * shape[0] / shape[1], 0.8, 7.0))
+    figure = Figure(figsize=(width * columns, lines * (height + 1.05) + below + 0.3), layout="constrained")
+    grid = figure.add_gridspec(
+        2 * lines + bool(below), columns, height_ratios=[height, 0.15] * lines + [below] * bool(below)
+    )
+    places = [(2 * line, column) for line in range(lines) for column in range(columns)]
+    images = [figure.add_subplot(grid[place]) for place in places]
+    bars = [figure.add_subplot(grid[line + 1, column]) for line, column in places]
+    if below:
+        figure.add_subplot(grid[-1, :])
+    return figure, images, bars
+
+
+def show_image(
+    axis: Axes,
+    bar: Axes,
+    image: NDArray[Any],
+    *,
+    title: str,
+    label: str,
+    colours: str,
+    low: float,
+    high: float,
+    scale: Literal["linear", "log"] = "linear",
 ) -> None:
     """An image with its colour bar below; grey where it is NaN, pointed ends where it goes beyond the bar."""
     _decorate(axis, title)
     cmap = matplotlib.colormaps[colours].with_extremes(bad=_MISSING)
-    shown = axis.imshow(image, interpolation="nearest", cmap=cmap, vmin=low, vmax=high)
+    shown = axis.imshow(image, interpolation="nearest", cmap=cmap, norm=scale, clim=(low, high))
     below, above = bool((image < low).any()), bool((image > high).any())
     extend = ("both" if above else "min") if below else ("max" if above else "neither")
-    axis.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+    colours_shown = axis.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+    if scale == "log":
+        ticks = [digit * 10.0**power for power in range(-30, 30) for digit in (1, 2, 5)]
+        ticks = [tick for tick in ticks if low <= tick <= high]
+        if len(ticks) > 7:
+            ticks = [tick for tick in ticks if f"{tick:e}"[0] == "1"]
+        ticks = ticks[:: 1 + len(ticks) // 8]
+        colours_shown.set_ticks(ticks, labels=[f"{tick:.4g}" for tick in ticks])
+        colours_shown.minorticks_off()
 
 
 def _decorate(axis: Axes, title: str) -> None:
@@ -216,7 +254,7 @@ def _caption(result: Result, figure: Figure) -> None:
     )
 
 
-def _limits(image: NDArray[Any], *, beyond: float = 0.0) -> tuple[float, float]:
+def shown_limits(image: NDArray[Any], *, beyond: float = 0.0) -> tuple[float, float]:
     """Lowest and highest value, at least 1 cm apart, leaving out `beyond` percent at each end."""
     values = image[np.isfinite(image)]
     low, high = np.percentile(values, (beyond, 100.0 - beyond)) if values.size else (0.0, 1.0)
