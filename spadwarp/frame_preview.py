@@ -48,18 +48,8 @@ def draw_recording(recording: Recording, result: Result, path: str | Path) -> Pa
     )
     title = "Depth − truth"
     show_image(images[1], bars[1], error, title=title, label="error [mm]", colours="PuOr", low=-reach, high=reach)
-    low, high = _log_limits(bound)
-    show_image(
-        images[2],
-        bars[2],
-        bound,
-        title="Cramér–Rao bound",
-        label="standard deviation of depth [mm]",
-        colours="magma_r",
-        low=low,
-        high=high,
-        scale="log",
-    )
+    label = "standard deviation of depth [mm]"
+    _show_positive(images[2], bars[2], bound, title="Cramér–Rao bound", label=label, colours="magma_r")
     top = float(max(np.percentile(counts, 99.5), 1))
     show_image(
         images[3], bars[3], counts, title="Intensity", label="counts in a frame", colours="cividis", low=0.0, high=top
@@ -155,9 +145,7 @@ def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
             ("Signal to backscatter SbNR", result.sbnr, "ratio", "cividis"),
         )
     for image, bar, (title, values, label, colours) in zip(images, bars, maps, strict=False):
-        shown = np.where(np.isfinite(values), values, np.nan)
-        low, high = _log_limits(shown)
-        show_image(image, bar, shown, title=title, label=label, colours=colours, low=low, high=high, scale="log")
+        _show_positive(image, bar, values, title=title, label=label, colours=colours)
     show_image(
         images[3],
         bars[3],
@@ -196,14 +184,27 @@ def draw_depth(
     return _write(figure, path)
 
 
-def _log_limits(image: NDArray[Any]) -> tuple[float, float]:
-    """Limits for a logarithmic scale: 2 and 98 percent of the positive values, at least a factor of 2 apart."""
-    values = image[np.isfinite(image) & (image > 0)]
-    if not values.size:
-        return 0.1, 1.0
-    low, high = np.percentile(values, (2.0, 98.0))
-    widen = max(1.0, np.sqrt(2.0 * low / high))
-    return float(low / widen), float(high * widen)
+def _show_positive(image: Any, bar: Any, values: NDArray[Any], *, title: str, label: str, colours: str) -> None:
+    """An image of positive values between their 1st and 99th percentile; logarithmic if these are far apart."""
+    shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
+    there = shown[np.isfinite(shown)]
+    low, high = map(float, np.percentile(there, (1.0, 99.0))) if there.size else (0.1, 1.0)
+    wide = high > 4.0 * low
+    exponent = 0 if wide or 1e-2 <= high < 1e4 else int(np.floor(np.log10(high)))
+    unit = 10.0**exponent
+    if not wide:
+        low, high = low - 0.05 * high, 1.05 * high  # one value alone is no interval
+    show_image(
+        image,
+        bar,
+        shown / unit,
+        title=title,
+        label=label + (f" [$10^{{{exponent}}}$]" if exponent else ""),
+        colours=colours,
+        low=low / unit,
+        high=high / unit,
+        scale="log" if wide else "linear",
+    )
 
 
 def _write(figure: Any, path: str | Path) -> Path:

@@ -220,15 +220,25 @@ def show_image(
     shown = axis.imshow(image, interpolation="nearest", cmap=cmap, norm=scale, clim=(low, high))
     below, above = bool((image < low).any()), bool((image > high).any())
     extend = ("both" if above else "min") if below else ("max" if above else "neither")
-    colours_shown = axis.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+    colour_bar = axis.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
     if scale == "log":
-        ticks = [digit * 10.0**power for power in range(-30, 30) for digit in (1, 2, 5)]
-        ticks = [tick for tick in ticks if low <= tick <= high]
-        if len(ticks) > 7:
-            ticks = [tick for tick in ticks if f"{tick:e}"[0] == "1"]
-        ticks = ticks[:: 1 + len(ticks) // 8]
-        colours_shown.set_ticks(ticks, labels=[f"{tick:.4g}" for tick in ticks])
-        colours_shown.minorticks_off()
+        ticks = _log_ticks(low, high)
+        colour_bar.set_ticks(list(ticks), labels=list(ticks.values()))
+        colour_bar.minorticks_off()
+
+
+def _log_ticks(low: float, high: float) -> dict[float, str]:
+    """A few values between `low` and `high` with their texts: powers of ten, and 2 and 5 times these if they are few."""
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    digits = (1,) if len(powers) > 4 else (1, 2, 5)
+    ticks: dict[float, str] = {}
+    for power, digit in ((power, digit) for power in powers for digit in digits):
+        value = digit * 10.0**power
+        if low <= value <= high:
+            exponential = ("" if digit == 1 else rf"{digit} \cdot ") + f"10^{{{power}}}"
+            ticks[value] = f"{value:g}" if -3 < power < 4 else f"${exponential}$"
+    step = 1 + (len(ticks) - 1) // 7
+    return dict(list(ticks.items())[::step])
 
 
 def _decorate(axis: Axes, title: str) -> None:
