@@ -121,9 +121,14 @@ def _histogram_figure(result: Result) -> Figure:
     figure = Figure(figsize=(7.0, 6.4), layout="constrained")
     _caption(result, figure)
     axes = figure.subplots(2, 1)
-    intensity = result.intensity
+    # Ranked by the light that came straight from the target, where there is any: a rare photon of large weight can make
+    # any other pixel the brightest of a short run.
+    straight = result.tallies[0].sum(axis=2)
+    on_target = bool(straight.any())
+    intensity = straight if on_target else result.intensity
     order = np.argsort(intensity, axis=None, kind="stable")
     order = order[intensity.ravel()[order] > 0]
+    place = "on the target" if on_target else "of those with a return"
     handles: dict[str, Any] = {}
     for axis, name, index in zip(axes, ("Brightest", "Median"), (-1, (len(order) - 1) // 2), strict=True):
         axis.set(xlabel="time of flight [ns]", xlim=1e9 * result.bin_edges[[0, -1]])
@@ -132,7 +137,7 @@ def _histogram_figure(result: Result) -> Figure:
             axis.set_yticks([])
         else:
             row, column = divmod(int(order[index]), intensity.shape[1])
-            axis.set_title(f"{name} pixel of those with a return: row {row}, column {column}", fontsize=10)
+            axis.set_title(f"{name} pixel {place}: row {row}, column {column}", fontsize=10)
             _plot_pixel(result, axis, row, column)
             handles |= {line.get_label(): line for line in axis.get_legend_handles_labels()[0]}
     if handles:
@@ -228,7 +233,7 @@ def show_image(
 
 
 def _log_ticks(low: float, high: float) -> dict[float, str]:
-    """A few values between `low` and `high` with their texts: powers of ten, and 2 and 5 times these if they are few."""
+    """A few values between `low` and `high` with their texts: powers of ten, 2 and 5 times these if they are few."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     digits = (1,) if len(powers) > 4 else (1, 2, 5)
     ticks: dict[float, str] = {}

@@ -416,9 +416,15 @@ def _interruptible() -> Iterator[threading.Event]:
         yield interrupted
         return
 
+    first = 0.0
+
     def handle(number: int, frame: object) -> None:
-        if interrupted.is_set():
+        nonlocal first
+        # Some programs send one interrupt twice, to a process and to its group; a person needs a moment to insist.
+        if interrupted.is_set() and time.monotonic() > first + 1.0:
             raise KeyboardInterrupt
+        if not interrupted.is_set():
+            first = time.monotonic()
         interrupted.set()
 
     before = signal.signal(signal.SIGINT, handle)

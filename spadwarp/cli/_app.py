@@ -30,7 +30,7 @@ class _Commands(TyperGroup):
             except MemoryError as error:
                 fail(f"not enough memory: {error}")
             except KeyboardInterrupt:
-                fail("interrupted before anything was done", INTERRUPTED)
+                fail("stopped; nothing was written of what was not finished", INTERRUPTED)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
