@@ -104,7 +104,7 @@ class AnalyticResult:
                 _dataset(file, "labels", self.labels, "1")
                 return Path(path)
             shape = self.truth.depth.shape
-            packed = {"chunks": (1, *shape), **_PACKED}
+            packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
             depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
             labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
             depth.attrs["unit"], labels.attrs["unit"] = "m", "1"

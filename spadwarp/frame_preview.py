@@ -128,7 +128,7 @@ def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
     """Maps of the model, and its first frame where there is one, else one that is drawn here."""
     frame, labels = (result.depth[0], result.labels[0]) if len(result.depth) else (one[0] for one in result.sample(1))
     truth = result.truth.depth
-    low, high = shown_limits(truth)
+    low, high = shown_limits(truth[result.fisher > 0] if (result.fisher > 0).any() else truth)
     margin = 0.05 * (high - low)
     figure, images, bars = image_panels(truth.shape, 3, lines=2)
     depth: dict[str, Any] = {
