@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_analytic", "draw_depth", "draw_recording", "expected_counts"]
 
 _DPI = 150
-_GREEN, _BLUE, _ORANGE = "#009E73", "#0072B2", "#E69F00"
+_GREEN, _BLUE = "#009E73", "#0072B2"
 
 
 def draw_recording(recording: Recording, result: Result, path: str | Path) -> Path:
@@ -109,8 +109,11 @@ def _plot_counts(recording: Recording, result: Result, axis: Any) -> None:
     edges = 1e9 * (first.gate_start + first.edges)
     expected, floor = expected_counts(first, result, row, column)
     values = first.counts[0, row, column]
+    detector = result.scene.detector
+    blind = detector.mode == "free_running" and detector.dead_time_ns > 0
+    label = "expected, dead time aside" if blind else "expected"
     axis.stairs(values, edges, fill=True, color="0.72", label="counts of the frame")
-    axis.stairs(expected, edges, baseline=None, color=_BLUE, linewidth=1.4, label="expected")
+    axis.stairs(expected, edges, baseline=None, color=_BLUE, linewidth=1.4, label=label)
     axis.stairs(floor, edges, baseline=None, color=_GREEN, linewidth=1.0, label="of that, background")
     arrival = 1e9 * result.true_path()[row, column] / result.water_speed
     if edges[0] <= arrival < edges[-1]:
