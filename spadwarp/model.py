@@ -62,7 +62,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
 
 
 def build_model(
-    scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: int = 1
+    scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: float = 1
 ) -> Model:
     """The scene on a device.
 
@@ -115,6 +115,8 @@ def build_model(
     limits.upper = wp.vec3(*(min(value, _UNLIMITED) for value in upper))
     limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
     limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
+    # What arrives by a longer path than histories may have lies outside the gate for every estimator.
+    gate.stop = min(gate.stop, limits.max_path)
     limits.weight_cutoff = scene.transport.weight_cutoff
     limits.max_collisions = scene.transport.max_collisions
 
@@ -206,7 +208,7 @@ def _check_domain(scene: Scene) -> None:
             raise ConfigError(problem, source=_source(scene))
 
 
-def _check_size(scene: Scene, model: Model, copies: int) -> None:
+def _check_size(scene: Scene, model: Model, copies: float) -> None:
     """Refuses what cannot fit before anything is computed."""
     shape = (
         f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.config import SPEED_OF_LIGHT
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ConfigError, SpadwarpError
 
 if TYPE_CHECKING:
     from spadwarp.config import Camera, Scene
@@ -62,7 +62,8 @@ class Result:
         ledger: Where the emitted weight went, in units of `ledger_unit` photons. Entries are differences of fixed-point
             weights (before − after; a gain is negative), so that their sum is the emitted weight exactly.
         ledger_unit: Photons per ledger unit, a power of two.
-        counters: Numbers of events, and of what was clipped or fell outside the gate.
+        counters: Numbers of events and of contributions that were clipped; light before and after the gate in tally
+            units (`guided` aims inside the gate and counts there what its surfaces score alone).
         truth: Depth, range, normal and reflectance at pixel centres.
         timing: Seconds of each stage.
         provenance: Versions, device and date.
@@ -139,7 +140,7 @@ class Result:
     @property
     def intensity(self) -> NDArray[np.float64]:
         """Expected fraction of emitted photons that arrive in each pixel within the gate: float64 `[H, W]`."""
-        return self._fraction(self.tallies.sum(axis=(0, 3)))
+        return self.tallies.sum(axis=(0, 3), dtype=np.float64) * (self.unit / self.photons)
 
     def _fraction(self, tallies: NDArray[np.int64]) -> NDArray[np.float64]:
         return tallies * np.float64(self.unit / self.photons)
@@ -245,7 +246,8 @@ class Result:
         """What is in the result and how it was made, in plain numbers and text that JSON can hold."""
         scene, truth = self.scene, self.truth.depth
         seen = np.isfinite(truth)
-        fractions = self._fraction(self.tallies.sum(axis=(1, 2, 3), dtype=np.int64))
+        # In floating point: the unit keeps each bin below 2^62, not their sum.
+        fractions = self.tallies.sum(axis=(1, 2, 3), dtype=np.float64) * (self.unit / self.photons)
         return {
             "scene": str(scene.source) if scene.source else None,
             "photons": self.photons,
@@ -298,7 +300,7 @@ def merge(results: Iterable[Result]) -> Result:
     first = parts[0]
     for other in parts[1:]:
         for name, a, b in (
-            ("scene", _physics(first.scene), _physics(other.scene)),
+            ("scene", physics_of(first.scene), physics_of(other.scene)),
             ("seed", first.seed, other.seed),
             ("tally unit", first.unit, other.unit),
             ("batch size", first.batch_size, other.batch_size),
@@ -317,6 +319,10 @@ def merge(results: Iterable[Result]) -> Result:
             joined[-1] = (joined[-1][0], stop)
         else:
             joined.append((start, stop))
+    for other in parts[1:]:
+        if not np.allclose(first.truth.range, other.truth.range, rtol=1e-4, equal_nan=True):
+            raise ConfigError("merge: the targets of the results differ, by their truth maps: was a mesh file changed?")
+    check_capacity(np.sum([part.tallies.sum(axis=0, dtype=np.float64) for part in parts], axis=0))
     squares = first.squares
     if squares is not None:
         for part in parts[1:]:
@@ -335,7 +341,16 @@ def merge(results: Iterable[Result]) -> Result:
     )
 
 
-def _physics(scene: Scene) -> Scene:
+def check_capacity(total: NDArray[np.float64]) -> None:
+    """Raises `SpadwarpError` where a bin's sum over components leaves the range of its 64-bit integer."""
+    if total.size and (total.max() >= 2.0**62 or total.min() < 0.0):
+        raise SpadwarpError(
+            "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at "
+            "a time and add up their histograms"
+        )
+
+
+def physics_of(scene: Scene) -> Scene:
     """The scene without what does not change a photon's history."""
     transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
     return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})

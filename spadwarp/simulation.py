@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.config import Scene
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.errors import ConfigError
 from spadwarp.hardware import core_count, pick_device
 from spadwarp.model import build_model, trace_truth, transport_spec
-from spadwarp.result import COMPONENTS, Result, merge
+from spadwarp.result import COMPONENTS, Result, check_capacity, merge, physics_of
 
 if TYPE_CHECKING:
     from spadwarp_kernels import Data, Model
@@ -57,11 +57,11 @@ def simulate(
         seed: 0 ... 2^64 - 1; by default `scene.transport.seed`, or that of the run to resume.
         device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
         threads: CPU threads; by default one a core. A GPU takes none.
-        pass_size: Photons in one launch, up to 2^26.
+        pass_size: Photons in one launch, up to 2^26, on the CPU 2^20.
         progress: Called from the caller's thread.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
             at
-            most 1/32; the histogram takes twice the memory.
+            most 1/32; the histogram takes 2 2/3 times the memory.
         relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
             `uncertainty`, and `photons` is the most that are traced.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
@@ -82,6 +82,12 @@ def simulate(
     if resume is not None:
         if len(resume.photon_ranges) != 1:
             raise ConfigError(f"resume: the photon ids {resume.photon_ranges} have gaps; merge the missing ones first")
+        if first_photon:
+            raise ConfigError(f"first_photon = {first_photon} goes without resume, which knows where to go on")
+        if physics_of(scene) != physics_of(resume.scene):
+            raise ConfigError("resume: the result is of another scene; only photons and output may differ")
+        if seed not in (None, resume.seed):
+            raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
         first_photon = resume.photon_ranges[0][1]
         seed = resume.seed if seed is None else seed
         photons -= resume.photons
@@ -110,7 +116,9 @@ def simulate(
     began = time.perf_counter()
     wp_device = pick_device(device)
     mesh = build_mesh(scene)
-    model = build_model(scene, wp_device, mesh, copies=2 if batch_size else 1)
+    model = build_model(scene, wp_device, mesh, copies=2 + 2 / len(COMPONENTS) if batch_size else 1)
+    if resume is not None and resume.unit != 1.0 / model.scale:
+        raise ConfigError(f"resume: the tally unit is {1.0 / model.scale}, that of the result {resume.unit}")
     ready = time.perf_counter()
     run = _Run(model, transport_spec(scene, mesh), seed=seed, progress=progress, batch_size=batch_size)
     compiled = time.perf_counter()
@@ -120,11 +128,7 @@ def simulate(
 
     def collect(done: int) -> Result:
         tallies, squares = run.tallies()
-        if tallies.min() < 0 or tallies.max() >= 2**62:
-            raise SpadwarpError(
-                f"a histogram bin overflowed after {done} photons: the scene is brighter than the tally's unit allows "
-                "for; run fewer photons at a time and add up their histograms"
-            )
+        check_capacity(tallies.sum(axis=0, dtype=np.float64))
         ledger, counters = run.accounts()
         part = Result(
             scene=scene,
@@ -256,7 +260,7 @@ class _Run:
 
         self.model, self.spec, self.seed, self.progress = model, spec, seed, progress
         self.ledger_unit = sk.LEDGER_UNIT
-        self.data: Data = sk.make_data(model)
+        self.data: Data = sk.make_data(model, histogram=spec.estimator != "none")
         self.batch_size = batch_size
         self.batches = sk.Batches(self.data.tally, len(COMPONENTS)) if batch_size else None
         self.stopped_early = False
@@ -313,7 +317,8 @@ class _Run:
 
         cuda = self.model.device.is_cuda
         size = (CUDA_PASS if cuda else CPU_PASS) if pass_size is None else pass_size
-        _check_range("pass_size", size, 1, CUDA_PASS)
+        # One CPU thread walks a whole pass, and counts its events in 32 bits.
+        _check_range("pass_size", size, 1, CUDA_PASS if cuda else 1 << 20)
         workers = 1 if cuda else core_count() if threads is None else threads
         _check_range("threads", workers, 1, 4096)
         total = stop - start
@@ -395,11 +400,15 @@ class _Run:
         pool = [threading.Thread(target=work, daemon=True) for _ in range(workers)]
         for thread in pool:
             thread.start()
-        while any(thread.is_alive() for thread in pool):
-            with lock:
-                lock.wait(timeout=0.1)
-                done = finished
-            report(done)
+        try:
+            while any(thread.is_alive() for thread in pool):
+                with lock:
+                    lock.wait(timeout=0.1)
+                    done = finished
+                report(done)
+        except BaseException:
+            interrupted.set()
+            raise
         if errors:
             raise errors[0]
         report(finished)

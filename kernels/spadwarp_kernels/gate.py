@@ -10,7 +10,8 @@ class Gate:
     """Equal bins of geometric path.
 
     Attributes:
-        start, stop: Path of the gate's ends [m]; bin k covers [start + k w, start + (k + 1) w).
+        start: Path of the gate's begin [m]; bin k covers [start + k w, start + (k + 1) w).
+        stop: Path at which it ends [m], before the last bin does if histories may not be as long.
         bins_per_metre: 1/w [1/m].
         bins: Number of bins.
     """
@@ -31,6 +32,6 @@ def gate_bin(gate: Gate, path: float) -> int:
     if path < gate.start:
         return BEFORE
     k = (path - gate.start) * gate.bins_per_metre
-    if k >= float(gate.bins):
+    if k >= float(gate.bins) or path >= gate.stop:
         return AFTER
     return int(k)

@@ -11,7 +11,7 @@ from .guided import Guiding
 from .laser import Laser
 from .medium import Medium
 from .shadow import near_depth_map
-from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH
+from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
 from .transport import COMPONENTS, Records, Surfaces, TransportSpec, make_transport_kernel
 
 
@@ -58,9 +58,12 @@ class Data:
     records: Records
 
 
-def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0) -> Data:
-    """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to."""
-    size = model.tally_size
+def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
+    """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to.
+
+    `histogram=False` makes none, for the estimator "none", which has nothing to put into it.
+    """
+    size = model.tally_size if histogram else 1
     if tally is None:
         tally = wp.zeros(size, dtype=wp.int64, device=model.device)
     elif tally.dtype is not wp.int64 or tally.size != size or not tally.is_contiguous or tally.ndim != 1:
@@ -180,4 +183,6 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     totals = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS).sum(axis=1)
     names = LEDGER_ENTRIES + COUNTERS
     values = {name: int(total) for name, total in zip(names, totals, strict=True)}
+    for name in ("before_gate", "after_gate"):
+        values[name] <<= int(OUTSIDE_SHIFT)
     return {n: values[n] for n in LEDGER_ENTRIES}, {n: values[n] for n in COUNTERS}

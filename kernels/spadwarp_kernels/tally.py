@@ -13,6 +13,9 @@ _DEPOSIT_LIMIT = wp.constant(9.007199254740992e15)
 # Copies of the ledger, so that threads seldom add to one address at the same time.
 LEDGER_SLOTS = 4096
 
+# Light outside the gate is counted in 2^8 tally units.
+OUTSIDE_SHIFT = wp.constant(wp.int64(8))
+
 LEDGER_ENTRIES = (
     "absorbed_water",
     "absorbed_surface",
@@ -81,10 +84,10 @@ def to_ledger(weight: float) -> wp.int64:
 
 @wp.func
 def to_fixed_point(value: float, scale: float, dither: float) -> wp.int64:
-    """value * scale >= 0, rounded up with probability equal to its fraction (dither uniform in [0, 1)): no value is
-    too small to count.
+    """value * scale >= 0, rounded up with probability equal to its fraction (dither uniform in [0, 1)).
 
-    Returns -1 for what is clipped and -2 for what is not a number.
+    The dither that transport hands over has 256 steps: a value below 1/512 unit counts as nothing, and larger ones
+    carry at most that as bias. Returns -1 for what is clipped and -2 for what is not a number.
     """
     units = value * scale
     if units <= _DEPOSIT_LIMIT:
@@ -119,4 +122,7 @@ def deposit(
         if units > wp.int64(0):
             atomic_add_int64(tally, index, units)
     else:
-        add_to_ledger(ledger, thread, wp.where(index == -1, BEFORE_GATE, AFTER_GATE), units)
+        # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
+        add_to_ledger(
+            ledger, thread, wp.where(index == -1, BEFORE_GATE, AFTER_GATE), (units + wp.int64(128)) >> OUTSIDE_SHIFT
+        )
