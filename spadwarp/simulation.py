@@ -298,7 +298,7 @@ class _Run:
         if self.batches is None:
             return self.data.tally.numpy().reshape(len(COMPONENTS), *shape), None
         squares = np.stack([half.numpy().reshape(shape) for half in self.batches.squares])
-        return self.batches.total.numpy().reshape(len(COMPONENTS), *shape).copy(), squares
+        return self.batches.total.numpy().reshape(len(COMPONENTS), *shape), squares
 
     def trace(
         self,
