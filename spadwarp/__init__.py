@@ -38,6 +38,7 @@ _HOMES = {
     "load_truth_exr": "truth_exr",
     "budget": "budgets",
     "sweep": "budgets",
+    "export": "exports",
     "validate": "validation",
     "SpadwarpError": "errors",
     "ConfigError": "errors",
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from spadwarp.depth import arrival_time
     from spadwarp.detector import Detection, coates, detect
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
+    from spadwarp.exports import export
     from spadwarp.files import load_result
     from spadwarp.hardware import devices
     from spadwarp.model import truth_maps

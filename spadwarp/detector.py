@@ -53,6 +53,8 @@ class Detection:
         edges: `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity).
         period: of the pulses [s], where time is folded; else None.
         irf: the response that was applied.
+        expected: float32 `[H, W, T]`, expected detections per pulse and bin before pile-up, of which the counts were
+            drawn: light through the response, dark counts, ambient light, crosstalk.
         background: float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark
             counts, ambient light and, where the source tells it, backscatter.
         seed: of the random numbers.
@@ -69,6 +71,7 @@ class Detection:
     edges: NDArray[np.float64]
     period: float | None
     irf: InstrumentResponse
+    expected: NDArray[np.float32]
     background: NDArray[np.float32]
     seed: int
     tags: TimeTags | None = None
@@ -302,6 +305,7 @@ def detect(
         edges=axis.edges[: axis.recorded + 1],
         period=period,
         irf=irf,
+        expected=hazard.numpy()[:, : axis.recorded].astype(np.float32).reshape(height, width, -1),
         background=known.reshape(height, width, -1),
         seed=seed,
         tags=None if stream is None else _time_tags(stream, (height, width), first_frame),

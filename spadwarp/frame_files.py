@@ -30,7 +30,8 @@ _READ_ME = (
     "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
     "seconds of flight. depth/NAME: [frame, height, width], planar depth in metres by that estimator, NaN where "
     "nothing was detected. intensity: counts over all bins. bound/time and bound/depth: Cramér–Rao standard deviation "
-    "of one frame [s], [m], NaN where there is no information. background: expected background per pulse and bin. "
+    "of one frame [s], [m], NaN where there is no information. expected, background: expected detections per pulse and "
+    "bin of all light and noise, and of what is not target. "
     "tags, if there: detections one by one. Camera frame: +x right, +y down, +z forward."
 )
 
@@ -227,6 +228,7 @@ def _begin(file: Any, result: Result, some: Detection, frames: int, methods: Seq
     if some.irf.times is not None:
         file.create_dataset("irf", data=np.array([some.irf.times, some.irf.values], np.float64))
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    file.create_dataset("expected", data=some.expected, **packed)
     file.create_dataset("background", data=some.background, **packed)
     file.create_dataset("truth/depth", data=result.truth.depth, **packed)
     columns = max(1, min(width, _CHUNK_BYTES // (4 * bins)))

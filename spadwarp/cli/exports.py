@@ -1,0 +1,87 @@
+"""`spadwarp export`: results and frames in the formats of other programs."""
+
+from __future__ import annotations
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import spadwarp
+from spadwarp.errors import FileError
+
+from ._app import app, say
+from ._options import Json, Out, Overwrite, Quiet, arguments_checked, prepare_directory, rows, write_json
+
+
+class Format(enum.StrEnum):
+    """`spadwarp.exports.FORMATS`, known without loading it."""
+
+    npy = "npy"
+    mat = "mat"
+    ptu = "ptu"
+    exr = "exr"
+
+
+@app.command()
+def export(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A result, frames of counts or depth, or their directory.",
+            show_default=False,
+        ),
+    ],
+    formats: Annotated[
+        list[Format],
+        typer.Option("--format", help="Format to write; may be repeated.", show_default=False),
+    ],
+    out: Out,
+    frame: Annotated[int | None, typer.Option(min=0, metavar="N", help="Only this frame; by default all.")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Results and frames in the formats of other programs.
+
+    \b
+    npy  NumPy: [height, width, bin], with frames before that
+    mat  MATLAB, one file a frame, as the simulated data that single-photon
+         denoisers read: sparse spad, rates, 1-based bin, bin_size in seconds
+    ptu  PicoQuant T3 image, one record a detection
+    exr  images: depth, intensity, truth; one file a frame
+
+    mat and ptu are for counts (`spadwarp detect`) and need spadwarp[formats].
+
+    \b
+    Examples:
+      spadwarp export frames/frames.h5 --format mat --format ptu --out exported/
+      spadwarp export run1/result.h5 --format npy --out exported/
+    """
+    source = _inside(path)
+    prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
+    written: dict[str, list[Path]] = {}
+    with arguments_checked():
+        for one in dict.fromkeys(formats):
+            written[one.value] = spadwarp.export(source, out / f"{source.stem}.{one.value}", frame=frame)
+    if not quiet:
+        lines = {}
+        for name, paths in written.items():
+            more = f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else ""
+            lines[name] = f"{paths[0]}{more}"
+        say(rows(lines))
+    write_json({"files": [path for paths in written.values() for path in paths]}, json_path)
+
+
+def _inside(place: Path) -> Path:
+    """The file, or the one that can be exported in a directory."""
+    if not place.is_dir():
+        return place
+    names = ("frames.h5", "result.h5", "analytic.h5")
+    found = [place / name for name in names if (place / name).is_file()]
+    if len(found) != 1:
+        what = " and ".join(one.name for one in found) if found else f"none of {', '.join(names)}"
+        raise FileError(f"{place}: holds {what}; name the file")
+    return found[0]
