@@ -13,7 +13,23 @@ from spadwarp.errors import DeviceError
 if TYPE_CHECKING:
     import warp as wp
 
-__all__ = ["core_count", "devices", "physical_memory", "pick_device", "start_warp"]
+__all__ = ["core_count", "devices", "physical_memory", "pick_device", "pick_devices", "start_warp"]
+
+
+def pick_devices(names: str | None = None) -> list[wp.Device]:
+    """The Warp devices of a list such as "cuda:0,cuda:2"; "cuda:all" are the GPUs of this host.
+
+    A device that is named twice works twice, with tallies of its own each time.
+
+    Raises:
+        DeviceError: There is no such device; names those there are.
+    """
+    import warp as wp
+
+    start_warp()
+    if names == "cuda:all":
+        return wp.get_cuda_devices() or [pick_device("cuda:0")]
+    return [pick_device(name) for name in ([None] if names is None else names.split(","))]
 
 
 def pick_device(name: str | None = None) -> wp.Device:

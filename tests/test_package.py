@@ -14,7 +14,7 @@ import spadwarp
 ROOT = Path(__file__).parents[1]
 
 # Heavy, so that nothing that `import spadwarp` or `spadwarp --help` loads may import them at its top.
-HEAVY = {"warp", "spadwarp_kernels", "torch", "matplotlib", "h5py", "rich", "trimesh", "OpenEXR", "scipy"}
+HEAVY = {"warp", "spadwarp_kernels", "torch", "matplotlib", "h5py", "rich", "trimesh", "OpenEXR", "scipy", "ray"}
 
 # Folder or file, and what it must not know of.
 ARROWS = {
