@@ -25,6 +25,12 @@ _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": 
 
 # Setting a field in a later layer drops these fields of the earlier ones.
 _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
+    "medium": {
+        **dict.fromkeys(COEFFICIENTS, ("chlorophyll",)),
+        "chlorophyll": (*COEFFICIENTS, "preset"),
+        "temperature": ("phase_index", "group_index"),
+        "salinity": ("phase_index", "group_index"),
+    },
     "camera": {
         "horizontal_fov_deg": ("pixel_pitch_um",),
         "pixel_pitch_um": ("horizontal_fov_deg",),

@@ -86,6 +86,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
         whole_table = isinstance(value, (Mapping, BaseModel))
         text = cause.args[0]
+        if not key:  # of the scene as a whole
+            return text
         if not whole_table:
             return f"{shown} {text}"
         return f"{name} {text}" if text.startswith("needs") else f"{name}.{text}"
@@ -162,6 +164,8 @@ def _bounds(holder: Any) -> Iterator[Any]:
 
 def _is_overridden(key: Key, layer: Mapping[str, Any]) -> bool:
     place: Any = layer
+    if not key:
+        return False
     for part in key[: 3 if key[0] == "targets" else 2]:
         if not isinstance(place, Mapping) or part not in place:
             return False

@@ -102,7 +102,10 @@ class Section(BaseModel):
 
 
 class Medium(Section):
-    """The water. Give exactly two of absorption, scattering, extinction, albedo; all four can be read."""
+    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
+
+    What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene).
+    """
 
     section: ClassVar[str] = "medium"
     preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
@@ -127,6 +130,13 @@ class Medium(Section):
         le=3,
         description='refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350',
     )
+    chlorophyll: float | None = Field(
+        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
+    )
+    temperature: float | None = Field(
+        None, ge=0, le=30, description="gives the indices that are not given, with salinity 35 [°C]"
+    )
+    salinity: float | None = Field(None, ge=0, le=40, description="the same, with temperature 20 [g/kg]")
 
     @field_validator("phase_index", "group_index", mode="before")
     @classmethod
@@ -139,13 +149,45 @@ class Medium(Section):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        # The two that were given stay in model_fields_set, from where to_dict() knows them.
-        self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        if self.chlorophyll is None:
+            self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
+        elif self.given or self.preset is not None:
+            raise ValueError(f"chlorophyll = {self.chlorophyll} goes without {', '.join(self.given or ['preset'])}")
+        self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
+
+    def _follow(self, wavelength_nm: float) -> None:
+        """Sets what depends on the wavelength."""
+        if not self.follows_wavelength:
+            return
+        from .water import water_optics
+
+        optics = water_optics(
+            wavelength_nm,
+            chlorophyll=self.chlorophyll or 0.0,
+            temperature=20.0 if self.temperature is None else self.temperature,
+            salinity=35.0 if self.salinity is None else self.salinity,
+        )
+        names = ("phase_index", "group_index") + (() if self.chlorophyll is None else _layers.COEFFICIENTS)
+        self.__dict__.update({name: getattr(optics, name) for name in names if name not in self.model_fields_set})
+
+    @property
+    def follows_wavelength(self) -> bool:
+        """Whether indices or coefficients follow from the laser's wavelength."""
+        return any(value is not None for value in (self.chlorophyll, self.temperature, self.salinity))
+
+    def at_wavelength(self, wavelength_nm: float) -> Medium:
+        """The medium as light of a vacuum wavelength [nm] meets it; raises `ValueError` outside [400, 700]."""
+        if not self.follows_wavelength:
+            return self
+        medium = self.model_copy()
+        medium._follow(wavelength_nm)
+        return medium
 
     @property
     def given(self) -> tuple[str, ...]:
-        """Names of the two coefficients that define the medium; the other two follow."""
+        """Names of the two coefficients that define the medium, none with chlorophyll; the others follow."""
         return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
 
     @property
@@ -156,6 +198,8 @@ class Medium(Section):
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again: of the coefficients the two given ones."""
         hidden = set(_layers.COEFFICIENTS) - set(self.given)
+        if self.follows_wavelength:
+            hidden |= {"phase_index", "group_index"} - self.model_fields_set
         return {name: value for name, value in super().to_dict().items() if name not in hidden}
 
 
@@ -470,6 +514,14 @@ class Scene(BaseModel):
     output: Output = Output()
     analytic: Analytic = Analytic()
     _source: Path | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _water_at_the_lasers_wavelength(self) -> Self:
+        try:
+            self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
+        except ValueError as error:
+            raise ValueError(f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold") from None
+        return self
 
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Scene:
