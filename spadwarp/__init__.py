@@ -15,6 +15,12 @@ _HOMES = {
     "load_scene": "config",
     "Scene": "config",
     "presets": "catalog",
+    "water_optics": "water",
+    "WaterOptics": "water",
+    "refractive_index": "water",
+    "group_index": "water",
+    "pure_water_absorption": "water",
+    "pure_water_scattering": "water",
     "check": "checks",
     "bench": "benchmark",
     "simulate": "simulation",
@@ -69,6 +75,14 @@ if TYPE_CHECKING:
     from spadwarp.simulation import PhotonRecords, simulate, trace
     from spadwarp.truth_exr import load_truth_exr
     from spadwarp.validation import validate
+    from spadwarp.water import (
+        WaterOptics,
+        group_index,
+        pure_water_absorption,
+        pure_water_scattering,
+        refractive_index,
+        water_optics,
+    )
 
 
 def __getattr__(name: str) -> Any:

@@ -49,7 +49,7 @@ def complete_medium(pair: Mapping[str, Any]) -> Table:
     """
     if len(pair) != 2:
         given = ", ".join(pair) or "none"
-        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}; given: {given}")
+        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
     a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
     if albedo == "paper":
         if c is None:

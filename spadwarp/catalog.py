@@ -11,24 +11,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["PRESETS", "PURE_WATER_ABSORPTION", "WATER_INDICES", "Preset", "presets"]
+__all__ = ["PRESETS", "WATER_INDICES", "Preset", "presets"]
 
-# (phase index, group index) of water at 532 nm and 20 °C; seawater of salinity 35. Time of flight uses the group index.
+# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`). Time
+# of flight uses the group index.
 WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
-
-# Absorption of pure water, wavelength [nm] -> [1/m]: Pope & Fry, Appl. Opt. 36, 8710 (1997), table 3.
-PURE_WATER_ABSORPTION: dict[float, float] = {
-    400.0: 0.00663,
-    450.0: 0.00922,
-    475.0: 0.0114,
-    500.0: 0.0204,
-    530.0: 0.0434,
-    550.0: 0.0565,
-    575.0: 0.0772,
-    600.0: 0.2224,
-    650.0: 0.340,
-    700.0: 0.624,
-}
 
 _WATER_G = (
     0.924  # mean cosine of Petzold's average particle phase function; the paper and most of the literature use it

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._frustum import beam_planes, points_inside, view_planes
-from .catalog import PURE_WATER_ABSORPTION, WATER_INDICES
+from .catalog import WATER_INDICES
 from .config import SPEED_OF_LIGHT, Laser, Scene
+from .water import group_index, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
     from .targets import TriangleMesh
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["CheckMessage", "check", "summary"]
 
 Points = NDArray[np.float64]
+
+_INDICES_AT_532_NM = [group for _, group in WATER_INDICES.values()]
 
 _MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies that is worth a word
 
@@ -245,7 +248,17 @@ def _timing(shape: _Shape) -> Iterator[CheckMessage]:
             f"{shape.irf_fwhm_ps:.4g} ps: depth is resolved to {shape.range_of(gate.bin_width):.3g} m"
         )
         yield CheckMessage("note", "gate.bin_width_ps", text, {"irf_fwhm_ps": shape.irf_fwhm_ps})
-    if "group_index" not in scene.medium.model_fields_set:
+    if index in _INDICES_AT_532_NM and abs(laser.wavelength_nm - 532.0) > 10.0 and _visible(laser):
+        salinity = 35.0 * (index == WATER_INDICES["seawater"][1])
+        there = group_index(laser.wavelength_nm, salinity=salinity)
+        far = shape.target_range[0] if shape.target_range else shape.range_of(gate.stop)
+        error = far * (there / index - 1.0)
+        text = (
+            f"{index} is for 532 nm; at the laser's {laser.wavelength_nm:g} nm it is {there:.4f}: {error:.3f} m at "
+            f"{far:.3g} m; medium.temperature takes it from the laser"
+        )
+        yield CheckMessage("warning", "medium.group_index", text, {"group_index": there, "error": error})
+    elif "group_index" not in scene.medium.model_fields_set and not scene.medium.follows_wavelength:
         yield CheckMessage(
             "note", "medium.group_index", f"not given: {index}, seawater at 532 nm, is used for the time of flight"
         )
@@ -264,15 +277,15 @@ def _timing(shape: _Shape) -> Iterator[CheckMessage]:
 
 def _water(shape: _Shape) -> Iterator[CheckMessage]:
     medium, transport, laser = shape.scene.medium, shape.scene.transport, shape.scene.laser
-    wavelengths = list(PURE_WATER_ABSORPTION)
-    if wavelengths[0] <= laser.wavelength_nm <= wavelengths[-1]:
-        pure = float(np.interp(laser.wavelength_nm, wavelengths, list(PURE_WATER_ABSORPTION.values())))
+    if _visible(laser):
+        pure = pure_water_absorption(laser.wavelength_nm)
         if medium.absorption < 0.95 * pure:
             text = f"absorption = {medium.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
             yield CheckMessage("note", "medium.absorption", text, {"absorption": medium.absorption, "pure_water": pure})
     if medium.preset is not None and abs(laser.wavelength_nm - 532.0) > 10.0:
-        text = f"the coefficients of {medium.preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
-        yield CheckMessage("note", "medium.preset", text, {"wavelength_nm": laser.wavelength_nm})
+        yield _preset_at_another_wavelength(medium.preset, laser)
+    if medium.chlorophyll is not None:
+        yield from _molecular_scattering(shape.scene)
     mean = medium.extinction * shape.scene.path_limit  # collisions along the longest path that counts
     most = mean + 3.0 * math.sqrt(mean)
     cutoff = _cutoff_collisions(shape.scene)
@@ -290,6 +303,42 @@ def _water(shape: _Shape) -> Iterator[CheckMessage]:
             f'(termination = "roulette" is without this bias)'
         )
         yield CheckMessage("note", "transport.weight_cutoff", text, values)
+
+
+def _visible(laser: Laser) -> bool:
+    return 400.0 <= laser.wavelength_nm <= 700.0
+
+
+def _preset_at_another_wavelength(preset: str, laser: Laser) -> CheckMessage:
+    text = f"the coefficients of {preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
+    values = {"wavelength_nm": laser.wavelength_nm}
+    if _visible(laser):
+        values |= {
+            "pure_water": pure_water_absorption(laser.wavelength_nm),
+            "pure_water_532": pure_water_absorption(532.0),
+        }
+        text += f", where pure water absorbs {values['pure_water']:.3g} 1/m and not {values['pure_water_532']:.3g}"
+    return CheckMessage("warning", "medium.preset", text, values)
+
+
+def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
+    """Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back."""
+    optics = water_optics(
+        scene.laser.wavelength_nm,
+        chlorophyll=scene.medium.chlorophyll or 0.0,
+        temperature=20.0 if scene.medium.temperature is None else scene.medium.temperature,
+        salinity=35.0 if scene.medium.salinity is None else scene.medium.salinity,
+    )
+    molecules = optics.water_scattering * 0.1171  # 3/(4π(2 + δ)) per steradian at 180°, depolarization δ = 0.039
+    g = scene.medium.anisotropy
+    particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
+    back, share = molecules / (molecules + particles), optics.water_scattering / optics.scattering
+    if scene.medium.phase_function == "henyey_greenstein" and back > 0.1:
+        text = (
+            f"{100.0 * share:.2g} % of the scattering is the water's own, nearly even in all directions, and not in the "
+            f"phase function, which is of particles: {100.0 * back:.2g} % of the light scattered straight back is missing"
+        )
+        yield CheckMessage("note", "medium.anisotropy", text, {"molecular_share": share, "missing": back})
 
 
 def _cutoff_collisions(scene: Scene) -> float:

@@ -2,10 +2,10 @@
 
 >>> spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0).extinction
 
-Pure water absorbs as Pope & Fry (1997) measured it and scatters as Zhang, Hu & He (2009) compute it; its index is Quan &
-Fry's (1995). What lives in it follows the chlorophyll concentration as in the open ocean, where nothing comes from land
-(case-1 water): particles absorb after Bricaud et al. (1998), dissolved matter and particles' scattering after Morel & Maritorena (2001).
-These are averages over many stations; a single water may well differ by a factor of two.
+Pure water absorbs as Pope & Fry (1997) measured it and scatters as Zhang, Hu & He (2009) compute it; its index is that of
+Quan & Fry (1995). What lives in it follows the chlorophyll concentration as in the open ocean, where nothing comes from
+land (case-1 water): absorption by particles after Bricaud et al. (1998); by dissolved matter, and scattering by particles,
+after Morel & Maritorena (2001). These are averages over many stations; a single water may differ by a factor of two.
 """
 
 from __future__ import annotations
@@ -136,13 +136,11 @@ def pure_water_scattering(
 ) -> Value:
     """Scattering coefficient of pure water or pure seawater [1/m], after Zhang, Hu & He, Opt. Express 17, 5698 (2009).
 
-    Molecular scattering by fluctuations of density and of the salts' concentration, symmetric about 90° and nearly even.
+    By fluctuations of density and of the salts' concentration; symmetric about 90° and nearly even in all directions.
     Arguments as in `refractive_index`.
     """
     _check(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
-    wavelength, t, s = np.broadcast_arrays(
-        *(np.asarray(one, float) for one in (wavelength_nm, temperature, salinity))
-    )
+    wavelength, t, s = np.broadcast_arrays(*(np.asarray(one, float) for one in (wavelength_nm, temperature, salinity)))
     # Quan & Fry's index counts from air (Ciddor 1996).
     inverse = (1000.0 / wavelength) ** 2
     air = 1.0 + (5792105.0 / (238.0185 - inverse) + 167917.0 / (57.362 - inverse)) * 1e-8

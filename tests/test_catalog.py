@@ -2,8 +2,9 @@
 
 import pytest
 
-from spadwarp.catalog import PRESETS, PURE_WATER_ABSORPTION, presets
+from spadwarp.catalog import PRESETS, presets
 from spadwarp.config import Camera, Medium, Scene
+from spadwarp.water import pure_water_absorption
 
 MEDIA = presets("medium")
 
@@ -39,7 +40,7 @@ def test_every_medium_is_complete_and_adds_up(name):
 
 @pytest.mark.parametrize("name", sorted(set(MEDIA) - {"paper"}))
 def test_every_medium_but_the_papers_absorbs_at_least_as_pure_water_does(name):
-    assert Medium(preset=name).absorption >= PURE_WATER_ABSORPTION[530.0]
+    assert Medium(preset=name).absorption >= pure_water_absorption(530.0)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +51,14 @@ def test_every_medium_but_the_papers_absorbs_at_least_as_pure_water_does(name):
         ("petzold-nuc-2040", 2.190),
         ("petzold-nuc-2240", 1.330),
         ("uwoc-pure-sea", 0.056),
+        ("uwoc-clear", 0.149),
+        ("uwoc-coastal", 0.304),
         ("uwoc-harbour", 2.17),
+        ("jerlov-IB-williamson", 0.177),
+        ("jerlov-5C-williamson", 1.376),
+        ("jerlov-I-solonenko", 0.0525),
+        ("jerlov-III-solonenko", 1.0926),
+        ("jerlov-9C-solonenko", 3.714),
         ("paper", 0.035),
     ],
 )

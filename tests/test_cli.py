@@ -191,6 +191,7 @@ def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):
         (["check", "SCENE", "--set", "medium.typo=1"], 2, ["medium.typo", "not a known field"]),
         (["info", "SCENE"], 1, ["scene.toml", "HDF5"]),
         (["presets", "water"], 2, ["'water'", "medium"]),
+        (["water", 900], 2, ["wavelength_nm = 900.0 is outside [400, 700]"]),
         (["nonsense"], 2, ["nonsense"]),
     ],
 )
@@ -271,13 +272,18 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     assert json.loads(summary.read_text()) == json.loads(json.dumps(result.summary()))
 
 
-def test_presets_and_devices_are_those_of_python(tmp_path):
+def test_presets_water_and_devices_are_those_of_python(tmp_path):
     summary = tmp_path / "summary.json"
     told = run("presets", "medium", "--json", summary).stdout
     names = [preset["name"] for preset in json.loads(summary.read_text())["presets"]]
     assert names == list(spadwarp.presets("medium"))
     assert all(name in told for name in names) and "picoquant" not in told
     assert "picoquant-visuv-532" in run("presets").stdout
+
+    told = run("water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", summary).stdout
+    optics = spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
+    assert f"{optics.extinction:.4g} 1/m" in told and f"{optics.group_index:.5f}" in told
+    assert json.loads(summary.read_text())["absorption"] == optics.absorption
 
     assert "cpu" in run("devices", "--json", summary).stdout
     assert json.loads(summary.read_text())["devices"] == spadwarp.devices()

@@ -57,7 +57,9 @@ def test_every_pair_of_coefficients_gives_the_same_medium(a, b):
 def test_a_medium_takes_exactly_two_coefficients(count):
     values = {"absorption": 0.1, "scattering": 0.2, "extinction": 0.3, "albedo": 2 / 3}
     (problem,) = problems({"medium": dict(list(values.items())[:count])})
-    assert problem.startswith("medium needs exactly two of absorption, scattering, extinction, albedo; given: ")
+    assert problem.startswith(
+        "medium needs exactly two of absorption, scattering, extinction, albedo, or chlorophyll; given: "
+    )
 
 
 def test_contradicting_or_empty_coefficients_are_refused():

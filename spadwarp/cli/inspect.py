@@ -1,4 +1,4 @@
-"""`spadwarp check`, `info`, `presets` and `devices`: what there is, without running anything."""
+"""`spadwarp check`, `info`, `presets`, `water` and `devices`: what there is, without running anything."""
 
 from __future__ import annotations
 
@@ -12,7 +12,20 @@ import typer
 import spadwarp
 
 from ._app import app, say
-from ._options import Json, Mesh, Overrides, Quiet, ScenePath, count, in_bytes, load_run, read_scene, rows, write_json
+from ._options import (
+    Json,
+    Mesh,
+    Overrides,
+    Quiet,
+    ScenePath,
+    arguments_checked,
+    count,
+    in_bytes,
+    load_run,
+    read_scene,
+    rows,
+    write_json,
+)
 
 
 @app.command()
@@ -162,6 +175,42 @@ def presets(
         values = ", ".join(f"{name} {_number(value)}" for name, value in preset.values.items())
         say(f"  {preset.name:<28}  {values}")
     write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]}, json_path)
+
+
+@app.command()
+def water(
+    wavelength_nm: Annotated[float, typer.Argument(metavar="NM", help="Vacuum wavelength, 400 to 700 [nm].")],
+    chlorophyll: Annotated[float, typer.Option(metavar="C", help="0 (pure water) to 30 [mg/m3].")] = 0.0,
+    temperature: Annotated[float, typer.Option(metavar="T", help="0 to 30 [degrees Celsius].")] = 20.0,
+    salinity: Annotated[float, typer.Option(metavar="S", help="0 (fresh) to 40 [g/kg].")] = 35.0,
+    json_path: Json = None,
+) -> None:
+    """Absorption, scattering and indices of water at a wavelength.
+
+    What a scene gets by medium.chlorophyll, temperature and salinity.
+
+    \b
+    Example:
+      spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
+    """
+    with arguments_checked():
+        optics = spadwarp.water_optics(
+            wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
+        )
+    say(
+        rows(
+            {
+                "absorption": f"{optics.absorption:.4g} 1/m, of pure water {optics.water_absorption:.4g}",
+                "scattering": f"{optics.scattering:.4g} 1/m, of pure water {optics.water_scattering:.4g}",
+                "extinction": f"{optics.extinction:.4g} 1/m, attenuation length {1.0 / optics.extinction:.4g} m",
+                "albedo": f"{optics.albedo:.4g}",
+                "phase index": f"{optics.phase_index:.5f}",
+                "group index": f"{optics.group_index:.5f}",
+            }
+        )
+    )
+    asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
+    write_json({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction}, json_path)
 
 
 @app.command()
