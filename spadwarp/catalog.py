@@ -13,8 +13,8 @@ from typing import Any
 
 __all__ = ["PRESETS", "WATER_INDICES", "Preset", "presets"]
 
-# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`). Time
-# of flight uses the group index.
+# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
+# Time of flight uses the group index.
 WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
 
 _WATER_G = (

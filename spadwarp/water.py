@@ -2,10 +2,11 @@
 
 >>> spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0).extinction
 
-Pure water absorbs as Pope & Fry (1997) measured it and scatters as Zhang, Hu & He (2009) compute it; its index is that of
-Quan & Fry (1995). What lives in it follows the chlorophyll concentration as in the open ocean, where nothing comes from
-land (case-1 water): absorption by particles after Bricaud et al. (1998); by dissolved matter, and scattering by particles,
-after Morel & Maritorena (2001). These are averages over many stations; a single water may differ by a factor of two.
+Pure water absorbs as Pope & Fry (1997) measured it and scatters as Zhang, Hu & He (2009) compute it; its index is that
+of Quan & Fry (1995). What lives in it follows the chlorophyll concentration as in the open ocean, where nothing comes
+from land (case-1 water): absorption by particles after Bricaud et al. (1998); by dissolved matter, and scattering by
+particles, after Morel & Maritorena (2001). These are averages over many stations; a single water may differ by a factor
+of two.
 """
 
 from __future__ import annotations
@@ -213,7 +214,7 @@ def _check(**values: ArrayLike) -> None:
         low, high = _RANGES[name]
         array = np.asarray(value, float)
         if not ((array >= low) & (array <= high)).all():
-            raise ValueError(f"{name} = {value} is outside [{low:g}, {high:g}]")
+            raise ValueError(f"{name} = {value!r} is outside [{low:g}, {high:g}]")
 
 
 def _value(array: Any) -> Value:

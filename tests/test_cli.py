@@ -191,7 +191,7 @@ def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):
         (["check", "SCENE", "--set", "medium.typo=1"], 2, ["medium.typo", "not a known field"]),
         (["info", "SCENE"], 1, ["scene.toml", "HDF5"]),
         (["presets", "water"], 2, ["'water'", "medium"]),
-        (["water", 900], 2, ["wavelength_nm = 900.0 is outside [400, 700]"]),
+        (["water", "900"], 2, ["wavelength_nm = 900.0 is outside [400, 700]"]),
         (["nonsense"], 2, ["nonsense"]),
     ],
 )
