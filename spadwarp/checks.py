@@ -335,8 +335,8 @@ def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
     back, share = molecules / (molecules + particles), optics.water_scattering / optics.scattering
     if scene.medium.phase_function == "henyey_greenstein" and back > 0.1:
         text = (
-            f"{100.0 * share:.2g} % of the scattering is the water's own, nearly even in all directions, which the phase "
-            f"function of particles leaves out: {100.0 * back:.2g} % of the light scattered straight back is missing"
+            f"{100.0 * share:.2g} % of the scattering is the water's own, nearly even in all directions; the phase "
+            f"function, of particles, leaves it out: {100.0 * back:.2g} % of what is scattered straight back is missing"
         )
         yield CheckMessage("note", "medium.anisotropy", text, {"molecular_share": share, "missing": back})
 
