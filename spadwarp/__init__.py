@@ -45,6 +45,8 @@ _HOMES = {
     "budget": "budgets",
     "sweep": "budgets",
     "export": "exports",
+    "to_torch": "tensors",
+    "TorchResult": "tensors",
     "validate": "validation",
     "SpadwarpError": "errors",
     "ConfigError": "errors",
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
     from spadwarp.response import InstrumentResponse, instrument_response
     from spadwarp.result import Result, Truth, merge
     from spadwarp.simulation import PhotonRecords, simulate, trace
+    from spadwarp.tensors import TorchResult, to_torch
     from spadwarp.truth_exr import load_truth_exr
     from spadwarp.validation import validate
     from spadwarp.water import (

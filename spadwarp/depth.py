@@ -5,6 +5,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.tensors import in_torch_order, is_torch, tensor_of
+
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
@@ -21,6 +23,8 @@ def arrival_time(
     gate: tuple[float, float] | None = None,
 ) -> NDArray[np.float64]:
     """Arrival time of the return in every pixel [s].
+
+    A torch tensor gives a torch tensor, on its device.
 
     Args:
         histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
@@ -60,44 +64,47 @@ def arrival_time(
     if irf is None and method in ("matched", "likelihood"):
         raise ValueError(f"method = {method!r} needs an irf")
 
-    cube = as_warp(histogram, name="histogram", device=device)
-    if cube.ndim < 2 or cube.size == 0:
-        raise ValueError(
-            f"histogram has shape {tuple(cube.shape)}; [..., bin] with at least one pixel and one bin is needed"
+    with in_torch_order(histogram, background):
+        cube = as_warp(histogram, name="histogram", device=device)
+        if cube.ndim < 2 or cube.size == 0:
+            raise ValueError(
+                f"histogram has shape {tuple(cube.shape)}; [..., bin] with at least one pixel and one bin is needed"
+            )
+        frame, bins = tuple(cube.shape[:-1]), cube.shape[-1]
+        rows = cube.reshape((cube.size // bins, bins))
+        if (row := kernels.first_invalid_row(rows)) is not None:
+            pixel = tuple(int(i) for i in np.unravel_index(row, frame))
+            raise ValueError(f"histogram holds a negative or non-finite value in pixel {pixel}")
+
+        first, stop = 0, bins
+        if gate is not None:
+            # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
+            edges = [(t - gate_start) / bin_width - 0.5 for t in gate]
+            first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
+            if first >= stop:
+                end = gate_start + bins * bin_width
+                raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
+
+        response, lowest_tap, half_width, offset = None, 0, 3, 0.0
+        if irf is not None:
+            mean, mode, fwhm = _moments(irf, bin_width)
+            half_width = max(1, int(np.ceil(1.5 * fwhm)))
+            offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
+            if method in ("matched", "likelihood"):
+                response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
+        bins_from_start = kernels.arrival_bins(
+            rows,
+            method=method,
+            background=_background_rows(background, rows, frame, wp),
+            response=response,
+            lowest_tap=lowest_tap,
+            first=first,
+            stop=stop,
+            half_width=half_width,
         )
-    frame, bins = tuple(cube.shape[:-1]), cube.shape[-1]
-    rows = cube.reshape((cube.size // bins, bins))
-    if (row := kernels.first_invalid_row(rows)) is not None:
-        pixel = tuple(int(i) for i in np.unravel_index(row, frame))
-        raise ValueError(f"histogram holds a negative or non-finite value in pixel {pixel}")
-
-    first, stop = 0, bins
-    if gate is not None:
-        # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
-        edges = [(t - gate_start) / bin_width - 0.5 for t in gate]
-        first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
-        if first >= stop:
-            end = gate_start + bins * bin_width
-            raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
-
-    response, lowest_tap, half_width, offset = None, 0, 3, 0.0
-    if irf is not None:
-        mean, mode, fwhm = _moments(irf, bin_width)
-        half_width = max(1, int(np.ceil(1.5 * fwhm)))
-        offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
-        if method in ("matched", "likelihood"):
-            response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
-    bins_from_start = kernels.arrival_bins(
-        rows,
-        method=method,
-        background=_background_rows(background, rows, frame, wp),
-        response=response,
-        lowest_tap=lowest_tap,
-        first=first,
-        stop=stop,
-        half_width=half_width,
-    )
-    return gate_start + (bins_from_start.numpy().astype(np.float64).reshape(frame) - offset) * bin_width
+        found: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
+    found = found.double() if is_torch(found) else found.astype(np.float64)
+    return gate_start + (found.reshape(frame) - offset) * bin_width
 
 
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
@@ -139,24 +146,32 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
 
 def _background_rows(background: Any, rows: Any, frame: tuple[int, ...], wp: Any) -> Any:
     """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
+    from spadwarp_kernels.depth import first_invalid_row
+
     if background is None:
         return None
-    if isinstance(background, wp.array):
-        background = background.numpy()
-    elif type(background).__module__.partition(".")[0] == "torch":
-        background = background.detach().cpu().numpy()
-    values = np.asarray(background, np.float32)
     bins = rows.shape[1]
+    shape = tuple(background.shape) if np.ndim(background) else ()
     shapes = (
         [(), (bins,)] + [(*frame[i:], bins) for i in range(len(frame))] + [(*frame[i:], 1) for i in range(len(frame))]
     )
-    if values.shape not in shapes:
-        raise ValueError(f"background has shape {values.shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise ValueError(f"background = {values.min()} … {values.max()} is outside [0, inf)")
-    if values.ndim < 2:
-        values = values.reshape(1, -1)
-    return wp.array(np.ascontiguousarray(values.reshape(-1, values.shape[-1])), dtype=float, device=rows.device)
+    if shape not in shapes:
+        raise ValueError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
+    last = shape[-1] if shape else 1
+    if isinstance(background, wp.array) and background.dtype != wp.float32:
+        background = background.numpy()
+    if is_torch(background) or isinstance(background, wp.array):
+        values = wp.from_torch(background.detach().float().contiguous()) if is_torch(background) else background
+        values = values.to(rows.device).contiguous().reshape((values.size // last, last))
+        valid = first_invalid_row(values) is None
+    else:
+        array = np.ascontiguousarray(np.asarray(background, np.float32).reshape(-1, last))
+        valid = bool(np.isfinite(array).all() and (array >= 0).all())
+        values = wp.array(array, dtype=wp.float32, device=rows.device)
+    if not valid:
+        found = values.numpy()
+        raise ValueError(f"background = {found.min()} … {found.max()} is outside [0, inf)")
+    return values
 
 
 def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:

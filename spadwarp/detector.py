@@ -7,6 +7,7 @@ dark counts, ambient light, crosstalk → hazard λ per detector bin → counts,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.config import Detector, Laser
 from spadwarp.response import InstrumentResponse, instrument_response, response_matrix
+from spadwarp.tensors import in_torch_order, is_torch, output_tensor, tensor_of
 
 if TYPE_CHECKING:
     from spadwarp.depth import Method
@@ -42,7 +44,7 @@ class TimeTags(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Detection:
-    """What the camera reports.
+    """What the camera reports; `counts`, `expected` and `background` are torch tensors if it was asked by them.
 
     Attributes:
         counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
@@ -90,7 +92,7 @@ class Detection:
     @property
     def intensity(self) -> NDArray[np.int64]:
         """Counts of each pixel over all bins: `[frames, H, W]` or `[H, W]`."""
-        return self.counts.sum(axis=-1, dtype=np.int64)
+        return self.counts.sum(-1) if is_torch(self.counts) else self.counts.sum(axis=-1, dtype=np.int64)
 
     def coates(self) -> NDArray[np.float64]:
         """Detections per pulse and bin with pile-up undone; see `coates`."""
@@ -119,14 +121,15 @@ class Detection:
 
         histogram: Any = self.counts
         if undo_pile_up:
-            histogram = np.nan_to_num(self.coates()) * self.exposure
+            undone: Any = self.coates()
+            histogram = (undone.nan_to_num() if is_torch(undone) else np.nan_to_num(undone)) * self.exposure
         return arrival_time(
             histogram,
             gate_start=self.gate_start,
             bin_width=self.bin_width,
             method=method,
             irf=self.irf if irf is None else irf,
-            background=self.background * np.float32(self.exposure),
+            background=self.background * float(self.exposure),
             gate=gate,
             device=device,
         )
@@ -150,6 +153,7 @@ def detect(
     summed: bool = False,
     tags: bool = False,
     camera_seed: int = 0,
+    out: Any = None,
     device: Any = None,
 ) -> Detection:
     """Frames of counts that the camera would record.
@@ -160,7 +164,8 @@ def detect(
     expected to detect in the same bin; that its counts come in pairs is left out. Dead time acts in free-running mode.
 
     Args:
-        source: a `Result`, or expected detections per pulse `[H, W, T]` (PDE included, noise not; NumPy, torch, Warp).
+        source: a `Result` or `TorchResult`, or expected detections per pulse `[H, W, T]` (PDE included, noise not;
+            NumPy, torch, Warp). Torch tensors in: torch tensors out, on their device.
         pulses: per frame; default: the detector's.
         frames: independent exposures.
         seed: 64 bits. The counts of a frame depend on the seed and the frame's number alone.
@@ -176,11 +181,14 @@ def detect(
         summed: add the frames up.
         tags: also return every detection.
         camera_seed: of the pixels' dark count rates, which a camera keeps.
+        out: the caller's own torch tensor for the counts, contiguous int32 of their shape, on the device.
         device: Warp device; default: where the source lies, for NumPy the first GPU or else the CPU.
 
     Raises:
         ValueError: naming the argument, its value and what is allowed.
     """
+    import warp as wp
+
     from spadwarp_kernels import detector as kernels
 
     scene = getattr(source, "scene", None)
@@ -204,99 +212,109 @@ def detect(
     if laser is None and (detector.fold or free_running or tags):
         raise ValueError("laser is missing: the detector needs its repetition rate (with fold = false it need not)")
 
-    rows, (height, width, bins) = _rows(source, "source", device)
-    device = rows.device
-    axis = _window(
-        window or (gate_start, bins),
-        bin_width,
-        tdc_widths,
-        period=1.0 / laser.repetition_rate if laser is not None else math.inf,
-        fold=detector.fold,
-        free_running=free_running,
-    )
-    if irf is None:
-        irf = instrument_response(
-            pulse_fwhm=laser.pulse_fwhm_ps * 1e-12 if laser is not None else 0.0,
-            jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
-            shape=detector.irf,
-            tail=detector.irf_tail_ps * 1e-12,
+    with in_torch_order(source, background, out):
+        rows, (height, width, bins) = _rows(source, "source", device)
+        device = rows.device
+        shape = (() if summed else (frames,)) + (height, width)
+        axis = _window(
+            window or (gate_start, bins),
+            bin_width,
+            tdc_widths,
+            period=1.0 / laser.repetition_rate if laser is not None else math.inf,
+            fold=detector.fold,
+            free_running=free_running,
         )
-    period = axis.period if detector.fold else None
-    matrix = response_matrix(
-        irf,
-        source_start=gate_start,
-        source_width=bin_width,
-        source_bins=bins,
-        edges=axis.start + axis.edges,
-        period=period,
-    )
-    noise = kernels.dark_count_rates(
-        rows.shape[0],
-        median=detector.dark_count_rate,
-        spread=detector.dark_count_spread,
-        hot_fraction=detector.hot_pixel_fraction,
-        hot_rate=detector.hot_pixel_rate,
-        offset=detector.ambient_rate,
-        seed=camera_seed,
-        device=device,
-    )
+        if irf is None:
+            irf = instrument_response(
+                pulse_fwhm=laser.pulse_fwhm_ps * 1e-12 if laser is not None else 0.0,
+                jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
+                shape=detector.irf,
+                tail=detector.irf_tail_ps * 1e-12,
+            )
+        period = axis.period if detector.fold else None
+        matrix = response_matrix(
+            irf,
+            source_start=gate_start,
+            source_width=bin_width,
+            source_bins=bins,
+            edges=axis.start + axis.edges,
+            period=period,
+        )
+        noise = kernels.dark_count_rates(
+            rows.shape[0],
+            median=detector.dark_count_rate,
+            spread=detector.dark_count_spread,
+            hot_fraction=detector.hot_pixel_fraction,
+            hot_rate=detector.hot_pixel_rate,
+            offset=detector.ambient_rate,
+            seed=camera_seed,
+            device=device,
+        )
 
-    def hazard_of(light: Any) -> Any:
-        return kernels.expected_detections(light, **matrix._asdict(), width=np.diff(axis.edges), noise_rate=noise)
+        def hazard_of(light: Any) -> Any:
+            return kernels.expected_detections(light, **matrix._asdict(), width=np.diff(axis.edges), noise_rate=noise)
 
-    hazard = hazard_of(rows)
-    dead_time = detector.dead_time_ns * 1e-9
-    if detector.crosstalk_probability > 0:
-        if free_running:
-            seen = kernels.free_running_probabilities(hazard, dead_time=dead_time, period=axis.period)
+        hazard = hazard_of(rows)
+        dead_time = detector.dead_time_ns * 1e-9
+        if detector.crosstalk_probability > 0:
+            if free_running:
+                seen = kernels.free_running_probabilities(hazard, dead_time=dead_time, period=axis.period)
+            else:
+                seen = kernels.first_photon_probabilities(hazard)
+            kernels.add_crosstalk(hazard, seen, image_width=width, probability=detector.crosstalk_probability)
+
+        if background is None:
+            widths = np.diff(axis.edges[: axis.recorded + 1])
+            flat = widths[:1] if tdc_widths is None else widths
+            known: Any = wp.array((noise.numpy()[:, None] * flat).astype(np.float32), device=device)
         else:
-            seen = kernels.first_photon_probabilities(hazard)
-        kernels.add_crosstalk(hazard, seen, image_width=width, probability=detector.crosstalk_probability)
+            known_rows, known_shape = _rows(background, "background", device)
+            if known_shape != (height, width, bins):
+                raise ValueError(
+                    f"background has shape {known_shape}; that of the source, {(height, width, bins)}, is needed"
+                )
+            known = hazard_of(known_rows)
 
-    known: NDArray[np.float32]
-    if background is None:
-        widths = np.diff(axis.edges[: axis.recorded + 1])
-        flat = widths[:1] if tdc_widths is None else widths
-        known = (noise.numpy()[:, None] * flat).astype(np.float32)
-    else:
-        known_rows, shape = _rows(background, "background", device)
-        if shape != (height, width, bins):
-            raise ValueError(f"background has shape {shape}; that of the source, {(height, width, bins)}, is needed")
-        known = hazard_of(known_rows).numpy()[:, : axis.recorded]
+        by_event = free_running or tags or detector.afterpulsing_probability > 0
+        as_torch = is_torch(source) or out is not None
+        if as_torch:
+            out = output_tensor(out, name="out", shape=(*shape, axis.recorded), device=device)
+        common: dict[str, Any] = {
+            "pulses": pulses,
+            "frames": frames,
+            "first_frame": first_frame,
+            "counter_depth": detector.counter_depth,
+            "seed": seed,
+            "counts": wp.from_torch(out).flatten() if as_torch and not (by_event and summed) else None,
+        }
+        stream = None
+        if by_event:
+            counts, stream = kernels.event_counts(
+                hazard,
+                edges=axis.edges,
+                recorded=axis.recorded,
+                period=axis.period,
+                gated=not free_running,
+                dead_time=dead_time,
+                afterpulsing_probability=detector.afterpulsing_probability,
+                afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
+                tags=tags,
+                **common,
+            )
+        else:
+            counts = kernels.first_photon_counts(hazard, summed=summed, **common)
+        give: Callable[[Any], Any] = tensor_of if as_torch else wp.array.numpy
+        arrays: dict[str, Any] = {"expected": give(hazard), "background": give(known)}
+        if not as_torch or common["counts"] is None:
+            arrays["counts"] = give(counts)
 
-    stream = None
-    if free_running or tags or detector.afterpulsing_probability > 0:
-        raw, stream = kernels.event_counts(
-            hazard,
-            edges=axis.edges,
-            recorded=axis.recorded,
-            period=axis.period,
-            pulses=pulses,
-            gated=not free_running,
-            dead_time=dead_time,
-            afterpulsing_probability=detector.afterpulsing_probability,
-            afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
-            frames=frames,
-            first_frame=first_frame,
-            counter_depth=detector.counter_depth,
-            tags=tags,
-            seed=seed,
-        )
-        counts = raw.numpy().reshape(frames, height, width, axis.recorded)
-        counts = counts.sum(axis=0, dtype=np.int32) if summed else counts
-    else:
-        raw = kernels.first_photon_counts(
-            hazard,
-            pulses=pulses,
-            frames=frames,
-            first_frame=first_frame,
-            summed=summed,
-            counter_depth=detector.counter_depth,
-            seed=seed,
-        )
-        counts = raw.numpy().reshape(*(() if summed else (frames,)), height, width, axis.recorded)
+    counts = arrays.get("counts", out)
+    if by_event and summed:
+        counts = counts.reshape(frames, height, width, axis.recorded).sum(0, dtype=counts.dtype)
+        if as_torch:
+            counts = out.copy_(counts)
     return Detection(
-        counts=counts,
+        counts=counts.reshape(*shape, axis.recorded),
         pulses=pulses,
         frames=frames,
         first_frame=first_frame,
@@ -305,8 +323,8 @@ def detect(
         edges=axis.edges[: axis.recorded + 1],
         period=period,
         irf=irf,
-        expected=hazard.numpy()[:, : axis.recorded].astype(np.float32).reshape(height, width, -1),
-        background=known.reshape(height, width, -1),
+        expected=arrays["expected"][:, : axis.recorded].reshape(height, width, -1),
+        background=arrays["background"][:, : axis.recorded].reshape(height, width, -1),
         seed=seed,
         tags=None if stream is None else _time_tags(stream, (height, width), first_frame),
         notes=_missing_light(axis, gate_start) if detector.fold else (),
@@ -323,10 +341,13 @@ def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np
 
     from spadwarp_kernels import detector as kernels
 
-    rows, shape = _rows(hazard, "hazard", device, dimensions=None)
-    if rows.dtype not in (wp.float32, wp.float64):
-        rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
-    return kernels.first_photon_probabilities(rows).numpy().astype(np.float64).reshape(shape)
+    with in_torch_order(hazard):
+        rows, shape = _rows(hazard, "hazard", device, dimensions=None)
+        if rows.dtype not in (wp.float32, wp.float64):
+            rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
+        law = kernels.first_photon_probabilities(rows)
+        given: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
+    return given.reshape(shape)
 
 
 def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float64]:
@@ -342,17 +363,21 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
 
     from spadwarp_kernels import detector as kernels
 
-    rows, shape = _rows(counts, "counts", device, dimensions=None)
-    if rows.dtype not in (wp.int32, wp.int64):
-        raise ValueError(f"counts are {rows.dtype.__name__}; integers are needed")
-    whole = rows.numpy()
-    most = int(whole.sum(axis=1, dtype=np.int64).max())
-    if most > pulses:
-        raise ValueError(
-            f"pulses = {pulses} is below the {most} counts of a histogram: it has seen more than one a pulse"
-        )
-    rows = rows if rows.dtype == wp.int32 else wp.array(whole.astype(np.int32), dtype=wp.int32, device=rows.device)
-    return kernels.coates(rows, pulses=pulses).numpy().reshape(shape)
+    with in_torch_order(counts):
+        rows, shape = _rows(counts, "counts", device, dimensions=None)
+        if rows.dtype not in (wp.int32, wp.int64):
+            raise ValueError(f"counts are {rows.dtype.__name__}; integers are needed")
+        whole = rows.numpy()
+        most = int(whole.sum(axis=1, dtype=np.int64).max())
+        if most > pulses:
+            raise ValueError(
+                f"pulses = {pulses} is below the {most} counts of a histogram: it has seen more than one a pulse"
+            )
+        if rows.dtype != wp.int32:
+            rows = wp.array(whole.astype(np.int32), dtype=wp.int32, device=rows.device)
+        corrected = kernels.coates(rows, pulses=pulses)
+        given: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
+    return given.reshape(shape)
 
 
 # Boundary

@@ -15,6 +15,7 @@ from spadwarp.config import SPEED_OF_LIGHT
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.files import atomic_path, load_result, write_exr
 from spadwarp.result import COMPONENTS, Result, pixel_directions
+from spadwarp.tensors import on_host
 
 if TYPE_CHECKING:
     from spadwarp.config import Scene
@@ -133,7 +134,8 @@ def _opened(source: Any, result: Result | None) -> Iterator[Result | _Exposures]
 
 
 def _of_detection(detection: Detection, result: Result | None) -> _Exposures:
-    counts = detection.counts[None] if detection.summed else detection.counts
+    counts = on_host(detection.counts)
+    counts = counts[None] if detection.summed else counts
     depth = None if result is None else result.truth.depth
     return _Exposures(
         place="Detection",
@@ -142,8 +144,8 @@ def _of_detection(detection: Detection, result: Result | None) -> _Exposures:
         images=lambda one: {"intensity": counts[one].sum(axis=-1)} | ({} if depth is None else {"truth.Z": depth}),
         most=int(counts.sum(axis=-1, dtype=np.int64).max()),
         shape=counts.shape[1:],
-        expected=detection.expected,
-        background=detection.background,
+        expected=on_host(detection.expected),
+        background=on_host(detection.background),
         pulses=detection.exposure,
         gate_start=detection.gate_start,
         bin_width=detection.bin_width,

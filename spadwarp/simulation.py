@@ -20,6 +20,7 @@ from spadwarp.errors import ConfigError
 from spadwarp.hardware import core_count, pick_device
 from spadwarp.model import build_model, trace_truth, transport_spec
 from spadwarp.result import COMPONENTS, Result, check_capacity, merge, physics_of
+from spadwarp.tensors import caller_tallies
 
 if TYPE_CHECKING:
     from spadwarp_kernels import Data, Model
@@ -46,6 +47,7 @@ def simulate(
     relative_error: float | None = None,
     first_photon: int = 0,
     resume: Result | None = None,
+    tallies: Any = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
@@ -67,6 +69,9 @@ def simulate(
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
         resume: A result of the same scene, to which photons are added until it has `photons`; the outcome is that of
             one long run.
+        tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
+            the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
+            memory; `spadwarp.to_torch(result, tallies=…)` makes histograms of it where it lies. Without `resume`.
 
     Returns:
         The result. After Ctrl-C it holds the photons (or batches) that were done and is marked `partial`.
@@ -80,6 +85,8 @@ def simulate(
     photons = scene.transport.photons if photons is None else photons
     _check_range("photons", photons, 1, 10**12)
     if resume is not None:
+        if tallies is not None:
+            raise ConfigError("tallies go without resume: they hold one run")
         if len(resume.photon_ranges) != 1:
             raise ConfigError(f"resume: the photon ids {resume.photon_ranges} have gaps; merge the missing ones first")
         if first_photon:
@@ -120,19 +127,20 @@ def simulate(
     if resume is not None and resume.unit != 1.0 / model.scale:
         raise ConfigError(f"resume: the tally unit is {1.0 / model.scale}, that of the result {resume.unit}")
     ready = time.perf_counter()
-    run = _Run(model, transport_spec(scene, mesh), seed=seed, progress=progress, batch_size=batch_size)
+    spec = transport_spec(scene, mesh)
+    run = _Run(model, spec, seed=seed, progress=progress, batch_size=batch_size, tallies=tallies)
     compiled = time.perf_counter()
     truth = trace_truth(scene, model)
     traced = time.perf_counter()
     result: Result | None = None
 
     def collect(done: int) -> Result:
-        tallies, squares = run.tallies()
-        check_capacity(tallies.sum(axis=0, dtype=np.float64))
+        counted, squares = run.tallies()
+        check_capacity(counted.sum(axis=0, dtype=np.float64))
         ledger, counters = run.accounts()
         part = Result(
             scene=scene,
-            tallies=tallies,
+            tallies=counted,
             unit=1.0 / model.scale,
             photons=done,
             seed=seed,
@@ -255,14 +263,26 @@ def trace(
 class _Run:
     """One model, its tallies, and the passes over photon ids."""
 
-    def __init__(self, model: Model, spec: Any, *, seed: int, progress: Progress | None, batch_size: int = 0) -> None:
+    def __init__(
+        self,
+        model: Model,
+        spec: Any,
+        *,
+        seed: int,
+        progress: Progress | None,
+        batch_size: int = 0,
+        tallies: Any = None,
+    ) -> None:
         import spadwarp_kernels as sk
+
+        shape = (len(COMPONENTS), model.camera.height, model.camera.width, model.gate.bins)
+        own = None if tallies is None else caller_tallies(tallies, shape=shape, device=model.device)
 
         self.model, self.spec, self.seed, self.progress = model, spec, seed, progress
         self.ledger_unit = sk.LEDGER_UNIT
-        self.data: Data = sk.make_data(model, histogram=spec.estimator != "none")
+        self.data: Data = sk.make_data(model, tally=None if batch_size else own, histogram=spec.estimator != "none")
         self.batch_size = batch_size
-        self.batches = sk.Batches(self.data.tally, len(COMPONENTS)) if batch_size else None
+        self.batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
         self.stopped_early = False
         self._accounts: list[tuple[dict[str, int], dict[str, int]]] = []
         if progress is not None:

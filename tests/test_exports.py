@@ -58,6 +58,12 @@ def test_npy(origin, frames, detection, tmp_path):
     assert np.array_equal(read_histograms(tmp_path / "one.npy").values, detection.counts[1])
 
 
+def test_tensors_are_exported_too(detection, tmp_path):
+    pytest.importorskip("torch")
+    spadwarp.export(spadwarp.to_torch(detection), tmp_path / "a.npy")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), detection.counts)
+
+
 def test_npy_of_a_result_is_its_histogram(result, tmp_path):
     spadwarp.export(result, tmp_path / "a.npy")
     assert np.array_equal(np.load(tmp_path / "a.npy"), result.histogram)

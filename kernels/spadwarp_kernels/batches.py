@@ -43,7 +43,7 @@ def close_batch_kernel(
 
 
 class Batches:
-    """Totals and squares on the device of a tally.
+    """Totals and squares on the device of a tally; `total` may be the caller's own array of zeros.
 
     Attributes:
         total: int64, as the tally.
@@ -51,10 +51,10 @@ class Batches:
         count: Batches closed.
     """
 
-    def __init__(self, tally: wp.array, component_count: int) -> None:
+    def __init__(self, tally: wp.array, component_count: int, *, total: wp.array | None = None) -> None:
         self._component_count = component_count
         voxels = tally.size // component_count
-        self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device)
+        self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device) if total is None else total
         self.squares = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
         self.count = 0
 

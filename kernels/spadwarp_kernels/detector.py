@@ -450,6 +450,7 @@ def first_photon_counts(
     summed: bool = False,
     counter_depth: int = 0,
     seed: int,
+    counts: wp.array | None = None,
 ) -> wp.array:
     """Counts of first-photon TCSPC, drawn exactly: bin after bin a binomial of the pulses that have not counted yet.
 
@@ -460,13 +461,14 @@ def first_photon_counts(
         summed: add the frames up.
         counter_depth: largest count of a bin and frame, 0: unlimited.
         seed: 64 bits.
+        counts: the caller's own contiguous array of that size to write into.
 
     Returns:
         int32 `[frames · pixel, bin]`, or `[pixel, bin]` if summed. At most one count per pulse and pixel.
     """
     pixels, bins = hazard.shape
     rows = pixels if summed else frames * pixels
-    counts = wp.zeros((rows, bins), dtype=int, device=hazard.device)
+    counts = _zeroed(counts, (rows, bins), hazard.device)
     inputs = [hazard, pulses, first_frame, frames if summed else 1, counter_depth or 2**31 - 1, seed, counts]
     launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
     return counts
@@ -488,6 +490,7 @@ def event_counts(
     counter_depth: int = 0,
     tags: bool = False,
     seed: int,
+    counts: wp.array | None = None,
 ) -> tuple[wp.array, dict[str, np.ndarray] | None]:
     """Counts of a detector followed event by event through `pulses` periods; the cost is per detection.
 
@@ -502,7 +505,7 @@ def event_counts(
         gated: off from a detection, or from the last edge, to the next pulse: first-photon TCSPC. Else free-running.
         dead_time, afterpulsing_time_constant: [s].
         tags: also return the stream of detections.
-        pulses, frames, first_frame, counter_depth, seed: as in `first_photon_counts`.
+        pulses, frames, first_frame, counter_depth, seed, counts: as in `first_photon_counts`.
 
     Returns:
         int32 `[frames · pixel, recorded]` and, with `tags`, the arrays `row` (frame · pixels + pixel, int64), `pulse`
@@ -511,7 +514,7 @@ def event_counts(
     device = hazard.device
     pixels, bins = hazard.shape
     rows = frames * pixels
-    counts = wp.zeros((rows, recorded), dtype=int, device=device)
+    counts = _zeroed(counts, (rows, recorded), device)
     number = wp.zeros(rows, dtype=int, device=device)
     # A period without dead time holds any number of detections: only then does the mean have to be looked up.
     most = 1.0 if gated else period / dead_time + 1.0 if dead_time > 0 else np.inf
@@ -545,3 +548,12 @@ def event_counts(
     stream = {"row": np.repeat(np.arange(rows), per_row)}
     stream |= {"pulse": pulse.numpy()[: start[-1]], "bin": bin.numpy()[: start[-1]]}
     return counts, stream
+
+
+def _zeroed(array: wp.array | None, shape: tuple[int, int], device: Any) -> wp.array:
+    if array is None:
+        return wp.zeros(shape, dtype=int, device=device)
+    if array.dtype is not wp.int32 or array.size != shape[0] * shape[1] or not array.is_contiguous:
+        raise ValueError(f"counts are {array.dtype.__name__} {array.shape}; contiguous int32 {shape} is needed")
+    array.zero_()
+    return array.reshape(shape)
