@@ -48,6 +48,13 @@ _HOMES = {
     "to_torch": "tensors",
     "TorchResult": "tensors",
     "validate": "validation",
+    "load_recipe": "dataset.recipe",
+    "Recipe": "dataset.recipe",
+    "make_dataset": "dataset.making",
+    "verify_dataset": "dataset.making",
+    "FrameReader": "dataset.reading",
+    "SpadDataset": "dataset.reading",
+    "iterate_dataset": "dataset.reading",
     "SpadwarpError": "errors",
     "ConfigError": "errors",
     "DeviceError": "errors",
@@ -65,6 +72,9 @@ if TYPE_CHECKING:
     from spadwarp.checks import check
     from spadwarp.config import Scene, load_scene
     from spadwarp.crlb import crlb_map
+    from spadwarp.dataset.making import make_dataset, verify_dataset
+    from spadwarp.dataset.reading import FrameReader, SpadDataset, iterate_dataset
+    from spadwarp.dataset.recipe import Recipe, load_recipe
     from spadwarp.depth import arrival_time
     from spadwarp.detector import Detection, coates, detect
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError

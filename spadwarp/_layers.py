@@ -233,17 +233,18 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     for section, fields in tables.items():
         headed = [(f"[[{section}]]", one) for one in fields] if isinstance(fields, list) else [(f"[{section}]", fields)]
         for header, table in headed:
-            blocks.append("\n".join([header, *(f"{name} = {_toml_value(value)}" for name, value in table.items())]))
+            blocks.append("\n".join([header, *(f"{name} = {toml_value(value)}" for name, value in table.items())]))
     return "\n\n".join(blocks) + "\n"
 
 
-def _toml_value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A boolean, number, string or list as TOML writes it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return '"' + "".join(_ESCAPES.get(char) or _escape(char) for char in value) + '"'
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
+        return "[" + ", ".join(map(toml_value, value)) + "]"
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)  # inf, -inf, nan are TOML's own words
     return repr(value)

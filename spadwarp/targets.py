@@ -91,7 +91,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     about its own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's
     axes are taken as they stand.
 
-    Faces that have no area in float32 are dropped with a warning that counts them.
+    Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
 
     Args:
         target: What and where.
@@ -134,7 +134,8 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     if not solid.any():
         raise MeshError(f"{name}: none of the {len(mesh.faces)} faces has an area")
     if not solid.all():
-        warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
+        if target.mesh is not None:  # slivers of a built-in are no news
+            warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
         mesh.update_faces(solid)
     mesh.remove_unreferenced_vertices()
     return mesh

@@ -1,0 +1,118 @@
+"""`spadwarp dataset`: make datasets, check them, and look at them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import spadwarp
+
+from ._app import app, fail, say
+from ._options import Device, Json, Quiet, count, in_bytes, rows, write_json
+from ._progress import progress
+
+group = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(group, name="dataset", help="Datasets of labelled depth frames: make, verify, info, preview.")
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset's folder.", show_default=False)]
+
+
+@group.command()
+def make(
+    recipe_path: Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe (TOML).", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The dataset's folder.", show_default=False)],
+    shard: Annotated[
+        str, typer.Option(metavar="K/N", help="Only every N-th shard, from the K-th on; for several machines.")
+    ] = "1/1",
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the recipe; may be repeated."),
+    ] = None,
+    device: Device = None,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Makes what is missing or broken of a dataset; the same recipe gives the same files.
+
+    May be stopped at any moment and called again: whole shards stay.
+
+    \b
+    Examples:
+      spadwarp dataset make configs/datasets/small.toml --out data/small/
+      spadwarp dataset make configs/datasets/paper.toml --out data/paper/ --shard 3/64
+    """
+    recipe = spadwarp.load_recipe(recipe_path)
+    if overrides:
+        recipe = recipe.with_overrides(overrides)
+    with progress(quiet=quiet, unit="frames") as report:
+        found = spadwarp.make_dataset(recipe, out, device=device, shard=_part(shard), progress=report)
+    summary = {
+        "folder": found.folder,
+        "frames": found.frames,
+        "made": list(found.made),
+        "kept": len(found.kept),
+        "broken": list(found.broken),
+        "missing": len(found.missing),
+    }
+    if not quiet:
+        table = {"made": f"{count(len(found.made))} shards with {count(found.frames)} frames in {out}"}
+        if found.kept:
+            table["kept"] = f"{count(len(found.kept))} shards that were there and whole"
+        if found.broken:
+            table["replaced"] = "; ".join(found.broken)
+        if found.missing:
+            table["missing"] = f"{count(len(found.missing))} shards that others are to make"
+        say(rows(table))
+    write_json(summary, json_path)
+
+
+def _part(text: str) -> tuple[int, int]:
+    part, slash, parts = text.partition("/")
+    if not (slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise typer.BadParameter(f"{text!r} is not of the form K/N with 1 <= K <= N", param_hint="--shard")
+    return int(part), int(parts)
+
+
+@group.command()
+def verify(folder: Folder, quiet: Quiet = False, json_path: Json = None) -> None:
+    """Compares every file of a dataset with its checksum; exit code 1 if something is missing or damaged.
+
+    \b
+    Example:
+      spadwarp dataset verify data/small/
+    """
+    wrong = spadwarp.verify_dataset(folder)
+    write_json({"folder": folder, "wrong": wrong}, json_path)
+    if wrong:
+        fail("\n".join(wrong) + "\n`spadwarp dataset make` makes these anew")
+    if not quiet:
+        say(f"{folder}: whole")
+
+
+@group.command()
+def info(folder: Folder, json_path: Json = None) -> None:
+    """What a dataset holds.
+
+    \b
+    Example:
+      spadwarp dataset info data/small/
+    """
+    from spadwarp.dataset.making import read_manifest
+
+    manifest = read_manifest(folder)
+    size = sum(one["bytes"] for one in manifest["files"].values())
+    table = {
+        "name": manifest["name"],
+        "frames": f"{count(manifest['frames'])} of {manifest['width']} x {manifest['height']} pixels, "
+        f"{count(manifest['scenes'])} scenes, {in_bytes(size)}",
+        "depth": f"{manifest['depth_offset']:.6g} m + {manifest['depth_step']:.6g} m per unit",
+    }
+    for name, split in manifest["splits"].items():
+        table[name] = f"{count(split['frames'])} frames: {', '.join(split['targets']) or 'none'}"
+    say(rows(table))
+    write_json(manifest, json_path)
+
+
+__all__ = ["group", "info", "make", "verify"]

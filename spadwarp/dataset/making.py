@@ -1,0 +1,273 @@
+"""Making a dataset: shards that are missing or broken, the manifest, the splits, the card.
+
+A shard is two files and a small record of their checksums, in this order, each renamed into place when it is whole.
+What is killed loses the shard in hand; a later call makes what has no record, or does not match it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.files import atomic_path
+from spadwarp.hardware import core_count
+
+from .card import card
+from .plan import Plan, Shard
+from .recipe import SPLITS, Recipe, load_recipe
+from .shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
+
+__all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class DatasetReport:
+    """What a call of `make_dataset` did.
+
+    Attributes:
+        folder: The dataset.
+        made: Names of the shards that were made.
+        kept: Those that were there and whole.
+        missing: Those that were not asked for and are not there.
+        broken: What was wrong with those that were made again.
+        frames: Frames made.
+    """
+
+    folder: Path
+    made: tuple[str, ...]
+    kept: tuple[str, ...]
+    missing: tuple[str, ...]
+    broken: tuple[str, ...]
+    frames: int
+
+
+def make_dataset(
+    recipe: Recipe | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    device: str | None = None,
+    shard: tuple[int, int] = (1, 1),
+    progress: Progress | None = None,
+) -> DatasetReport:
+    """Makes what is missing or broken of a dataset.
+
+    Args:
+        recipe: From `load_recipe`, or its path.
+        out: The dataset's folder; new, or that of the same recipe.
+        device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
+        shard: (k, n): only every n-th shard, from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
+        progress: Called with ("frames", done, all that will be made).
+
+    Raises:
+        ConfigError: A recipe that cannot be used, or another one's dataset in the folder.
+        FileError: The folder cannot be written or is full; whole shards stay.
+    """
+    plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
+    part, parts = shard
+    if not 1 <= part <= parts:
+        raise ConfigError(f"shard = {part}/{parts}: {part} is outside [1, {parts}]")
+    folder = Path(out)
+    _claim(plan, folder)
+    mine = [one for one in plan.shards if one.index % parts == part - 1]
+    state = _check(folder, mine)
+    todo = [one for one in mine if state[one.index] != ""]
+    total = sum(one.scenes for one in todo) * plan.frames_per_scene
+    _check_room(plan, folder, total)
+    done = 0
+
+    def report(frames: int) -> None:
+        nonlocal done
+        done += frames
+        if progress is not None:
+            progress("frames", done, total)
+
+    for one in todo:
+        _record_path(folder, one).unlink(missing_ok=True)
+        written = write_shard(plan, one, folder, device=device, progress=report)
+        _write_json(_record_path(folder, one), written)
+    missing = _finish(plan, folder)
+    return DatasetReport(
+        folder=folder,
+        made=tuple(one.frames_file for one in todo),
+        kept=tuple(one.frames_file for one in mine if state[one.index] == ""),
+        missing=missing,
+        broken=tuple(text for text in state.values() if text not in ("", "missing")),
+        frames=total,
+    )
+
+
+def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
+    """What is wrong with a dataset, one line for each shard or file: missing, or not what its checksum says.
+
+    Raises `FileError` if there is no dataset.
+    """
+    place = Path(folder)
+    recipe = place / "recipe.toml"
+    if not recipe.is_file():
+        raise FileError(f"{place}: no dataset there (no recipe.toml)")
+    plan = Plan(load_recipe(recipe))
+    wrong = [
+        f"{one.frames_file}: missing" if text == "missing" else text
+        for one, text in zip(plan.shards, _check(place, plan.shards).values(), strict=True)
+        if text
+    ]
+    if (place / "manifest.json").is_file():
+        files = read_manifest(place)["files"]
+        known = {name for one in plan.shards for name in (one.frames_file, one.scenes_file)}
+        wrong += [text for name in sorted(set(files) - known) if (text := _compare(place, name, files[name]))]
+    else:
+        wrong.append("manifest.json: missing")
+    return wrong
+
+
+def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """The manifest of a dataset. Raises `FileError`."""
+    path = Path(folder) / "manifest.json"
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileError(f"{folder}: no dataset there (no manifest.json)") from None
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot be read: {error}") from error
+    if manifest.get("format") != "spadwarp dataset":
+        raise FileError(f"{path}: not the manifest of a spadwarp dataset")
+    if manifest["format_version"] > FORMAT_VERSION:
+        raise FileError(f"{path}: format version {manifest['format_version']} is newer than {FORMAT_VERSION}")
+    return manifest
+
+
+# Parts
+
+
+def _record_path(folder: Path, shard: Shard) -> Path:
+    return folder / "shards" / f"{shard.name}.json"
+
+
+def _claim(plan: Plan, folder: Path) -> None:
+    """Writes the recipe into a new folder; refuses one that holds something else."""
+    path, text = folder / "recipe.toml", plan.recipe.to_toml()
+    try:
+        if path.is_file():
+            if path.read_text(encoding="utf-8") == text:
+                return
+            raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
+        if folder.exists() and not folder.is_dir():
+            raise FileError(f"{folder}: is a file; a folder is needed")
+        if folder.is_dir() and any(not one.name.startswith(".") for one in folder.iterdir()):
+            raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def _check(folder: Path, shards: Any) -> dict[int, str]:
+    """For each shard "" (whole), "missing", or what is wrong with it."""
+
+    def state(shard: Shard) -> str:
+        path = _record_path(folder, shard)
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            files = {name: (int(one["bytes"]), str(one["sha256"])) for name, one in record.items()}
+        except FileNotFoundError:
+            return "missing"
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            return f"{path}: cannot be read: {error}"
+        if set(files) != {shard.frames_file, shard.scenes_file}:
+            return f"{path}: not the record of this shard"
+        return next((text for name in files if (text := _compare(folder, name, record[name]))), "")
+
+    with ThreadPoolExecutor(core_count()) as pool:
+        return dict(zip((one.index for one in shards), pool.map(state, shards), strict=True))
+
+
+def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
+    path = folder / name
+    try:
+        if path.stat().st_size != record["bytes"]:
+            return f"{name}: damaged: it has {path.stat().st_size} bytes, not {record['bytes']}"
+        return "" if checksum(path) == record else f"{name}: damaged: its checksum is not that of manifest.json"
+    except FileNotFoundError:
+        return f"{name}: missing"
+    except OSError as error:
+        return f"{name}: cannot be read: {error.strerror}"
+
+
+def _check_room(plan: Plan, folder: Path, frames: int) -> None:
+    """Frames take up to 3.2 bytes a pixel, scenes up to 20."""
+    pixels = plan.shape[0] * plan.shape[1]
+    needed = int(frames * pixels * (3.2 + 20.0 / plan.frames_per_scene))
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise FileError(f"{folder}: up to {needed / 1e9:.3g} GB will be written; {free / 1e9:.3g} GB are free there")
+
+
+def _finish(plan: Plan, folder: Path) -> tuple[str, ...]:
+    """Splits, the index of scenes, and, once every shard is there, manifest and card; returns what is not there."""
+    files: dict[str, Any] = {}
+    missing = []
+    for shard in plan.shards:
+        try:
+            files |= json.loads(_record_path(folder, shard).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            missing.append(shard.frames_file)
+    for split in SPLITS:
+        names = [one.frames_file for one in plan.shards if one.split == split]
+        _write_text(folder / f"{split}.txt", "".join(f"{name}\n" for name in names))
+    write_scene_index(plan, folder)
+    if missing:
+        return tuple(missing)
+    files["scenes.h5"] = checksum(folder / "scenes.h5")
+    manifest = _manifest(plan, files)
+    _write_text(folder / "README.md", card(plan, manifest))
+    _write_json(folder / "manifest.json", manifest)
+    return ()
+
+
+def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
+    from spadwarp import __version__
+
+    return {
+        "format": "spadwarp dataset",
+        "format_version": FORMAT_VERSION,
+        "version": __version__,
+        "name": plan.recipe.name,
+        "description": plan.recipe.description,
+        "seed": str(plan.recipe.seed),
+        "frames": plan.sample_count,
+        "scenes": plan.scene_count,
+        "frames_per_scene": plan.frames_per_scene,
+        "height": plan.shape[0],
+        "width": plan.shape[1],
+        "depth_step": plan.depth_step,
+        "depth_offset": plan.depth_offset,
+        "targets": [one.name for one in plan.targets],
+        "splits": {
+            split: {
+                "seed": str(plan.split_seeds[split]),
+                "targets": [one.name for one in plan.targets if one.split == split],
+                "shards": [one.frames_file for one in plan.shards if one.split == split],
+                "frames": sum(one.scenes for one in plan.shards if one.split == split) * plan.frames_per_scene,
+            }
+            for split in SPLITS
+        },
+        "files": dict(sorted(files.items())),
+    }
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _write_json(path: Path, value: Any) -> None:
+    _write_text(path, json.dumps(value, indent=1) + "\n")

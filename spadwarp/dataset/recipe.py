@@ -1,0 +1,333 @@
+"""Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
+
+A recipe holds a scene, given as in a scene file, and distributions over what changes from scene to scene. A
+distribution is a number (always that), a list (one of these), or a table `{low = , high = }`, with `log = true` even in
+the logarithm.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
+
+from spadwarp._layers import parse_override, toml_value
+from spadwarp._problems import describe
+from spadwarp.config import Scene, Whole, _listed
+from spadwarp.errors import ConfigError, FileError
+
+__all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
+
+SPLITS = ("train", "validation", "test")
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+
+
+class _Table(BaseModel):
+    """One table of a recipe: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as TOML has them, without those that are None."""
+        return {name: _plain(value) for name, value in self if value is not None}
+
+
+class Distribution(_Table):
+    """One of `choices`, or even between `low` and `high`."""
+
+    choices: Annotated[tuple[Any, ...], BeforeValidator(_listed)] = ()
+    low: float | None = Field(None, description="lowest value")
+    high: float | None = Field(None, description="highest value")
+    log: bool = Field(False, description="whether the logarithm is even")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if bool(self.choices) == (self.low is not None and self.high is not None):
+            raise ValueError("needs a number, a list of choices, or low and high")
+        if self.low is not None and self.high is not None:
+            if not self.low <= self.high:
+                raise ValueError(f"low = {self.low} is outside (-inf, {self.high}], {self.high} being high")
+            if self.log and not self.low > 0:
+                raise ValueError(f"low = {self.low} is outside (0, inf), the range of a logarithm")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value that can come."""
+        if self.choices:
+            return min(self.choices), max(self.choices)
+        assert self.low is not None and self.high is not None
+        return self.low, self.high
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """One value."""
+        if self.choices:
+            return self.choices[int(generator.integers(len(self.choices)))]
+        low, high = self.limits
+        u = float(generator.random())
+        return low * (high / low) ** u if self.log else low + (high - low) * u
+
+    def to_dict(self) -> Any:
+        """As TOML has it: a number, a list or a table."""
+        if self.choices:
+            single = len(self.choices) == 1 and not isinstance(self.choices[0], (list, tuple))
+            return self.choices[0] if single else list(self.choices)
+        return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
+
+
+def _distribution(value: Any) -> Any:
+    if isinstance(value, (Mapping, Distribution)):
+        return value
+    return {"choices": list(value) if isinstance(value, (list, tuple)) else [value]}
+
+
+def _within(low: float, high: float, *, open_low: bool = False) -> AfterValidator:
+    """A distribution of numbers in [low, high], or (low, high]."""
+
+    def check(value: Distribution) -> Distribution:
+        for one in value.choices:
+            if isinstance(one, bool) or not isinstance(one, (int, float)):
+                raise ValueError(f"{one!r} is not a number")
+        for one in value.limits:
+            if not low <= one <= high or (open_low and one == low):
+                left, right = "(" if open_low else "[", "]" if high < math.inf else ")"
+                raise ValueError(f"{one} is outside {left}{low}, {high}{right}")
+        return value
+
+    return AfterValidator(check)
+
+
+Positive = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, math.inf, open_low=True)]
+NotNegative = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, math.inf)]
+Share = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, 1.0)]
+Angle = Annotated[Distribution, BeforeValidator(_distribution), _within(-360.0, 360.0)]
+Real = Annotated[Distribution, BeforeValidator(_distribution), _within(-math.inf, math.inf)]
+
+
+def _constant(value: float) -> Distribution:
+    return Distribution(choices=(value,))
+
+
+class Targets(_Table):
+    """What is looked at, and which targets are kept for validation and test; all others are for training."""
+
+    builtin: Names | Literal["all"] = Field("all", description='names from `spadwarp targets`, or "all" objects')
+    meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
+    mesh_size: float | None = Field(
+        3.6, gt=0, description="longest side that meshes are scaled to [m]; none if not given"
+    )
+    validation: Names = Field((), description="targets of the validation split")
+    test: Names = Field((), description="targets of the test split")
+
+
+class Pose(_Table):
+    """Where a target stands, how it is turned, and how much it reflects."""
+
+    distance: Positive = Field(_constant(15.0), description="of the target's centre, along the optical axis [m]")
+    shift: Real = Field(_constant(0.0), description="aside, drawn for x and for y [m]")
+    yaw_deg: Angle = Field(_constant(0.0), description="turn about the vertical [°]")
+    pitch_deg: Angle = Field(_constant(0.0), description="turn about the horizontal across the view [°]")
+    roll_deg: Angle = Field(_constant(0.0), description="turn about the optical axis [°]")
+    size: Positive = Field(_constant(1.0), description="scale of the target")
+    reflectance: Share = Field(_constant(0.5), description="Lambertian reflectance of the target")
+
+
+class Backdrop(_Table):
+    """A wall behind the target."""
+
+    probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
+    behind: NotNegative = Field(_constant(0.5), description="of the wall from the target's centre [m]")
+    tilt_deg: Angle = Field(_constant(0.0), description="its yaw and pitch, each drawn [°]")
+    reflectance: Share = Field(_constant(0.3), description="Lambertian reflectance of the wall")
+
+
+class Water(_Table):
+    """How turbid it is; what is not given here is the scene's."""
+
+    attenuation_lengths: Positive | None = Field(None, description="extinction times distance, one way")
+
+
+class Window(_Table):
+    """The gate, as ranges."""
+
+    before: Positive = Field(_constant(1.5), description="from where it opens to the target's centre [m]")
+    behind: Positive = Field(_constant(1.0), description="from the target's centre to where it closes [m]")
+    bins: Whole = Field(1024, ge=1, le=1_000_000, description="time bins in it")
+
+
+class Exposure(_Table):
+    """How long a frame is exposed: by pulses, or by the photons that come back from the median pixel."""
+
+    signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
+    pulses: Positive | None = Field(None, description="pulses of a frame; the scene's if neither is given")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if self.signal_photons is not None and self.pulses is not None:
+            raise ValueError("needs either signal_photons or pulses")
+        return self
+
+
+class Frames(_Table):
+    """The depth frames of a scene."""
+
+    per_scene: Whole = Field(20, ge=1, le=1_000_000, description="frames of each scene")
+    backscatter_fraction: Literal["rates"] | Share = Field(
+        _constant(0.183),
+        description='BS, part of the pixels that report backscatter; "rates": what the photon rates say',
+    )
+    compression: Literal["none", "gzip"] = Field("none", description="of the frames; none reads fastest")
+
+
+class Recipe(_Table):
+    """Everything a dataset depends on, checked and frozen."""
+
+    name: str = Field(..., min_length=1, description="what the dataset is called")
+    description: str = Field("", description="one or two sentences for its card")
+    seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of every draw; one seed gives the same dataset")
+    scenes_per_target: Whole = Field(
+        50, ge=1, le=1_000_000, description="scenes, each with a pose and a water of its own"
+    )
+    scenes_per_shard: Whole = Field(25, ge=1, le=1_000_000, description="scenes in one file, all of one target")
+    targets: Targets = Targets()
+    pose: Pose = Pose()
+    backdrop: Backdrop = Backdrop()
+    water: Water = Water()
+    gate: Window = Window()
+    exposure: Exposure = Exposure()
+    frames: Frames = Frames()
+    vary: dict[str, Annotated[Distribution, BeforeValidator(_distribution)]] = Field(
+        default_factory=dict, description='further fields of the scene: "laser.preset" = ["paper", ...]'
+    )
+    scene: dict[str, Any] = Field(..., description="the scene without targets and gate, as in a scene file")
+    _source: Path | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for name in ("targets", "gate"):
+            if name in self.scene:
+                raise ValueError(f"scene.{name} is not the scene's: the recipe's own [{name}] says it")
+        for field in self.vary:
+            if field in ("camera.width", "camera.height") or field.split(".")[0] in ("gate", "targets"):
+                raise ValueError(f"vary.{field} cannot vary")
+        return self
+
+    @property
+    def source(self) -> Path | None:
+        """The file that the recipe came from."""
+        return self._source
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Recipe:
+        """A recipe from tables as TOML gives them; relative paths in them start at `source`'s folder.
+
+        Raises `ConfigError` with a line for each problem.
+        """
+        name = None if source is None else str(source)
+        try:
+            recipe = cls.model_validate(dict(tables))
+        except ValidationError as error:
+            raise ConfigError(describe(error, cls, {}), source=name) from None
+        recipe._source = None if source is None else Path(source)
+        try:
+            recipe.template()
+        except ConfigError as error:
+            raise ConfigError([f"scene: {line}" for line in error.problems], source=name) from None
+        return recipe
+
+    def template(self) -> Scene:
+        """The scene before anything is drawn, without targets, its gate from 0 to 1 ns."""
+        tables = {
+            **self.scene,
+            "gate": {"start_ns": 0.0, "bin_width_ps": 1000.0 / self.gate.bins, "bins": self.gate.bins},
+        }
+        return Scene.from_dict(tables)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Tables from which `from_dict` makes an equal recipe."""
+        return super().to_dict()
+
+    def __eq__(self, other: object) -> bool:
+        """Equal in every field; where it came from does not matter."""
+        return isinstance(other, Recipe) and self.to_dict() == other.to_dict()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def to_toml(self) -> str:
+        """The full text that `load_recipe` reads back to an equal recipe."""
+        return _toml(self.to_dict())
+
+    def with_overrides(self, overrides: Mapping[str, Any] | list[str] | tuple[str, ...]) -> Recipe:
+        """A changed recipe: `["seed=7", "frames.per_scene=2"]` or `{"frames.per_scene": 2}`. Raises `ConfigError`."""
+        pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
+        tables = self.to_dict()
+        for key, value in pairs:
+            parts = [str(part) for part in (key.split(".") if isinstance(key, str) else key)]
+            inner = tables
+            for part in parts[:-1]:
+                inner = inner.setdefault(part, {})
+                if not isinstance(inner, dict):
+                    raise ConfigError(f"{'.'.join(parts)} is not a field of a recipe")
+            inner[parts[-1]] = value
+        return Recipe.from_dict(tables, source=self.source)
+
+
+def load_recipe(path: str | os.PathLike[str]) -> Recipe:
+    """Reads a recipe. Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it."""
+    try:
+        tables = tomllib.loads(Path(path).read_bytes().decode())
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+    return Recipe.from_dict(tables, source=path)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, _Table):
+        return value.to_dict()
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _toml(tables: Mapping[str, Any]) -> str:
+    """TOML of a recipe: its own fields, then tables; the scene's sections are tables of their own."""
+
+    def lines(fields: Mapping[str, Any]) -> list[str]:
+        return [f"{_key(name)} = {_inline(value)}" for name, value in fields.items()]
+
+    blocks = ["\n".join(lines({name: value for name, value in tables.items() if not isinstance(value, dict)}))]
+    for name, fields in tables.items():
+        if isinstance(fields, dict) and name == "scene":
+            blocks += ["\n".join([f"[scene.{section}]", *lines(inner)]) for section, inner in fields.items()]
+        elif isinstance(fields, dict) and fields:
+            blocks.append("\n".join([f"[{name}]", *lines(fields)]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else toml_value(name)
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + " }"
+    return toml_value(value)
