@@ -164,18 +164,26 @@ def write_shard(
 def write_scene_index(plan: Plan, folder: Path) -> dict[str, Any]:
     """`scenes.h5`: the scenes of all shards as one, by reference; rows of shards that are not there are NaN or 0."""
     import h5py
+    from h5py import h5d, h5p, h5s, h5t
 
     with atomic_path(folder / "scenes.h5") as temporary, h5py.File(temporary, "w", libver=_LIBRARY) as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
         for name, (shape, kind, unit, text) in scene_columns(plan).items():
-            dtype = np.dtype(kind)
-            layout = h5py.VirtualLayout(shape=(plan.scene_count, *shape), dtype=dtype)
+            # h5py's own virtual datasets hold the time of day.
+            how = h5p.create(h5p.DATASET_CREATE)
+            how.set_layout(h5d.VIRTUAL)
+            how.set_obj_track_times(False)
+            whole, rest = (plan.scene_count, *shape), (0,) * len(shape)
             for shard in plan.shards:
-                source = h5py.VirtualSource(shard.scenes_file, name, shape=(shard.scenes, *shape), dtype=dtype)
-                layout[shard.first_scene : shard.first_scene + shard.scenes] = source
-            empty = np.nan if dtype.kind == "f" else None
-            one = file.create_virtual_dataset(name, layout, fillvalue=empty)
-            one.attrs.update({"unit": unit, "description": text})
+                part = (shard.scenes, *shape)
+                place = h5s.create_simple(whole)
+                place.select_hyperslab((shard.first_scene, *rest), part)
+                how.set_virtual(place, shard.scenes_file.encode(), name.encode(), h5s.create_simple(part))
+            dtype = np.dtype(kind)
+            if dtype.kind == "f":
+                how.set_fill_value(np.array([np.nan], dtype))
+            h5d.create(file.id, name.encode(), h5t.py_create(dtype, logical=True), h5s.create_simple(whole), how)
+            file[name].attrs.update({"unit": unit, "description": text})
     return checksum(folder / "scenes.h5")
 
 
