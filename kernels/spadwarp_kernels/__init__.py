@@ -17,10 +17,12 @@ from .launch import (
     launch_transport,
     load_transport_kernel,
     make_data,
+    make_layers,
     make_records,
     make_surfaces,
     read_ledger,
 )
+from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
 from .medium import Medium, free_path
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -67,6 +69,7 @@ __all__ = [
     "Gate",
     "Guiding",
     "Laser",
+    "Layers",
     "Limits",
     "Medium",
     "Model",
@@ -84,9 +87,14 @@ __all__ = [
     "intersect_mesh_aimed",
     "lambert_brdf",
     "launch_transport",
+    "layer_index",
+    "layered_extinction",
+    "layered_free_path",
+    "layered_water",
     "lens_point",
     "load_transport_kernel",
     "make_data",
+    "make_layers",
     "make_records",
     "make_surfaces",
     "make_transport_kernel",

@@ -1,6 +1,7 @@
 """Launching the transport kernel: what it takes (Model), what it writes (Data), and the call itself."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import warp as wp
 
@@ -9,6 +10,7 @@ from .domain import Limits
 from .gate import Gate
 from .guided import Guiding
 from .laser import Laser
+from .layers import Layers
 from .medium import Medium
 from .shadow import near_depth_map
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
@@ -25,6 +27,7 @@ class Model:
         mesh: Target, or None for water alone; kept here so that its BVH lives as long as the model.
         surfaces: The struct that kernels take, made from the mesh by `make_surfaces`.
         scale: Tally units per emitted photon.
+        layers: Of a layered spec, from `make_layers`; empty otherwise.
     """
 
     device: wp.Device
@@ -37,6 +40,7 @@ class Model:
     mesh: wp.Mesh | None
     surfaces: Surfaces
     scale: float
+    layers: Layers = field(default_factory=Layers)
 
     @property
     def tally_size(self) -> int:
@@ -85,6 +89,27 @@ def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
     records.collisions = wp.zeros(count, dtype=int, device=device)
     records.reason = wp.zeros(count, dtype=int, device=device)
     return records
+
+
+def make_layers(
+    start: Sequence[float],
+    extinction: Sequence[float],
+    albedo: Sequence[float],
+    anisotropy: Sequence[float],
+    *,
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    device: wp.DeviceLike = None,
+) -> Layers:
+    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning."""
+    columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
+    if len({len(column) for column in columns.values()}) > 1:
+        sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
+        raise ValueError(f"layers: {sizes} entries; one each for every layer are needed")
+    layers = Layers()
+    layers.axis = wp.vec3(*axis)
+    for name, column in columns.items():
+        setattr(layers, name, wp.array(column, dtype=float, device=device))
+    return layers
 
 
 def make_surfaces(
@@ -160,6 +185,7 @@ def launch_transport(
         dim=threads,
         inputs=[
             model.medium,
+            model.layers,
             model.laser,
             model.camera,
             model.gate,

@@ -18,7 +18,8 @@ from .domain import Limits, exit_distance, exit_face
 from .gate import Gate, gate_bin
 from .guided import Guiding, clip_flight, sample_flight
 from .laser import Laser, emit_photon
-from .medium import Medium, free_path
+from .layers import HOMOGENEOUS, LAYERED, Layers
+from .medium import Medium
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import (
     STREAM_FLIGHT_SAMPLE,
@@ -86,6 +87,7 @@ class TransportSpec(NamedTuple):
         bounded: Honour the domain and the lateral limit.
         roulette: Russian roulette in place of the weight cut-off.
         records: Write the terminal state of each photon.
+        layered: The water is that of the layers, not that of the medium.
     """
 
     estimator: str = "next_event"
@@ -96,6 +98,7 @@ class TransportSpec(NamedTuple):
     bounded: bool = False
     roulette: bool = False
     records: bool = False
+    layered: bool = False
 
 
 @wp.struct
@@ -215,7 +218,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     analog = spec.estimator == "analog"
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
-    paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:]
+    paper_albedo, has_mesh, few_faces, bounded, roulette, records, layered = spec[2:]
+    local_albedo = layered and not paper_albedo
+    water_free_path, water_extinction, water_at = LAYERED if layered else HOMOGENEOUS
     # A handful of faces is tried on the spot; rays for a BVH wait until the warp has enough of them.
     has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
@@ -230,6 +235,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     def transport(
         # Model:
         medium: Medium,
+        layers: Layers,
         laser: Laser,
         camera: Camera,
         gate: Gate,
@@ -261,7 +267,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     id = first_id + wp.uint64(s.photon)
                     s.block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
                     s.face = -1
-                    s.distance = free_path(u01(s.block[0]), medium.extinction)
+                    s.distance = water_free_path(medium, layers, s.x, s.u, u01(s.block[0]))
                     limit = limits.max_path - s.path
                     if wp.static(bounded):
                         limit = wp.min(limit, exit_distance(limits, s.x, s.u))
@@ -275,7 +281,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.lens = lens_point(camera, u01(s.sample_block[2]), u01(s.sample_block[3]))
                         s.dither = u01_last(s.sample_block[2])
                         s.interval = clip_flight(camera, gate, s.x, s.u, s.path, s.lens, limit)
-                        if s.interval[0] < s.interval[1] and medium.extinction > 0.0:
+                        if s.interval[0] < s.interval[1] and (wp.static(layered) or medium.extinction > 0.0):
                             s.stage = _FLIGHT_SAMPLE
                             s.reach = wp.max(s.reach, s.interval[1])
                     if wp.static(has_mesh):
@@ -297,11 +303,18 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.stage = _EVENT
                         if s.interval[0] < s.interval[1]:
                             g = medium.anisotropy
+                            # Layers: a density with the mean extinction; what is scored weighs with the exact one.
                             flight = sample_flight(
                                 s.x - s.lens,
                                 s.u,
                                 s.interval,
-                                medium.extinction,
+                                water_extinction(
+                                    medium,
+                                    layers,
+                                    s.x + s.interval[0] * s.u,
+                                    s.u,
+                                    s.interval[1] - s.interval[0],
+                                ),
                                 (1.0 - g) * (1.0 - g) / wp.max(g, 0.05),
                                 u01(s.sample_block[0]),
                                 u01_fine(s.sample_block[1]),
@@ -312,12 +325,22 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
                                 t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
+                                if wp.static(local_albedo):
+                                    s.albedo = water_at(medium, layers, y).albedo
                                 weight_there = (
-                                    s.weight * s.albedo * medium.extinction * wp.exp(-medium.extinction * s.along)
+                                    s.weight
+                                    * s.albedo
+                                    * water_at(medium, layers, y).extinction
+                                    * wp.exp(-water_extinction(medium, layers, s.x, s.u, s.along) * s.along)
                                 )
                                 s.pending_value = (
                                     next_event_value(
-                                        camera, medium.extinction, weight_there, phase_pdf(t, medium), to_lens, flight.r
+                                        camera,
+                                        water_extinction(medium, layers, y, to_lens, flight.r),
+                                        weight_there,
+                                        phase_pdf(t, water_at(medium, layers, y)),
+                                        to_lens,
+                                        flight.r,
                                     )
                                     / flight.density
                                 )
@@ -369,6 +392,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.path += s.distance
                         s.collisions += 1
                         s.stage = _SCATTER
+                        if wp.static(local_albedo):
+                            s.albedo = water_at(medium, layers, s.x).albedo
                         if wp.static(has_mesh):
                             if s.face >= 0:
                                 s.x = offset_from_surface(s.x, s.normal, s.distance)
@@ -398,13 +423,20 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                             component = BALLISTIC
                                     else:
                                         snapped = snap_direction(s.u, medium.axis_threshold)
-                                        scattering = s.albedo * phase_pdf(one_minus_cosine(snapped, to_lens), medium)
+                                        scattering = s.albedo * phase_pdf(
+                                            one_minus_cosine(snapped, to_lens), water_at(medium, layers, s.x)
+                                        )
                                         if s.surface_count == 0:
                                             component = BACKSCATTER
                                     if scattering > 0.0:
                                         s.along = 0.0
                                         s.pending_value = next_event_value(
-                                            camera, medium.extinction, s.weight, scattering, to_lens, r
+                                            camera,
+                                            water_extinction(medium, layers, s.x, to_lens, r),
+                                            s.weight,
+                                            scattering,
+                                            to_lens,
+                                            r,
                                         )
                                         s.pending_index = tally_index(camera, gate, pixel, s.path + r, component)
                                         s.contributions += 1
@@ -481,7 +513,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])
-                            t = phase_sample(u01_fine(s.block[1]), medium)
+                            t = phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x))
                             axis = snapped
                             if choice < to_lens_chance:
                                 axis = v
@@ -493,7 +525,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
                                 s.u = rotate_direction(axis, t, u01(s.block[2]))
-                            density = phase_pdf(one_minus_cosine(snapped, s.u), medium)
+                            density = phase_pdf(one_minus_cosine(snapped, s.u), water_at(medium, layers, s.x))
                             if on_surface:
                                 density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
                             mixture = (1.0 - to_lens_chance - to_view_chance) * density
@@ -516,7 +548,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
                                 s.u = rotate_direction(
-                                    snapped, phase_sample(u01_fine(s.block[1]), medium), u01(s.block[2])
+                                    snapped,
+                                    phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x)),
+                                    u01(s.block[2]),
                                 )
 
                 waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)

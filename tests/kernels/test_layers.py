@@ -1,0 +1,92 @@
+"""Flights through layers against sums in float64, and against the homogeneous functions bit for bit."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import spadwarp_kernels as sk
+from statistics_of_samples import DEVICES
+
+AXIS = np.array([0.36, -0.48, 0.8])
+START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read
+EXTINCTION = [0.2, 1.5, 0.05, 4.0, 0.7]
+COUNT = 20_000
+
+
+@wp.kernel(enable_backward=False)
+def fly(
+    medium: sk.Medium,
+    layers: sk.Layers,
+    x: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    xi: wp.array(dtype=float),
+    distance: wp.array(dtype=float),
+    homogeneous: wp.array(dtype=float),
+    mean: wp.array(dtype=float),
+    index: wp.array(dtype=int),
+):
+    """Free path, that of the medium alone, mean extinction along it, layer at its begin. Launch: rays."""
+    i = wp.tid()
+    distance[i] = sk.layered_free_path(medium, layers, x[i], u[i], xi[i])
+    homogeneous[i] = sk.free_path(xi[i], medium.extinction)
+    mean[i] = sk.layered_extinction(medium, layers, x[i], u[i], distance[i])
+    index[i] = sk.layer_index(layers, wp.dot(layers.axis, x[i]))
+
+
+def rays():
+    rng = np.random.default_rng(4)
+    x = rng.uniform(-4.0, 4.0, (COUNT, 3)).astype(np.float32)
+    u = rng.normal(size=(COUNT, 3))
+    u[:200] = np.cross(u[:200], AXIS)  # along the layers
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return x, u.astype(np.float32), rng.random(COUNT, dtype=np.float32)
+
+
+def flown(device, extinction):
+    x, u, xi = rays()
+    medium = sk.Medium()
+    medium.extinction = extinction[0]
+    layers = sk.make_layers(START, extinction, [0.5] * 5, [0.9] * 5, axis=AXIS, device=device)
+    out = [wp.zeros(COUNT, dtype=kind, device=device) for kind in (float, float, float, int)]
+    rays_there = [wp.array(a, dtype=kind, device=device) for a, kind in ((x, wp.vec3), (u, wp.vec3), (xi, float))]
+    wp.launch(fly, COUNT, inputs=[medium, layers, *rays_there], outputs=out, device=device)
+    return [one.numpy() for one in out]
+
+
+def optical_depth(x, u, length):
+    """Of the stretches of each ray in each layer, cut out one by one."""
+    along, slope = x.astype(float) @ AXIS, u.astype(float) @ AXIS
+    edges = np.array([-np.inf, *START[1:], np.inf])
+    total = np.zeros(len(x))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for low, high, extinction in zip(edges[:-1], edges[1:], EXTINCTION, strict=True):
+            cuts = np.sort([(low - along) / slope, (high - along) / slope], axis=0)
+            stretch = np.minimum(cuts[1], length) - np.maximum(cuts[0], 0.0)
+            total += extinction * np.maximum(stretch, 0.0)
+    return total
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_free_paths_end_where_the_optical_depth_is_reached(device):
+    x, u, xi = rays()
+    distance, _, mean, index = flown(device, EXTINCTION)
+    assert np.isfinite(distance).all() and (distance >= 0.0).all()
+    np.testing.assert_array_equal(index, np.searchsorted(START[1:], x.astype(float) @ AXIS, side="right"))
+    wanted = -np.log1p(-xi.astype(float))
+    np.testing.assert_allclose(optical_depth(x, u, distance), wanted, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(mean * distance, wanted, rtol=1e-4, atol=1e-5)
+    # Flights begin in every layer.
+    assert (np.bincount(index) > 200).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_layers_of_one_extinction_are_no_layers(device):
+    """The same bits as without them, whatever the boundaries."""
+    distance, homogeneous, mean, _ = flown(device, [0.7] * 5)
+    np.testing.assert_array_equal(distance, homogeneous)
+    np.testing.assert_array_equal(mean, np.float32(0.7))
+
+
+def test_lists_of_different_lengths_are_refused():
+    with pytest.raises(ValueError, match="start 2, extinction 1, albedo 2, anisotropy 2"):
+        sk.make_layers([0.0, 1.0], [0.3], [0.5, 0.5], [0.9, 0.9], device="cpu")
