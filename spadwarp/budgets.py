@@ -116,7 +116,7 @@ def budget(
         scene: Laser, camera, detector, gate and `[analytic]` settings are taken from it; the target's shape is not.
         ranges: Distances on the optical axis [m], > 0; default 1 to 50 m.
         media: Names of presets, or name → fields of `[medium]`; default: the scene's water alone.
-        reflectance: Of the face, in [0, 1]; default: that of the scene's first target, else 0.5.
+        reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
         device: Warp device; default: the first GPU, else the CPU.
 
     Returns:
@@ -130,7 +130,8 @@ def budget(
     if distances.size == 0 or not ((distances > 0) & np.isfinite(distances)).all():
         raise ValueError(f"ranges = {distances.tolist()} are not all in (0, inf)")
     if reflectance is None:
-        reflectance = scene.targets[0].reflectance if scene.targets else 0.5
+        given = scene.targets[0].reflectance if scene.targets else 0.5
+        reflectance = 0.5 if given == "from_file" else given
     if not 0 <= reflectance <= 1:
         raise ValueError(f"reflectance = {reflectance} is outside [0, 1]")
     if scene.analytic.backscatter == "monte_carlo":

@@ -94,6 +94,7 @@ class _Shape:
             mesh = build_mesh(scene)
         self.scene = scene
         self.target = np.zeros(0, dtype=np.int32) if mesh is None else mesh.target
+        self.reflectance = np.zeros(0) if mesh is None else mesh.reflectance
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         self.view = view_planes(scene.camera)
         self.beam = beam_planes(scene.laser)
@@ -148,7 +149,7 @@ class _Shape:
         if self.target_range is None or self.target_range[0] == 0.0:
             return None
         scene, distance = self.scene, self.target_range[0]
-        reflectance = max(target.reflectance for target in scene.targets)
+        reflectance = float(self.reflectance.max())
         collected = reflectance / math.pi * scene.camera.aperture_area / distance**2  # Lambertian, towards the lens
         fraction = self._pixel_share(distance) * math.exp(-2.0 * scene.medium.extinction * distance) * collected
         return fraction * scene.laser.photons_per_pulse * scene.detector.pde

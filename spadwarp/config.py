@@ -399,7 +399,17 @@ class Target(Section):
         (0.0, 0.0, 0.0), description="turns about the target's own x, then the turned y, then z [°]"
     )
     translation: Vector = Field((0.0, 0.0, 0.0), description="shift in the camera frame [m]")
-    reflectance: float = Field(0.5, ge=0, le=1, description="Lambertian reflectance of both sides")
+    reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = Field(
+        0.5, description='Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file'
+    )
+    reflectance_scale: float = Field(1.0, gt=0, description='factor on the reflectance "from_file"')
+    colour_encoding: Literal["srgb", "linear"] = Field(
+        "srgb", description='how the file\'s colours and images stand for reflectance; "linear" is proportional'
+    )
+    specular: float = Field(
+        0.0, ge=0, le=1, description="reflectance of the facets of a rough specular lobe; 0 is none"
+    )
+    roughness: float = Field(0.2, ge=0.01, le=1, description="width of that lobe: GGX parameter α")
 
     @model_validator(mode="after")
     def _one_mesh(self) -> Self:
@@ -409,6 +419,16 @@ class Target(Section):
             raise ValueError(f"scale = {list(self.scale)} holds a zero")
         if self.size is not None and self.builtin is None:
             raise ValueError(f"size = {list(self.size)} goes with builtin only; a mesh file takes scale")
+        if self.reflectance == "from_file":
+            if self.mesh is None:
+                raise ValueError("reflectance = 'from_file' goes with mesh only; a builtin takes a number")
+        elif self.reflectance + self.specular > 1:
+            raise ValueError(
+                f"specular = {self.specular:g} and reflectance = {self.reflectance:g} reflect more than arrives:"
+                " their sum is outside [0, 1]"
+            )
+        elif self.reflectance_scale != 1:
+            raise ValueError(f"reflectance_scale = {self.reflectance_scale:g} goes with reflectance = 'from_file' only")
         return self
 
 

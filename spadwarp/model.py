@@ -53,6 +53,9 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
         lower, upper = mesh.bounds.astype(float)
         gap = float(np.linalg.norm(np.maximum(np.maximum(lower, -upper), 0.0)))
         surface = 1.0 / (math.pi * max(gap, nearest) ** 2)
+        if mesh.specular is not None and mesh.roughness is not None:
+            # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
+            surface *= max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
     path = 2.0 * nearest
     brightest = 16.0 * camera.aperture_area * max(water, surface) * math.exp(-medium.extinction * path) / lit
     brightest = min(max(brightest, 1e-30), 1.0)
@@ -143,6 +146,7 @@ def build_model(
             device_mesh,
             wp.array(mesh.reflectance, dtype=float, device=device),
             camera=lens if camera else None,
+            **_appearance(mesh, device),
         )
     model = sk.Model(
         device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
@@ -150,6 +154,25 @@ def build_model(
     if camera:
         _check_size(scene, model, copies)
     return model
+
+
+def _appearance(mesh: TriangleMesh, device: wp.Device) -> dict[str, Any]:
+    """What `make_surfaces` takes beyond one reflectance a face."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    arrays: dict[str, Any] = {}
+    if mesh.specular is not None and mesh.roughness is not None:
+        arrays["specular"] = wp.array(mesh.specular, dtype=float, device=device)
+        arrays["roughness"] = wp.array(mesh.roughness, dtype=float, device=device)
+    if mesh.pattern is not None:
+        arrays["corner_reflectance"] = wp.array(mesh.pattern.corners, dtype=wp.vec3, device=device)
+        if mesh.pattern.images:
+            arrays["textures"] = sk.make_textures(
+                mesh.pattern.texture, mesh.pattern.coordinates, mesh.pattern.images, device=device
+            )
+    return arrays
 
 
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
@@ -163,6 +186,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,
         bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),
         roulette=scene.transport.termination == "roulette",
+        pattern=mesh is not None and mesh.pattern is not None,
+        specular=mesh is not None and mesh.specular is not None,
     )
     return spec._replace(**choices)
 
@@ -190,7 +215,7 @@ def trace_truth(scene: Scene, model: Model) -> Truth:
     wp.launch(
         sk.truth_kernel,
         dim=shape,
-        inputs=[model.camera, model.mesh.id, model.surfaces.reflectance],
+        inputs=[model.camera, model.surfaces],
         outputs=[depth, distance, normal, reflectance],
         device=model.device,
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.appearance import Images, Pattern, read_coloured_mesh
 from spadwarp.errors import MeshError
 
 if TYPE_CHECKING:
@@ -32,12 +33,18 @@ class TriangleMesh:
         faces: int32 `[F, 3]`, indices into `vertices`.
         reflectance: float32 `[F]`, Lambertian reflectance of both sides, in [0, 1].
         target: int32 `[F]`, index into `scene.targets`.
+        pattern: Where the reflectance varies within faces; `reflectance` then has their means over the corners, times
+            the mean of the face's image.
+        specular, roughness: float32 `[F]`, of the specular lobe; None if no target has one.
     """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
     reflectance: NDArray[np.float32]
     target: NDArray[np.int32]
+    pattern: Pattern | None = None
+    specular: NDArray[np.float32] | None = None
+    roughness: NDArray[np.float32] | None = None
 
     @property
     def face_count(self) -> int:
@@ -59,19 +66,25 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
     """
     parts: list[TriangleMesh] = []
     vertex_count = 0
+    varied = any(target.reflectance == "from_file" for target in scene.targets)
+    lobes = any(target.specular > 0 for target in scene.targets)
     for index, target in enumerate(scene.targets):
         field = f"targets[{index}]" if scene.source is None else f"{scene.source}: targets[{index}]"
-        mesh = load_target(target, field=field)
+        mesh, images = _load(target, field, scene.laser.wavelength_nm)
         faces = np.asarray(mesh.faces, dtype=np.int64) + vertex_count
         vertex_count += len(mesh.vertices)
         if vertex_count > MAX_FACES or sum(part.face_count for part in parts) + len(faces) > MAX_FACES:
             raise MeshError(f"{field}: the targets have more than {MAX_FACES} faces or vertices together")
+        pattern = _pattern(mesh, images, target, field) if varied else None
         parts.append(
             TriangleMesh(
                 vertices=np.asarray(mesh.vertices, dtype=np.float32),
                 faces=faces.astype(np.int32),
-                reflectance=np.full(len(faces), target.reflectance, dtype=np.float32),
+                reflectance=_number(target, len(faces)) if pattern is None else _means(pattern),
                 target=np.full(len(faces), index, dtype=np.int32),
+                pattern=pattern,
+                specular=np.full(len(faces), target.specular, dtype=np.float32) if lobes else None,
+                roughness=np.full(len(faces), target.roughness, dtype=np.float32) if lobes else None,
             )
         )
     if not parts:
@@ -81,7 +94,63 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
         faces=np.concatenate([part.faces for part in parts]),
         reflectance=np.concatenate([part.reflectance for part in parts]),
         target=np.concatenate([part.target for part in parts]),
+        pattern=_join([part.pattern for part in parts if part.pattern is not None]),
+        specular=_concatenate([part.specular for part in parts]),
+        roughness=_concatenate([part.roughness for part in parts]),
     )
+
+
+def _number(target: Target, count: int) -> NDArray[np.float32]:
+    return np.full(count, target.reflectance, dtype=np.float32)
+
+
+def _concatenate(arrays: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:
+    given = [array for array in arrays if array is not None]
+    return np.concatenate(given) if given else None
+
+
+def _pattern(mesh: trimesh.Trimesh, images: Images, target: Target, field: str) -> Pattern:
+    """The reflectance of a loaded target's faces."""
+    count = len(mesh.faces)
+    texture, coordinates = np.full(count, -1, dtype=np.int32), np.zeros((count, 3, 2), dtype=np.float32)
+    if target.reflectance != "from_file":
+        return Pattern(np.repeat(_number(target, count)[:, None], 3, axis=1), texture, coordinates, ())
+    surface: NDArray[np.float64] = np.asarray(mesh.vertex_attributes["surface"])[mesh.faces]
+    corners = surface[:, :, 0] * target.reflectance_scale
+    texture = surface[:, 0, 1].round().astype(np.int32)
+    coordinates = np.ascontiguousarray(surface[:, :, 2:], dtype=np.float32)
+    brightest = np.array([*(image.max() for image in images), 1.0], dtype=np.float64)[texture]
+    highest = float((corners.max(axis=1) * brightest).max())
+    if highest + target.specular > 1.0 + 1e-6:
+        raise MeshError(
+            f"{field}: the file's reflectance reaches {highest / target.reflectance_scale:.4g}; times"
+            f" reflectance_scale = {target.reflectance_scale:g}, plus specular = {target.specular:g}, that is"
+            f" {highest + target.specular:.4g}, outside [0, 1]"
+        )
+    return Pattern(corners.astype(np.float32), texture, coordinates, images)
+
+
+def _means(pattern: Pattern) -> NDArray[np.float32]:
+    """One reflectance a face: exact where it does not vary."""
+    means = pattern.corners.mean(axis=1, dtype=np.float64)
+    flat = (pattern.corners == pattern.corners[:, :1]).all(axis=1)
+    means[flat] = pattern.corners[flat, 0]
+    brightness = np.array([*(image.mean() for image in pattern.images), 1.0], dtype=np.float64)
+    return (means * brightness[pattern.texture]).astype(np.float32)
+
+
+def _join(patterns: Sequence[Pattern]) -> Pattern | None:
+    """All targets' patterns as one; None if no face's reflectance varies."""
+    if not patterns:
+        return None
+    corners = np.concatenate([pattern.corners for pattern in patterns])
+    before = np.cumsum([0, *(len(pattern.images) for pattern in patterns)])
+    textures = [np.where(p.texture < 0, -1, p.texture + n) for p, n in zip(patterns, before, strict=False)]
+    texture = np.concatenate(textures).astype(np.int32)
+    if (texture < 0).all() and (corners == corners[:, :1]).all():
+        return None
+    coordinates = np.concatenate([pattern.coordinates for pattern in patterns])
+    return Pattern(corners, texture, coordinates, tuple(image for pattern in patterns for image in pattern.images))
 
 
 def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
@@ -100,8 +169,20 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     Raises:
         MeshError: Missing or unreadable file, unknown built-in, or a mesh that is empty, not finite or has no area.
     """
+    return _load(target, field)[0]
+
+
+def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[trimesh.Trimesh, Images]:
+    """`load_target`, and the images of a file that gives the reflectance."""
+    images: Images = ()
     if target.mesh is not None:
-        name, mesh = f"{field}.mesh = {target.mesh!r}", _read_mesh(Path(target.mesh), field)
+        name, path = f"{field}.mesh = {target.mesh!r}", Path(target.mesh)
+        if not path.is_file():
+            raise MeshError(f"{name}: {'is not a file' if path.exists() else 'no such file'}")
+        if target.reflectance == "from_file":
+            mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
+        else:
+            mesh = _read_mesh(path, name)
     else:
         name, mesh = f"{field}.builtin = {target.builtin!r}", _make_builtin(str(target.builtin), field)
         if target.size is not None and target.builtin not in SIZED_BUILTINS:
@@ -138,7 +219,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
             warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
         mesh.update_faces(solid)
     mesh.remove_unreferenced_vertices()
-    return mesh
+    return mesh, images
 
 
 def builtin_names() -> tuple[str, ...]:
@@ -173,13 +254,10 @@ def _placement(
     return matrix
 
 
-def _read_mesh(path: Path, field: str) -> trimesh.Trimesh:
+def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     """A mesh file in the file's own units and axes; several objects in it become one."""
     import trimesh
 
-    name = f"{field}.mesh = {str(path)!r}"
-    if not path.is_file():
-        raise MeshError(f"{name}: {'is not a file' if path.exists() else 'no such file'}")
     try:
         mesh = trimesh.load_mesh(path, process=False)  # processing drops what is not finite without a word
     except Exception as error:  # what trimesh raises depends on the format and its parser

@@ -20,10 +20,13 @@ from .launch import (
     make_layers,
     make_records,
     make_surfaces,
+    make_textures,
     read_ledger,
+    surface_choices,
 )
 from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
 from .medium import Medium, free_path
+from .microfacet import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
 from .phase import (
     HENYEY_GREENSTEIN,
     PhaseFunction,
@@ -34,10 +37,13 @@ from .philox import philox4x32, random_block, u01, u01_fine
 from .shadow import near_depth_map
 from .surface import (
     SurfaceHit,
+    Surfaces,
+    Textures,
     intersect_mesh,
     intersect_mesh_aimed,
     lambert_brdf,
     offset_from_surface,
+    reflectance_at,
     segment_meets_box,
 )
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
@@ -46,7 +52,6 @@ from .transport import (
     ESTIMATORS,
     FEW_FACES,
     Records,
-    Surfaces,
     TransportSpec,
     make_transport_kernel,
     next_event_value,
@@ -77,11 +82,15 @@ __all__ = [
     "Records",
     "SurfaceHit",
     "Surfaces",
+    "Textures",
     "TransportSpec",
     "emit_photon",
     "exit_distance",
     "free_path",
     "gate_bin",
+    "ggx_brdf",
+    "ggx_normals",
+    "ggx_pdf",
     "henyey_greenstein_pdf",
     "intersect_mesh",
     "intersect_mesh_aimed",
@@ -97,6 +106,7 @@ __all__ = [
     "make_layers",
     "make_records",
     "make_surfaces",
+    "make_textures",
     "make_transport_kernel",
     "near_depth_map",
     "next_event_value",
@@ -108,13 +118,17 @@ __all__ = [
     "project",
     "random_block",
     "read_ledger",
+    "reflectance_at",
     "rotate_direction",
+    "sample_ggx",
     "sample_henyey_greenstein",
     "sample_lambert",
     "segment_meets_box",
     "snap_direction",
+    "surface_choices",
     "to_fixed_point",
     "truth_kernel",
     "u01",
     "u01_fine",
+    "unshadowed",
 ]

@@ -21,6 +21,7 @@ STREAM_ROULETTE = wp.constant(wp.uint32(3))
 STREAM_LENS = wp.constant(wp.uint32(4))
 STREAM_DETECTOR = wp.constant(wp.uint32(5))
 STREAM_ANALYTIC = wp.constant(wp.uint32(6))
+STREAM_SURFACE = wp.constant(wp.uint32(7))
 STREAM_FRAMES = wp.constant(wp.uint32(16))
 
 

@@ -20,11 +20,13 @@ from .guided import Guiding, clip_flight, sample_flight
 from .laser import Laser, emit_photon
 from .layers import HOMOGENEOUS, LAYERED, Layers
 from .medium import Medium
+from .microfacet import ggx_brdf, reflection_pdf, sample_reflection, unshadowed
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import (
     STREAM_FLIGHT_SAMPLE,
     STREAM_LENS,
     STREAM_ROULETTE,
+    STREAM_SURFACE,
     STREAM_TRANSPORT,
     random_block,
     u01,
@@ -34,7 +36,16 @@ from .philox import (
     u01_low,
 )
 from .shadow import may_be_hidden
-from .surface import intersect_faces, intersect_mesh, lambert_brdf, offset_from_surface, segment_meets_box
+from .surface import (
+    Surfaces,
+    face_reflectance,
+    intersect_faces,
+    intersect_mesh,
+    lambert_brdf,
+    offset_from_surface,
+    pattern_reflectance,
+    segment_meets_box,
+)
 from .tally import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,
@@ -88,6 +99,8 @@ class TransportSpec(NamedTuple):
         roulette: Russian roulette in place of the weight cut-off.
         records: Write the terminal state of each photon.
         layered: The water is that of the layers, not that of the medium.
+        pattern: The reflectance varies within faces: corners and textures.
+        specular: Faces have a rough specular lobe beside the Lambertian one.
     """
 
     estimator: str = "next_event"
@@ -99,6 +112,8 @@ class TransportSpec(NamedTuple):
     roulette: bool = False
     records: bool = False
     layered: bool = False
+    pattern: bool = False
+    specular: bool = False
 
 
 @wp.struct
@@ -120,24 +135,6 @@ class Records:
     path: wp.array(dtype=float)
     collisions: wp.array(dtype=int)
     reason: wp.array(dtype=int)
-
-
-@wp.struct
-class Surfaces:
-    """The target as the kernels take it.
-
-    Attributes:
-        mesh: Id of a `wp.Mesh`.
-        lower, upper: Its bounding box [m], padded against rounding.
-        reflectance: Of each face, in [0, 1].
-        near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
-    """
-
-    mesh: wp.uint64
-    lower: wp.vec3
-    upper: wp.vec3
-    reflectance: wp.array(dtype=float)
-    near_depth: wp.array2d(dtype=float)
 
 
 @wp.func
@@ -218,12 +215,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     analog = spec.estimator == "analog"
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
-    paper_albedo, has_mesh, few_faces, bounded, roulette, records, layered = spec[2:]
+    paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:8]
+    layered, pattern, specular = spec.layered, spec.pattern, spec.specular
     local_albedo = layered and not paper_albedo
     water_free_path, water_extinction, water_at = LAYERED if layered else HOMOGENEOUS
     # A handful of faces is tried on the spot; rays for a BVH wait until the warp has enough of them.
     has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
+    reflectance_at = pattern_reflectance if pattern else face_reflectance
     waiting_lanes = WAITING_LANES[has_bvh]
 
     @wp.kernel(
@@ -418,7 +417,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     component = int(FORWARD_SCATTERED)
                                     if s.face >= 0:
                                         cos_out = wp.max(wp.dot(to_lens, s.normal), 0.0)
-                                        scattering = lambert_brdf(surfaces.reflectance[s.face]) * cos_out
+                                        scattering = lambert_brdf(reflectance_at(surfaces, s.face, s.x)) * cos_out
+                                        if wp.static(specular):
+                                            scattering += (
+                                                surfaces.specular[s.face]
+                                                * ggx_brdf(s.u, to_lens, s.normal, surfaces.roughness[s.face])
+                                                * cos_out
+                                            )
                                         if s.collisions == 1:
                                             component = BALLISTIC
                                     else:
@@ -466,9 +471,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 if s.stage == _SCATTER and s.ray == _NO_RAY:
                     # The score took the photon as it arrived; now its weight, its end or its new direction.
                     survival = float(s.albedo)
+                    if wp.static(specular):
+                        lobe = float(0.0)
+                        incoming = wp.vec3(s.u)
                     if wp.static(has_mesh):
                         if s.face >= 0:
-                            survival = surfaces.reflectance[s.face]
+                            survival = reflectance_at(surfaces, s.face, s.x)
+                            if wp.static(specular):
+                                survival += surfaces.specular[s.face]
+                                lobe = surfaces.specular[s.face] / wp.max(survival, 1.0e-30)
                     s.weight *= survival
                     s.analog_weight *= survival
                     after = to_ledger(s.weight)
@@ -503,6 +514,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(has_mesh):
                             on_surface = s.face >= 0
                         snapped = snap_direction(s.u, medium.axis_threshold)
+                        if wp.static(specular):
+                            reflected = wp.vec3(s.u)
+                            if on_surface:
+                                id = first_id + wp.uint64(s.photon)
+                                draw = random_block(seed, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                                reflected = sample_reflection(
+                                    incoming, s.normal, surfaces.roughness[s.face], lobe, draw
+                                )
                         if wp.static(guided):
                             # Towards the lens, or back into the view, with some chance; the weight makes up for it.
                             v = -wp.normalize(s.x)
@@ -522,12 +541,17 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 axis = inward
                                 t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.return_anisotropy)
                             if on_surface and choice >= to_lens_chance + to_view_chance:
-                                s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
+                                if wp.static(specular):
+                                    s.u = reflected
+                                else:
+                                    s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
                                 s.u = rotate_direction(axis, t, u01(s.block[2]))
                             density = phase_pdf(one_minus_cosine(snapped, s.u), water_at(medium, layers, s.x))
                             if on_surface:
                                 density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
+                                if wp.static(specular):
+                                    density = reflection_pdf(incoming, s.u, s.normal, surfaces.roughness[s.face], lobe)
                             mixture = (1.0 - to_lens_chance - to_view_chance) * density
                             mixture += to_lens_chance * henyey_greenstein_pdf(
                                 one_minus_cosine(v, s.u), guiding.anisotropy
@@ -545,13 +569,29 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.stage = _END
                         else:
                             if on_surface:
-                                s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
+                                if wp.static(specular):
+                                    s.u = reflected
+                                else:
+                                    s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
                                 s.u = rotate_direction(
                                     snapped,
                                     phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x)),
                                     u01(s.block[2]),
                                 )
+
+                        if wp.static(specular):
+                            if on_surface:
+                                # What one facet takes of another's light stays in the surface.
+                                leaving = unshadowed(incoming, s.u, s.normal, surfaces.roughness[s.face], lobe)
+                                s.weight *= leaving
+                                s.analog_weight *= leaving
+                                after = to_ledger(s.weight)
+                                s.absorbed_surface += s.ledger_weight - after
+                                s.ledger_weight = after
+                                if s.weight <= 0.0 and s.stage == _FLIGHT:
+                                    s.reason = WEIGHT_CUTOFF
+                                    s.stage = _END
 
                 waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)
 

@@ -3,32 +3,31 @@
 import warp as wp
 
 from .camera import Camera, pixel_direction
-from .surface import intersect_mesh_aimed
+from .surface import Surfaces, intersect_mesh_aimed, reflectance_at
 
 
 @wp.kernel(enable_backward=False)
 def truth_kernel(
     camera: Camera,
-    mesh: wp.uint64,
-    reflectance: wp.array(dtype=float),
+    surfaces: Surfaces,
     # Out, [height, width]:
     depth: wp.array2d(dtype=float),
     range: wp.array2d(dtype=float),
     normal: wp.array2d(dtype=wp.vec3),
-    reflectance_out: wp.array2d(dtype=float),
+    reflectance: wp.array2d(dtype=float),
 ):
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
     width)."""
     row, column = wp.tid()
     u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
-    hit = intersect_mesh_aimed(mesh, wp.vec3(0.0), u, 1.0e30)
+    hit = intersect_mesh_aimed(surfaces.mesh, wp.vec3(0.0), u, 1.0e30)
     if hit.face >= 0:
         depth[row, column] = hit.distance * u[2]
         range[row, column] = hit.distance
         normal[row, column] = hit.normal
-        reflectance_out[row, column] = reflectance[hit.face]
+        reflectance[row, column] = reflectance_at(surfaces, hit.face, hit.distance * u)
     else:
         depth[row, column] = wp.NAN
         range[row, column] = wp.NAN
         normal[row, column] = wp.vec3(wp.NAN)
-        reflectance_out[row, column] = wp.NAN
+        reflectance[row, column] = wp.NAN
