@@ -4,8 +4,13 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 `wp.Mesh`.
 """
 
+from .analytic import sample_frames
+from .analytic_budget import BACKSCATTER_SOURCES, Lidar, signal_map, single_scatter_table
 from .batches import Batches
 from .camera import Camera, lens_point, pixel_direction, project
+from .cramer_rao import COUNT_LAWS, statistics_maps
+from .depth import arrival_bins
+from .detector import dark_count_rates, event_counts, expected_detections, first_photon_counts
 from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance
 from .gate import C0, Gate, gate_bin
@@ -59,9 +64,11 @@ from .transport import (
 from .truth import truth_kernel
 
 __all__ = [
+    "BACKSCATTER_SOURCES",
     "C0",
     "COMPONENTS",
     "COUNTERS",
+    "COUNT_LAWS",
     "ESTIMATORS",
     "FEW_FACES",
     "HENYEY_GREENSTEIN",
@@ -75,6 +82,7 @@ __all__ = [
     "Guiding",
     "Laser",
     "Layers",
+    "Lidar",
     "Limits",
     "Medium",
     "Model",
@@ -84,8 +92,13 @@ __all__ = [
     "Surfaces",
     "Textures",
     "TransportSpec",
+    "arrival_bins",
+    "dark_count_rates",
     "emit_photon",
+    "event_counts",
     "exit_distance",
+    "expected_detections",
+    "first_photon_counts",
     "free_path",
     "gate_bin",
     "ggx_brdf",
@@ -120,11 +133,15 @@ __all__ = [
     "read_ledger",
     "reflectance_at",
     "rotate_direction",
+    "sample_frames",
     "sample_ggx",
     "sample_henyey_greenstein",
     "sample_lambert",
     "segment_meets_box",
+    "signal_map",
+    "single_scatter_table",
     "snap_direction",
+    "statistics_maps",
     "surface_choices",
     "to_fixed_point",
     "truth_kernel",
