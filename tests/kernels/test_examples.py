@@ -60,7 +60,7 @@ def depth_camera():
 
 
 def test_depth_camera(depth_camera):
-    """Noise grows with distance from a fraction of a millimetre; no estimate where nothing was hit; frames are drawn anew."""
+    """Noise grows with distance; no estimate where nothing was hit; every frame is drawn anew."""
     _, camera, depth, normal = depth_camera
     frames = np.stack([camera.frame(depth, normal).numpy() for _ in range(60)])
     true = depth.numpy()
