@@ -24,12 +24,15 @@ _HOMES = {
     "check": "checks",
     "bench": "benchmark",
     "simulate": "simulation",
-    "trace": "simulation",
-    "PhotonRecords": "simulation",
+    "Ray": "engines",
+    "run_jobs": "engines",
+    "interruptible": "engines",
+    "trace": "records",
+    "PhotonRecords": "records",
     "truth_maps": "model",
     "devices": "hardware",
     "Result": "result",
-    "merge": "result",
+    "merge": "sums",
     "Truth": "result",
     "load_result": "files",
     "detect": "detector",
@@ -77,14 +80,17 @@ if TYPE_CHECKING:
     from spadwarp.dataset.recipe import Recipe, load_recipe
     from spadwarp.depth import arrival_time
     from spadwarp.detector import Detection, coates, detect
+    from spadwarp.engines import Ray, interruptible, run_jobs
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.exports import export
     from spadwarp.files import load_result
     from spadwarp.hardware import devices
     from spadwarp.model import truth_maps
+    from spadwarp.records import PhotonRecords, trace
     from spadwarp.response import InstrumentResponse, instrument_response
-    from spadwarp.result import Result, Truth, merge
-    from spadwarp.simulation import PhotonRecords, simulate, trace
+    from spadwarp.result import Result, Truth
+    from spadwarp.simulation import simulate
+    from spadwarp.sums import merge
     from spadwarp.tensors import TorchResult, to_torch
     from spadwarp.truth_exr import load_truth_exr
     from spadwarp.validation import validate

@@ -367,7 +367,7 @@ def _error(scene: Scene, device: wp.Device, photons: int, photons_per_second: fl
 
 
 def _absorbed(scene: Scene, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:
-    from spadwarp.simulation import trace
+    from spadwarp.records import trace
 
     weights = trace(scene, photons=max(2, min(photons, _CHECK_PHOTONS)), device=device.alias).weight
     lost = 1.0 - weights.astype(np.float64)

@@ -104,6 +104,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             file.create_dataset("squares", data=result.squares, chunks=(1, rows, columns, bins), **packed)
         file.create_dataset("bin_edges", data=result.bin_edges)
         file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
+        file.create_dataset("requested", data=np.array(result.requested, dtype=np.uint64))
         file.create_dataset("config", data=result.scene.to_toml())
         for name in _RECORDS:
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
@@ -148,6 +149,7 @@ def load_result(path: str | Path) -> Result:
                 batch_size=int(file.attrs.get("batch_size", 0)),
                 squares=file["squares"][...] if "squares" in file else None,
                 photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
+                requested=_requested(file),
                 truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
                 **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
             )
@@ -157,6 +159,14 @@ def load_result(path: str | Path) -> Result:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
     except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
         raise FileError(f"{path}: not a whole spadwarp result: {error}") from error
+
+
+def _requested(file: Any) -> tuple[int, int]:
+    """Files of version 0.1.0 do not have it."""
+    if "requested" not in file:
+        return 0, 0
+    start, stop = file["requested"][...]
+    return int(start), int(stop)
 
 
 def _attributes(result: Result) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from spadwarp.errors import DeviceError
 if TYPE_CHECKING:
     import warp as wp
 
-__all__ = ["core_count", "devices", "physical_memory", "pick_device", "pick_devices", "start_warp"]
+__all__ = ["core_count", "devices", "physical_memory", "pick_device", "pick_devices", "processor_name", "start_warp"]
 
 
 def pick_devices(names: str | None = None) -> list[wp.Device]:
@@ -69,9 +69,7 @@ def devices() -> list[dict[str, Any]]:
         found.append(
             {
                 "name": device.alias,
-                "description": device.name
-                if cuda
-                else f"{threads} threads, {platform.processor() or platform.machine()}",
+                "description": processor_name(device) if cuda else f"{threads} threads, {processor_name(device)}",
                 "memory": device.total_memory if cuda else physical_memory(),
                 "compute_capability": f"{device.arch // 10}.{device.arch % 10}" if cuda else None,
                 "threads": threads,
@@ -79,6 +77,11 @@ def devices() -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def processor_name(device: wp.Device) -> str:
+    """What a device calls itself."""
+    return device.name if device.is_cuda else platform.processor() or platform.machine()
 
 
 @functools.cache

@@ -1,19 +1,26 @@
-"""Photon records in HDF5."""
+"""Photon records: how each photon ended, traced and kept in HDF5."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.files import atomic_path
+from spadwarp.hardware import pick_device
+from spadwarp.model import build_model, transport_spec
+from spadwarp.passes import CPU_PASS, CUDA_PASS, Lane, check_range
 
 if TYPE_CHECKING:
     from spadwarp.config import Scene
-    from spadwarp.simulation import PhotonRecords
+    from spadwarp.simulation import Progress
 
-__all__ = ["FORMAT", "load_records", "save_records"]
+__all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
 
 FORMAT = "spadwarp records"
 FORMAT_VERSION = 1
@@ -23,6 +30,84 @@ _READ_ME = (
     "One row a photon, as its history ended: position [m] and direction in the camera frame (+x right, +y down, "
     "+z forward), weight, geometric path [m], collisions (surfaces included), reason (index into reasons)."
 )
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonRecords:
+    """How each photon ended.
+
+    Attributes:
+        id: uint64 `[N]`.
+        position: float32 `[N, 3]`, where it ended [m].
+        direction: float32 `[N, 3]`, unit vector of its last flight.
+        weight: float32 `[N]`, what was left of it.
+        path: float32 `[N]`, geometric path [m].
+        collisions: int32 `[N]`, events, surfaces included.
+        reason: int32 `[N]`, index into `reasons`.
+        reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
+        ledger: As in `Result`, with its unit.
+    """
+
+    id: NDArray[np.uint64]
+    position: NDArray[np.float32]
+    direction: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    path: NDArray[np.float32]
+    collisions: NDArray[np.int32]
+    reason: NDArray[np.int32]
+    reasons: tuple[str, ...]
+    ledger: dict[str, int]
+    ledger_unit: float
+
+    def ended(self, *names: str) -> NDArray[np.bool_]:
+        """Mask of the photons that ended for one of the named reasons."""
+        return np.isin(self.reason, [self.reasons.index(name) for name in names])
+
+
+def trace(
+    scene: Scene,
+    *,
+    photons: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> PhotonRecords:
+    """Walks photons without a camera and returns the terminal state of each.
+
+    Path is limited by `transport.max_path` alone; the gate plays no part. A photon takes 44 bytes.
+
+    Args and raises: as `simulate`.
+    """
+    import spadwarp_kernels as sk
+    from spadwarp.targets import build_mesh
+
+    photons = scene.transport.photons if photons is None else photons
+    seed = scene.transport.seed if seed is None else seed
+    check_range("photons", photons, 1, 2**31 - 1)
+    check_range("seed", seed, 0, 2**64 - 1)
+    mesh = build_mesh(scene)
+    model = build_model(scene, pick_device(device), mesh, camera=False)
+    if progress is not None:
+        progress("compile", 0, 0)
+    lane = Lane(model, transport_spec(scene, mesh, estimator="none", records=True), seed=seed)
+    size = CUDA_PASS if model.device.is_cuda else CPU_PASS
+    parts: list[dict[str, NDArray[Any]]] = []
+    for first in range(0, photons, size):
+        stop = min(first + size, photons)
+        lane.data.records = sk.make_records(stop - first, device=model.device)
+        lane.launch(first, stop)
+        names = ("position", "direction", "weight", "path", "collisions", "reason")
+        parts.append({name: getattr(lane.data.records, name).numpy() for name in names})
+        if progress is not None:
+            progress("trace", stop, photons)
+    ledger, _ = sk.read_ledger(lane.data)
+    return PhotonRecords(
+        id=np.arange(photons, dtype=np.uint64),
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        reasons=sk.LEDGER_ENTRIES,
+        ledger=ledger,
+        ledger_unit=sk.LEDGER_UNIT,
+    )
 
 
 def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | None = None) -> Path:
@@ -63,8 +148,6 @@ def load_records(path: str | Path) -> PhotonRecords:
         FileError: No such file, not photon records, or damaged; says which.
     """
     import h5py
-
-    from spadwarp.simulation import PhotonRecords
 
     if not Path(path).is_file() or not h5py.is_hdf5(path):
         raise FileError(f"{path}: {'not an HDF5 file' if Path(path).is_file() else 'no such file'}")

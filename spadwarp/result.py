@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.config import SPEED_OF_LIGHT
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.errors import ConfigError
 
 if TYPE_CHECKING:
     from spadwarp.config import Camera, Scene
     from spadwarp.depth import Method
 
-__all__ = ["COMPONENTS", "Component", "Result", "Truth", "merge", "pixel_directions", "range_from_path"]
+__all__ = ["COMPONENTS", "Component", "Result", "Truth", "pixel_directions", "range_from_path"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
 COMPONENTS: tuple[Component, ...] = ("ballistic", "forward_scattered", "backscatter")
@@ -69,6 +69,7 @@ class Result:
         provenance: Versions, device and date.
         partial: Whether the run was stopped early; `photons` then counts what was done.
         photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
+        requested: The ids [start, stop) that were asked for, which a run that was stopped early has only in part.
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
         squares: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally, summed
             over components; None without batches.
@@ -89,10 +90,13 @@ class Result:
     photon_ranges: Sequence[tuple[int, int]] = ()
     batch_size: int = 0
     squares: NDArray[np.uint64] | None = None
+    requested: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
             object.__setattr__(self, "photon_ranges", ((0, self.photons),))
+        if self.requested == (0, 0):
+            object.__setattr__(self, "requested", (self.photon_ranges[0][0], self.photon_ranges[-1][1]))
         camera, gate = self.scene.camera, self.scene.gate
         shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
         if self.tallies.dtype != np.int64 or self.tallies.shape != shape:
@@ -286,80 +290,6 @@ class Result:
         from spadwarp.files import save_result
 
         return save_result(self, path)
-
-
-def merge(results: Iterable[Result]) -> Result:
-    """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
-
-    Raises:
-        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
-    """
-    parts = list(results)
-    if not parts:
-        raise ConfigError("merge: no results given")
-    first = parts[0]
-    for other in parts[1:]:
-        for name, a, b in (
-            ("scene", physics_of(first.scene), physics_of(other.scene)),
-            ("seed", first.seed, other.seed),
-            ("tally unit", first.unit, other.unit),
-            ("batch size", first.batch_size, other.batch_size),
-        ):
-            if a != b:
-                detail = f" ({a} and {b})" if name != "scene" else ": only photons and output may differ"
-                raise ConfigError(f"merge: the {name} of the results differs{detail}")
-    ranges = sorted(r for part in parts for r in part.photon_ranges)
-    joined: list[tuple[int, int]] = []
-    for start, stop in ranges:
-        if joined and start < joined[-1][1]:
-            raise ConfigError(
-                f"merge: photon ids {start} to {min(stop, joined[-1][1]) - 1} are in more than one result"
-            )
-        if joined and start == joined[-1][1]:
-            joined[-1] = (joined[-1][0], stop)
-        else:
-            joined.append((start, stop))
-    for other in parts[1:]:
-        if not np.allclose(first.truth.range, other.truth.range, rtol=1e-4, equal_nan=True):
-            raise ConfigError("merge: the targets of the results differ, by their truth maps: was a mesh file changed?")
-    check_capacity(np.sum([part.tallies.sum(axis=0, dtype=np.float64) for part in parts], axis=0))
-    squares = first.squares
-    if squares is not None:
-        for part in parts[1:]:
-            assert squares is not None and part.squares is not None
-            squares = _add_128(squares, part.squares)
-    return replace(
-        first,
-        tallies=np.sum([part.tallies for part in parts], axis=0, dtype=np.int64),
-        photons=sum(part.photons for part in parts),
-        ledger={name: sum(part.ledger[name] for part in parts) for name in first.ledger},
-        counters={name: sum(part.counters[name] for part in parts) for name in first.counters},
-        timing={name: sum(part.timing.get(name, 0.0) for part in parts) for name in first.timing},
-        partial=any(part.partial for part in parts),
-        photon_ranges=tuple(joined),
-        squares=squares,
-    )
-
-
-def check_capacity(total: NDArray[np.float64]) -> None:
-    """Raises `SpadwarpError` where a bin's sum over components leaves the range of its 64-bit integer."""
-    if total.size and (total.max() >= 2.0**62 or total.min() < 0.0):
-        raise SpadwarpError(
-            "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at "
-            "a time and add up their histograms"
-        )
-
-
-def physics_of(scene: Scene) -> Scene:
-    """The scene without what does not change a photon's history."""
-    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
-    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})
-
-
-def _add_128(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Sum of 128-bit numbers given as [low, high]."""
-    low = a[0] + b[0]
-    return np.stack([low, a[1] + b[1] + (low < a[0])])
 
 
 def pixel_directions(camera: Camera) -> NDArray[np.float64]:

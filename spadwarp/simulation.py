@@ -1,37 +1,40 @@
-"""Running a scene: passes of photons over the cores of the CPU or a GPU, into a `Result` or photon records."""
+"""Running a scene: which photons, on what, until when; their sums become a `Result`."""
 
 from __future__ import annotations
 
 import datetime
 import platform
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spadwarp.config import Scene
-from spadwarp.errors import ConfigError
-from spadwarp.hardware import core_count, pick_device
-from spadwarp.model import build_model, trace_truth, transport_spec
-from spadwarp.result import COMPONENTS, Result, check_capacity, merge, physics_of
-from spadwarp.tensors import caller_tallies
+from spadwarp.engines import Ray, interruptible
+from spadwarp.errors import ConfigError, DeviceError, FileError
+from spadwarp.hardware import pick_devices, processor_name
+from spadwarp.passes import Plan, Tracer, check_range
+from spadwarp.photon_ids import Range, Ranges, count, joined, shard_of, without
+from spadwarp.result import Result
+from spadwarp.sums import add_timing, check_capacity, check_targets, join_provenance, physics_of
 
 if TYPE_CHECKING:
-    from spadwarp_kernels import Data, Model
+    from spadwarp.cluster import ClusterTracer
 
 # Called with ("compile", 0, 0) before kernels are compiled or loaded, then with ("trace", photons done, photons asked
-# for).
+# for); any other first word is a remark for whoever watches.
 Progress = Callable[[str, int, int], None]
 
-# Photons in one launch: large enough to fill the device, small enough that progress is seen and Ctrl-C heard.
-CPU_PASS = 1 << 16
-CUDA_PASS = 1 << 26
+# Checkpoints take at most this share of the time.
+_CHECKPOINT_SHARE = 0.02
+
+# Photons of a batch at most: some seconds of a GPU, so that there is enough to deal out and little to lose.
+_LARGEST_BATCH = 1 << 30
 
 
 def simulate(
@@ -40,446 +43,291 @@ def simulate(
     photons: int | None = None,
     seed: int | None = None,
     device: str | None = None,
+    engine: Ray | None = None,
     threads: int | None = None,
     pass_size: int | None = None,
     progress: Progress | None = None,
     uncertainty: bool = False,
     relative_error: float | None = None,
     first_photon: int = 0,
+    shard: tuple[int, int] | None = None,
     resume: Result | None = None,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: float = 60.0,
     tallies: Any = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
-    One seed gives the same bits on one kind of device, whatever `threads` and `pass_size`.
+    One seed gives the same bits on one kind of device, whatever their number, the engine, `threads` and `pass_size`.
 
     Args:
         scene: From `spadwarp.load_scene`.
-        photons: Emitted photons in all, > 0; by default `scene.transport.photons`.
+        photons: Emitted photons in all, > 0; by default `scene.transport.photons`, or what the run to resume was asked
+            for.
         seed: 0 ... 2^64 - 1; by default `scene.transport.seed`, or that of the run to resume.
-        device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
+        device: "cpu", "cuda:0", "cuda:0,cuda:2", or "cuda:all" for the GPUs of this host; by default the first GPU,
+            else the CPU.
+        engine: `spadwarp.Ray(...)` to run on its workers; `device` is then "cpu" or "cuda".
         threads: CPU threads; by default one a core. A GPU takes none.
         pass_size: Photons in one launch, up to 2^26, on the CPU 2^20.
         progress: Called from the caller's thread.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
-            at
-            most 1/32; the histogram takes 2 2/3 times the memory.
+            at most 1/32; the histogram takes 2 2/3 times the memory.
         relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
             `uncertainty`, and `photons` is the most that are traced.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
+        shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
         resume: A result of the same scene, to which photons are added until it has `photons`; the outcome is that of
-            one long run.
+            one long run. Gaps in its ids are filled.
+        checkpoint: A file that holds, as a partial result, what is done so far; `resume` goes on from it. Left where
+            it is when the run is done.
+        checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
+            the time at most.
         tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
             the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
-            memory; `spadwarp.to_torch(result, tallies=…)` makes histograms of it where it lies. Without `resume`.
+            memory; `spadwarp.to_torch(result, tallies=…)` makes histograms of it where it lies. For one device, without
+            `resume`.
 
     Returns:
-        The result. After Ctrl-C it holds the photons (or batches) that were done and is marked `partial`.
+        The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
 
     Raises:
         ConfigError, MeshError, DeviceError: The scene cannot be simulated; nothing was computed.
+        DeviceError: A device failed on the way; the text names the checkpoint, if there is one.
         KeyboardInterrupt: Ctrl-C before the first pass was done, or a second Ctrl-C.
     """
     from spadwarp.targets import build_mesh
 
-    photons = scene.transport.photons if photons is None else photons
-    _check_range("photons", photons, 1, 10**12)
     if resume is not None:
-        if tallies is not None:
-            raise ConfigError("tallies go without resume: they hold one run")
-        if len(resume.photon_ranges) != 1:
-            raise ConfigError(f"resume: the photon ids {resume.photon_ranges} have gaps; merge the missing ones first")
-        if first_photon:
-            raise ConfigError(f"first_photon = {first_photon} goes without resume, which knows where to go on")
-        if physics_of(scene) != physics_of(resume.scene):
-            raise ConfigError("resume: the result is of another scene; only photons and output may differ")
-        if seed not in (None, resume.seed):
-            raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
-        first_photon = resume.photon_ranges[0][1]
-        seed = resume.seed if seed is None else seed
-        photons -= resume.photons
-        if photons <= 0:
-            raise ConfigError(f"photons = {photons + resume.photons} is outside [{resume.photons + 1}, {10**12}]")
+        _check_resumed(resume, scene, seed, first_photon, shard, uncertainty or relative_error is not None)
+        seed, first_photon = resume.seed, resume.requested[0]
+        photons = count([resume.requested]) if photons is None else photons
+        if photons <= resume.photons:
+            raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
+    photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed
-    _check_range("seed", seed, 0, 2**64 - 1)
-    _check_range("first_photon", first_photon, 0, 2**62)
+    check_range("photons", photons, 1, 10**12)
+    check_range("seed", seed, 0, 2**64 - 1)
+    check_range("first_photon", first_photon, 0, 2**62)
     if relative_error is not None and not 0 < relative_error < 1:
         raise ConfigError(f"relative_error = {relative_error} is outside (0, 1)")
+    if relative_error is not None and shard is not None:
+        raise ConfigError("relative_error goes without shard: no part knows the error of the whole")
+    if tallies is not None and (resume is not None or engine is not None):
+        raise ConfigError("tallies go without resume and engine: they hold one run of one device")
+    if not checkpoint_every >= 0:
+        raise ConfigError(f"checkpoint_every = {checkpoint_every} is outside [0, inf)")
     batch_size = 0
     if resume is not None:
         batch_size = resume.batch_size
-        if batch_size == 0 and (uncertainty or relative_error):
-            raise ConfigError("uncertainty: the run to resume kept no batches")
     elif uncertainty or relative_error is not None:
-        # At least 32 batches; with a stopping rule up to 1024, so that it can act early.
-        batch_size = 1 << max(0, (photons // (32 if relative_error is None else 1024)).bit_length() - 1)
+        # With a stopping rule more of them, so that it can act early.
+        least = 32 if relative_error is None else 1024
+        batch_size = _batch_size(photons, least if shard is None else max(least, shard[1]))
     if batch_size:
         photons = -(-photons // batch_size) * batch_size
         if first_photon % batch_size:
             raise ConfigError(
                 f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
             )
+    wanted = first_photon, first_photon + photons
+    if shard is not None:
+        wanted = shard_of(wanted, shard, batch_size or 1)
 
-    began = time.perf_counter()
-    wp_device = pick_device(device)
     mesh = build_mesh(scene)
-    model = build_model(scene, wp_device, mesh, copies=2 + 2 / len(COMPONENTS) if batch_size else 1)
-    if resume is not None and resume.unit != 1.0 / model.scale:
-        raise ConfigError(f"resume: the tally unit is {1.0 / model.scale}, that of the result {resume.unit}")
-    ready = time.perf_counter()
-    spec = transport_spec(scene, mesh)
-    run = _Run(model, spec, seed=seed, progress=progress, batch_size=batch_size, tallies=tallies)
-    compiled = time.perf_counter()
-    truth = trace_truth(scene, model)
-    traced = time.perf_counter()
-    result: Result | None = None
-
-    def collect(done: int) -> Result:
-        counted, squares = run.tallies()
-        check_capacity(counted.sum(axis=0, dtype=np.float64))
-        ledger, counters = run.accounts()
-        part = Result(
-            scene=scene,
-            tallies=counted,
-            unit=1.0 / model.scale,
-            photons=done,
-            seed=seed,
-            ledger=ledger,
-            ledger_unit=run.ledger_unit,
-            counters=counters,
-            truth=truth,
-            timing={
-                "setup": ready - began,
-                "compile": compiled - ready,
-                "truth": traced - compiled,
-                "trace": time.perf_counter() - traced,
-            },
-            provenance=provenance(wp_device),
-            partial=False,
-            photon_ranges=((first_photon, first_photon + done),),
-            batch_size=batch_size,
-            squares=squares,
-        )
-        return part if resume is None else merge([replace(resume, partial=False), part])
-
-    def enough(done: int) -> bool:
-        nonlocal result
-        batches = done // batch_size
-        if relative_error is None or batches < 8 or batches & (batches - 1):
-            return False
-        result = collect(done)
-        return result.relative_error <= relative_error
-
-    done = run.trace(
-        first_photon,
-        first_photon + photons,
-        threads=threads,
-        pass_size=pass_size,
-        enough=enough if batch_size else None,
-    )
-    if done == 0:
-        raise KeyboardInterrupt
-    if result is None or not run.stopped_early:
-        result = collect(done)
-    return replace(result, partial=done < photons and not run.stopped_early)
-
-
-@dataclass(frozen=True, eq=False)
-class PhotonRecords:
-    """How each photon ended.
-
-    Attributes:
-        id: uint64 `[N]`.
-        position: float32 `[N, 3]`, where it ended [m].
-        direction: float32 `[N, 3]`, unit vector of its last flight.
-        weight: float32 `[N]`, what was left of it.
-        path: float32 `[N]`, geometric path [m].
-        collisions: int32 `[N]`, events, surfaces included.
-        reason: int32 `[N]`, index into `reasons`.
-        reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
-        ledger: As in `Result`, with its unit.
-    """
-
-    id: NDArray[np.uint64]
-    position: NDArray[np.float32]
-    direction: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    path: NDArray[np.float32]
-    collisions: NDArray[np.int32]
-    reason: NDArray[np.int32]
-    reasons: tuple[str, ...]
-    ledger: dict[str, int]
-    ledger_unit: float
-
-    def ended(self, *names: str) -> NDArray[np.bool_]:
-        """Mask of the photons that ended for one of the named reasons."""
-        return np.isin(self.reason, [self.reasons.index(name) for name in names])
-
-
-def trace(
-    scene: Scene,
-    *,
-    photons: int | None = None,
-    seed: int | None = None,
-    device: str | None = None,
-    progress: Progress | None = None,
-) -> PhotonRecords:
-    """Walks photons without a camera and returns the terminal state of each.
-
-    Path is limited by `transport.max_path` alone; the gate plays no part. A photon takes 44 bytes.
-
-    Args and raises: as `simulate`.
-    """
-    import spadwarp_kernels as sk
-    from spadwarp.targets import build_mesh
-
-    photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
-    _check_range("photons", photons, 1, 2**31 - 1)
-    _check_range("seed", seed, 0, 2**64 - 1)
-    mesh = build_mesh(scene)
-    model = build_model(scene, pick_device(device), mesh, camera=False)
-    spec = transport_spec(scene, mesh, estimator="none", records=True)
-    run = _Run(model, spec, seed=seed, progress=progress)
-    size = CUDA_PASS if model.device.is_cuda else CPU_PASS
-    parts: list[dict[str, NDArray[Any]]] = []
-    for first in range(0, photons, size):
-        count = min(size, photons - first)
-        run.data.records = sk.make_records(count, device=model.device)
-        run.launch(first, count)
-        names = ("position", "direction", "weight", "path", "collisions", "reason")
-        parts.append({name: getattr(run.data.records, name).numpy() for name in names})
-        run.report(first + count, photons)
-    ledger, _ = run.accounts()
-    return PhotonRecords(
-        id=np.arange(photons, dtype=np.uint64),
-        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
-        reasons=sk.LEDGER_ENTRIES,
-        ledger=ledger,
-        ledger_unit=run.ledger_unit,
-    )
-
-
-class _Run:
-    """One model, its tallies, and the passes over photon ids."""
-
-    def __init__(
-        self,
-        model: Model,
-        spec: Any,
-        *,
-        seed: int,
-        progress: Progress | None,
-        batch_size: int = 0,
-        tallies: Any = None,
-    ) -> None:
-        import spadwarp_kernels as sk
-
-        shape = (len(COMPONENTS), model.camera.height, model.camera.width, model.gate.bins)
-        own = None if tallies is None else caller_tallies(tallies, shape=shape, device=model.device)
-
-        self.model, self.spec, self.seed, self.progress = model, spec, seed, progress
-        self.ledger_unit = sk.LEDGER_UNIT
-        self.data: Data = sk.make_data(model, tally=None if batch_size else own, histogram=spec.estimator != "none")
-        self.batch_size = batch_size
-        self.batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
-        self.stopped_early = False
-        self._accounts: list[tuple[dict[str, int], dict[str, int]]] = []
+    plan = Plan(scene, mesh, seed, batch_size, pass_size)
+    with ExitStack() as stack:
+        stopped = stack.enter_context(interruptible())
         if progress is not None:
             progress("compile", 0, 0)
-        # Compiles, or loads from Warp's cache, before the clock of the passes starts.
-        sk.load_transport_kernel(spec, model.device)
+        tracer: Tracer | ClusterTracer
+        if engine is None:
+            tracer = Tracer(plan, pick_devices(device), threads=threads, base=resume, tallies=tallies)
+        else:
+            from spadwarp.cluster import ClusterTracer
 
-    def launch(self, first: int, count: int) -> None:
-        """One pass; back when its photons are done."""
-        import warp as wp
-
-        import spadwarp_kernels as sk
-
-        sk.launch_transport(self.spec, self.model, self.data, seed=self.seed, first_id=first, photon_count=count)
-        wp.synchronize_device(self.model.device)
-
-    def report(self, done: int, total: int) -> None:
-        if self.progress is not None:
-            self.progress("trace", done, total)
-
-    def accounts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Ledger and counters of what `tallies` holds."""
-        import spadwarp_kernels as sk
-
-        parts = self._accounts if self.batches is not None else [sk.read_ledger(self.data)]
-        ledger, counters = ({name: sum(p[i][name] for p in parts) for name in parts[0][i]} for i in range(2))
-        return ledger, counters
-
-    def tallies(self) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
-        """Tallies [component, height, width, bin] and the sums of squares, if there are batches."""
-        camera, gate = self.model.camera, self.model.gate
-        shape = (camera.height, camera.width, gate.bins)
-        if self.batches is None:
-            return self.data.tally.numpy().reshape(len(COMPONENTS), *shape), None
-        squares = np.stack([half.numpy().reshape(shape) for half in self.batches.squares])
-        return self.batches.total.numpy().reshape(len(COMPONENTS), *shape), squares
-
-    def trace(
-        self,
-        start: int,
-        stop: int,
-        *,
-        threads: int | None = None,
-        pass_size: int | None = None,
-        enough: Callable[[int], bool] | None = None,
-    ) -> int:
-        """Walks the photons start ... stop - 1; returns how many were done before an interrupt, always a prefix.
-
-        With batches only whole ones count, and `enough(done)` is asked after each whether to stop.
-        """
-        import spadwarp_kernels as sk
-
-        cuda = self.model.device.is_cuda
-        size = (CUDA_PASS if cuda else CPU_PASS) if pass_size is None else pass_size
-        # One CPU thread walks a whole pass, and counts its events in 32 bits.
-        _check_range("pass_size", size, 1, CUDA_PASS if cuda else 1 << 20)
-        workers = 1 if cuda else core_count() if threads is None else threads
-        _check_range("threads", workers, 1, 4096)
-        total = stop - start
-        with _interruptible() as interrupted:
-            if self.batches is None:
-                return self._passes(start, stop, size, workers, interrupted, lambda done: self.report(done, total))
-            for first in range(start, stop, self.batch_size):
-                before = first - start
-                part = self._passes(
-                    first,
-                    first + self.batch_size,
-                    size,
-                    workers,
-                    interrupted,
-                    lambda done, before=before: self.report(before + done, total),  # type: ignore[misc]
-                )
-                if part < self.batch_size:
-                    return before
-                self.batches.close(self.data.tally)
-                self._accounts.append(sk.read_ledger(self.data))
-                self.data.ledger.zero_()
-                if enough is not None and enough(before + part):
-                    self.stopped_early = True
-                    return before + part
-            return total
-
-    def _passes(
-        self,
-        start: int,
-        stop: int,
-        size: int,
-        workers: int,
-        interrupted: threading.Event,
-        report: Callable[[int], None],
-    ) -> int:
-        workers = min(workers, -(-(stop - start) // size))
-        if workers > 1:
-            return self._trace_in_threads(start, stop, size, workers, interrupted, report)
-        done = start
-        while done < stop and not interrupted.is_set():
-            count = min(size, stop - done)
-            self.launch(done, count)
-            done += count
-            report(done - start)
-        return done - start
-
-    def _trace_in_threads(
-        self,
-        start: int,
-        stop: int,
-        size: int,
-        workers: int,
-        interrupted: threading.Event,
-        report: Callable[[int], None],
-    ) -> int:
-        """CPU passes on several threads; all add to one tally, with atomics of their own."""
-        queue = iter(range(start, stop, size))
-        lock = threading.Condition()
-        finished = 0
-        errors: list[BaseException] = []
-
-        def work() -> None:
-            nonlocal finished
-            while not interrupted.is_set():
-                with lock:
-                    first = next(queue, None)
-                if first is None:
-                    return
-                try:
-                    self.launch(first, min(size, stop - first))
-                except BaseException as error:
-                    errors.append(error)
-                    interrupted.set()
-                    return
-                with lock:
-                    finished += min(size, stop - first)
-                    lock.notify()
-
-        pool = [threading.Thread(target=work, daemon=True) for _ in range(workers)]
-        for thread in pool:
-            thread.start()
+            tell = None if progress is None else lambda text: progress(text, 0, 0)
+            tracer = stack.enter_context(ClusterTracer(plan, engine, device, base=resume, note=tell))
+        run = _Run(plan, tracer, wanted, resume, progress, _Checkpoint(checkpoint, checkpoint_every))
         try:
-            while any(thread.is_alive() for thread in pool):
-                with lock:
-                    lock.wait(timeout=0.1)
-                    done = finished
-                report(done)
-        except BaseException:
-            interrupted.set()
+            return run(stopped, relative_error)
+        except DeviceError as error:
+            if run.checkpoint.photons:
+                kept = f"{run.checkpoint.path}: the {run.checkpoint.photons} photons that were done are here; resume it"
+                raise DeviceError(f"{error}\n{kept}") from error
             raise
-        if errors:
-            raise errors[0]
-        report(finished)
-        # Every pass that was begun was finished, and they are begun in order: what was done is a prefix.
-        return finished
 
 
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second one raises KeyboardInterrupt. Signals reach the main thread
-    only."""
-    interrupted = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield interrupted
-        return
+@dataclass
+class _Checkpoint:
+    """When what is done is written down, and where."""
 
-    first = 0.0
+    path: str | Path | None
+    every: float
+    photons: int = 0
 
-    def handle(number: int, frame: object) -> None:
-        nonlocal first
-        # Some programs send one interrupt twice, to a process and to its group; a person needs a moment to insist.
-        if interrupted.is_set() and time.monotonic() > first + 1.0:
+    def __post_init__(self) -> None:
+        self._written, self._cost = time.monotonic(), 0.0
+
+    def due(self) -> bool:
+        pause = max(self.every, self._cost / _CHECKPOINT_SHARE)
+        return self.path is not None and time.monotonic() >= self._written + pause
+
+    def write(self, collect: Callable[[], Result]) -> None:
+        """The run goes on if this fails: the disk may have room again later."""
+        from spadwarp.files import save_result
+
+        assert self.path is not None
+        began = time.monotonic()
+        try:
+            result = collect()
+            save_result(result, self.path)
+            self.photons = result.photons
+        except FileError as error:
+            warnings.warn(f"no checkpoint, the run goes on: {error}", RuntimeWarning, stacklevel=2)
+        self._written = time.monotonic()
+        self._cost = self._written - began
+
+
+@dataclass
+class _Run:
+    """A plan on its way to a result."""
+
+    plan: Plan
+    tracer: Tracer | ClusterTracer
+    wanted: Range
+    resumed: Result | None
+    progress: Progress | None
+    checkpoint: _Checkpoint
+
+    def __call__(self, stopped: Any, relative_error: float | None) -> Result:
+        from spadwarp.model import tally_scale
+
+        self.unit = 1.0 / tally_scale(self.plan.scene, self.plan.mesh)
+        if self.resumed is not None and self.resumed.unit != self.unit:
+            raise ConfigError(f"resume: the tally unit is {self.unit}, that of the result {self.resumed.unit}")
+        began = time.perf_counter()
+        self.truth = self.tracer.truth()
+        self.began = time.perf_counter()
+        self.truth_seconds = self.began - began
+        if self.resumed is not None:
+            check_targets(self.resumed.truth, self.truth, "resume")
+
+        self.earlier: Ranges = () if self.resumed is None else joined(self.resumed.photon_ranges)
+        done = self.earlier
+        start, stop = self.wanted
+        for goal in [*self._milestones(count(done) if relative_error is not None else None), stop]:
+            done = self._trace((start, goal), done, stopped)
+            if stopped.is_set() and without((start, goal), done):
+                break
+            if relative_error is not None:
+                result = self._collect(done)
+                if self._known(result, relative_error) or goal == stop:
+                    return replace(result, requested=(start, goal), partial=False)
+        if count(done) == count(self.earlier):
             raise KeyboardInterrupt
-        if not interrupted.is_set():
-            first = time.monotonic()
-        interrupted.set()
+        return self._collect(done)
 
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
+    def _milestones(self, done: int | None) -> list[int]:
+        """Where the error is looked at: after 8, 16, 32, ... batches; nowhere without a stopping rule."""
+        start, stop = self.wanted
+        if done is None:
+            return []
+        sizes = [self.plan.batch_size << power for power in range(3, 45)]
+        return [start + size for size in sizes if done < size < stop - start]
+
+    def _known(self, result: Result, relative_error: float | None) -> bool:
+        assert relative_error is not None
+        if result.photons < 2 * result.batch_size:
+            return False
+        error = result.relative_error
+        if self.progress is not None:
+            batches = result.photons // result.batch_size
+            self.progress(f"error {100 * error:.3g} % after {batches} batches", result.photons, count([self.wanted]))
+        return error <= relative_error
+
+    def _trace(self, span: Range, done: Ranges, stopped: Any) -> Ranges:
+        """The ids done once a span is, or once the run was stopped."""
+        total = count([self.wanted])
+
+        def report(now: int) -> None:
+            if self.progress is not None:
+                self.progress("trace", count(done) + now, total)
+
+        def keep(now: Ranges) -> None:
+            self.checkpoint.write(lambda: self._collect(joined([*done, *now])))
+
+        todo = without(span, done)
+        if not todo:
+            return done
+        now = self.tracer.trace(todo, stopped=stopped, report=report, due=self.checkpoint.due, keep=keep)
+        return joined([*done, *now])
+
+    def _collect(self, done: Ranges) -> Result:
+        """The result of the ids done, which are what the tracer's sums hold."""
+        import spadwarp_kernels as sk
+
+        sums = self.tracer.sums()
+        check_capacity(sums.tallies.sum(axis=0, dtype=np.float64))
+        tracing = {"truth": self.truth_seconds, "trace": time.perf_counter() - self.began}
+        fresh = Result(
+            scene=self.plan.scene,
+            **vars(sums),
+            unit=self.unit,
+            photons=count(done),
+            seed=self.plan.seed,
+            ledger_unit=sk.LEDGER_UNIT,
+            truth=self.truth,
+            timing={**self.tracer.timing, **tracing},
+            provenance={**provenance(), **self.tracer.about()},
+            photon_ranges=done,
+            batch_size=self.plan.batch_size,
+            requested=self.wanted,
+            partial=bool(without(self.wanted, done)),
+        )
+        if difference := fresh.ledger_report()["difference"]:
+            raise DeviceError(f"the energy ledger is off by {difference} units: a device has lost counts")
+        if self.resumed is None:
+            return fresh
+        own = tuple(span for first in done for span in without(first, self.earlier))
+        parts = [self.resumed, replace(fresh, photon_ranges=own, photons=count(own))] if own else [self.resumed]
+        return replace(
+            fresh,
+            timing=add_timing([fresh.timing, self.resumed.timing]),
+            provenance=join_provenance(parts),
+        )
 
 
-def provenance(device: Any) -> dict[str, Any]:
-    """What made a result: versions, device, machine, date."""
+def _batch_size(photons: int, least: int) -> int:
+    """A power of two, for at least so many batches."""
+    return min(1 << max(0, (photons // least).bit_length() - 1), _LARGEST_BATCH)
+
+
+def _check_resumed(
+    resume: Result, scene: Scene, seed: int | None, first_photon: int, shard: tuple[int, int] | None, batches: bool
+) -> None:
+    for name, value in (("first_photon", first_photon), ("shard", shard)):
+        if value:
+            raise ConfigError(f"{name} = {value} goes without resume, which knows where to go on")
+    if physics_of(scene) != physics_of(resume.scene):
+        raise ConfigError("resume: the result is of another scene; only photons and output may differ")
+    if seed not in (None, resume.seed):
+        raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
+    if batches and not resume.batch_size:
+        raise ConfigError("uncertainty: the run to resume kept no batches")
+
+
+def provenance(device: Any = None) -> dict[str, Any]:
+    """What made a result: versions, machine, date; and a device."""
     import warp as wp
 
     import spadwarp
 
-    return {
+    made = {
         "spadwarp": spadwarp.__version__,
         "warp": wp.__version__,
         "numpy": np.__version__,
         "python": platform.python_version(),
-        "device": device.alias,
-        "device_name": device.name if device.is_cuda else platform.processor() or platform.machine(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def _check_range(name: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise ConfigError(f"{name} = {value} is outside [{low}, {high}]")
+    return made if device is None else {**made, "device": device.alias, "device_name": processor_name(device)}

@@ -82,7 +82,7 @@ def test_a_resumed_run_equals_one_long_run(uncertainty, tmp_path):
 
 
 def _first_batches(one, whole, count):
-    """The run interrupted after so many batches."""
+    """The run interrupted after so many batches or a few more."""
     import signal
 
     def interrupt(stage, done, total):
@@ -92,7 +92,7 @@ def _first_batches(one, whole, count):
 
     fired = []
     part = spadwarp.simulate(one, photons=65_536, seed=5, device="cpu", threads=1, uncertainty=True, progress=interrupt)
-    assert part.partial and part.photons == count * whole.batch_size
+    assert part.partial and count * whole.batch_size <= part.photons < whole.photons
     return part
 
 

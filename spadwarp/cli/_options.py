@@ -21,7 +21,7 @@ from spadwarp.errors import ConfigError, FileError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp import Result, Scene
+    from spadwarp import Ray, Result, Scene
 
 
 def whole_number(text: str | int) -> int:
@@ -60,6 +60,31 @@ Device = Annotated[
     str | None,
     typer.Option(metavar="NAME", help='"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
 ]
+Devices = Annotated[
+    str | None,
+    typer.Option(
+        "--device",
+        metavar="NAME",
+        help='"cpu", "cuda:0", "cuda:0,cuda:2", "cuda:all" for every GPU of this host; by default the first GPU, else '
+        "the CPU.",
+    ),
+]
+EngineName = Annotated[
+    str,
+    typer.Option("--engine", metavar="NAME", help='"local" for the devices of this host, "ray" for workers of Ray.'),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT", help='A running Ray cluster, or "auto"; by default Ray is started on this machine.'
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1, metavar="N", help="Workers of Ray; by default one for each GPU, without any one for each machine."
+    ),
+]
 Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threads; by default one for each core.")]
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Allow an output directory that is not empty.")]
@@ -78,6 +103,25 @@ def read_scene(
     scene = scene.with_overrides(overrides or [])
     given = {"photons": photons, "seed": seed}
     return scene.with_overrides(transport={name: value for name, value in given.items() if value is not None})
+
+
+def read_engine(name: str, address: str | None, workers: int | None) -> Ray | None:
+    """What `engine=` takes."""
+    if name not in ("local", "ray"):
+        raise typer.BadParameter(f"{name!r} is not local or ray", param_hint="--engine")
+    if name == "ray":
+        return spadwarp.Ray(address, workers)
+    for option, value in {"--ray-address": address, "--workers": workers}.items():
+        if value is not None:
+            raise typer.BadParameter("needs --engine ray", param_hint=option)
+    return None
+
+
+def one_device(devices: str | None, engine: Ray | None) -> str | None:
+    """Where what a single device does after a run is done."""
+    if devices is None or engine is not None:
+        return None
+    return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]
 
 
 def load_run(place: Path) -> Result:

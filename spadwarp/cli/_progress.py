@@ -49,8 +49,8 @@ def _lines(unit: str) -> Report:
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal told, told_done, patience
-        if stage == "compile":
-            complain(_COMPILING)
+        if stage != "trace":
+            complain(_COMPILING if stage == "compile" else stage)
             return
         rate, seconds = pace(done)
         waited = time.monotonic() - told
@@ -85,6 +85,9 @@ def _bar(unit: str) -> Iterator[Report]:
         def report(stage: str, done: int, total: int) -> None:
             if stage == "compile":
                 bar.update(task, description=_COMPILING, total=None)
+                return
+            if stage != "trace":
+                bar.console.print(stage, markup=False, highlight=False)
                 return
             rate, _ = pace(done)
             text = f"{count(done)} {unit}" + (f", {rate:.3g} {unit}/s" if rate else "")

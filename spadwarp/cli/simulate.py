@@ -16,19 +16,24 @@ from spadwarp.errors import ConfigError, FileError
 
 from ._app import INTERRUPTED, app, complain, fail, say
 from ._options import (
-    Device,
+    Devices,
+    EngineName,
     Json,
     Mesh,
     Overrides,
     Overwrite,
     Photons,
     Quiet,
+    RayAddress,
     Seed,
     Threads,
+    Workers,
     check_writable,
     count,
     load_run,
+    one_device,
     prepare_directory,
+    read_engine,
     read_scene,
     rows,
     whole_number,
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
 _RECORD_BYTES = 52  # of one photon's terminal state, id included
 _OTHER_BYTES = 16 << 20  # pictures, maps, text
 _NAMES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr")
+_CHECKPOINT = "checkpoint.h5"  # there while a run is not finished
 _PICTURES = ("depth.png", "intensity.png", "histogram.png", "truth.png")
 
 
@@ -58,7 +64,10 @@ def simulate(
         Path | None, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)
     ] = None,
     mesh: Mesh = None,
-    device: Device = None,
+    device: Devices = None,
+    engine_name: EngineName = "local",
+    ray_address: RayAddress = None,
+    workers: Workers = None,
     photons: Photons = None,
     seed: Seed = None,
     overrides: Overrides = None,
@@ -82,14 +91,29 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Add photons to the finished or interrupted run in DIR until it has --photons in all (by default its "
-            "scene's), and write it back there.",
+            help="Go on with the finished, interrupted or killed run in DIR until it has --photons in all (by default "
+            "what it was asked for), and write it back there.",
         ),
     ] = None,
+    checkpoint: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="How often what is done is kept in --out, for --resume after a crash; more seldom if writing takes "
+            "long. 0: never.",
+        ),
+    ] = 60.0,
     first_photon: Annotated[
         int,
         typer.Option(parser=whole_number, metavar="ID", help="Id of the first photon; `spadwarp merge` adds the runs."),
     ] = 0,
+    shard_text: Annotated[
+        str | None,
+        typer.Option(
+            "--shard", metavar="I/N", help="Only part I of N equal parts of the photons; `spadwarp merge` adds them."
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json_path: Json = None,
@@ -97,7 +121,8 @@ def simulate(
     """Trace photons through a scene into histograms.
 
     Writes to the output directory: result.h5 (everything, for `spadwarp info` and `spadwarp.load_result`), scene.toml
-    (the full scene as it was run), depth.exr, truth.exr and pictures. Ctrl-C ends the run and writes what is done.
+    (the full scene as it was run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and writes what
+    is done; after a crash --resume goes on from the last checkpoint.
 
     \b
     Examples:
@@ -106,14 +131,18 @@ def simulate(
           --photons 2e9 --seed 7 --out run1/ --set medium.extinction=0.9
       spadwarp simulate configs/scenes/plane_5m.toml --relative-error 0.02 --photons 1e8 --out run2/
       spadwarp simulate --resume run1/ --photons 4e9
+      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e10 --device cuda:all --out run3/
+      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --engine ray --ray-address auto --out run4/
+      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
     """
     earlier = None
     if resume is not None:
-        given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
+        given: dict[str, Any] = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
         given |= {
-            "--first-photon": first_photon or None,
-            "--records": records or None,
-            "--overwrite": overwrite or None,
+            "--first-photon": first_photon,
+            "--shard": shard_text,
+            "--records": records,
+            "--overwrite": overwrite,
         }
         if clash := [name for name, value in given.items() if value]:
             raise typer.BadParameter(f"goes without {', '.join(clash)}: the run knows them", param_hint="--resume")
@@ -124,35 +153,47 @@ def simulate(
         if scene_path is None or out is None:
             raise typer.BadParameter("is missing", param_hint="SCENE" if scene_path is None else "--out")
         scene = read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
-    if records and first_photon:
-        raise typer.BadParameter("goes without --first-photon: records begin at photon 0", param_hint="--records")
+    if records and (first_photon or shard_text):
+        raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
+    shard = None if shard_text is None else _shard(shard_text)
+    engine = read_engine(engine_name, ray_address, workers)
     if records and scene.transport.photons >= 2**31:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
     for message in spadwarp.check(scene):
         if message.level == "warning":
             complain(str(message))
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
-    needed = bytes_needed(scene, records=records, batches=batches)
+    needed = bytes_needed(scene, records=records, batches=batches, checkpoint=checkpoint > 0)
     prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
+    kept = out / _CHECKPOINT
+    if earlier is None:
+        _forget(kept)
     if json_path is not None:
         check_writable(json_path.parent)
 
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
+            photons=photons if earlier is not None else None,
             device=device,
+            engine=engine,
             threads=threads,
             progress=report,
             uncertainty=uncertainty,
             relative_error=relative_error,
             first_photon=first_photon,
+            shard=shard,
             resume=earlier,
+            checkpoint=kept if checkpoint > 0 else None,
+            checkpoint_every=checkpoint,
         )
-    written, frame = write_run(result, out, device=device)
+    single = one_device(device, engine)
+    written, frame = write_run(result, out, device=single)
+    _forget(kept)
     if records and not result.partial:
-        written.append(_write_records(scene, result.photons, out, device=device, quiet=quiet))
-    kept = {"records.h5"} if earlier is not None else set()
-    for name in {*_NAMES, *_PICTURES} - kept:  # left from an earlier run, they would be taken for this one's
+        written.append(_write_records(scene, result.photons, out, device=single, quiet=quiet))
+    spared = {"records.h5"} if earlier is not None else set()
+    for name in {*_NAMES, *_PICTURES} - spared:  # left from an earlier run, they would be taken for this one's
         if out / name not in written:
             (out / name).unlink(missing_ok=True)
 
@@ -165,30 +206,53 @@ def simulate(
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
     if result.partial:
         left_out = "; no records were written" if records else ""
+        asked = result.requested[1] - result.requested[0]
         fail(
-            f"interrupted after {count(result.photons)} of {count(scene.transport.photons)} photons, "
+            f"interrupted after {count(result.photons)} of {count(asked)} photons, "
             f"which are written and marked partial{left_out}",
             INTERRUPTED,
         )
 
 
 def _earlier(place: Path, photons: int | None) -> Result:
-    """The run to resume, its scene asking for as many photons as it shall have."""
+    """The run to resume: its result or its checkpoint, whichever is newer; its scene asks for as many photons as it
+    shall have."""
+    if place.is_dir():
+        there = [path for name in ("result.h5", _CHECKPOINT) if (path := place / name).is_file()]
+        place = max(there, key=lambda path: path.stat().st_mtime_ns, default=place)
     earlier = load_run(place)
-    wanted = earlier.scene.transport.photons if photons is None else photons
+    start, stop = earlier.requested
+    wanted = stop - start if photons is None else photons
     if wanted <= earlier.photons:
         raise ConfigError(f"--photons: {wanted} is no more than the {earlier.photons} that {place} has")
-    return replace(earlier, scene=earlier.scene.with_overrides(transport={"photons": wanted}))
+    if photons is None:
+        return earlier
+    return replace(earlier, scene=earlier.scene.with_overrides(transport={"photons": photons}))
+
+
+def _forget(checkpoint: Path) -> None:
+    """Removes a checkpoint, and what a killed run has left of one."""
+    for path in (checkpoint, *checkpoint.parent.glob(f".{checkpoint.name}.*.tmp")):
+        path.unlink(missing_ok=True)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    number, _, parts = text.partition("/")
+    if not (number.isdecimal() and parts.isdecimal()):
+        raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint="--shard")
+    return int(number), int(parts)
 
 
 def _has_errors(result: Result) -> bool:
     return result.squares is not None and result.photons >= 2 * result.batch_size
 
 
-def bytes_needed(scene: Scene, *, records: bool, batches: bool) -> int:
+def bytes_needed(scene: Scene, *, records: bool, batches: bool, checkpoint: bool = False) -> int:
     """Upper bound of what a run writes; compression takes off most of it."""
     tallies = (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
-    return tallies + _OTHER_BYTES + (_RECORD_BYTES * scene.transport.photons if records else 0)
+    return (
+        (2 if checkpoint else 1) * tallies + _OTHER_BYTES + (_RECORD_BYTES * scene.transport.photons if records else 0)
+    )
 
 
 def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:

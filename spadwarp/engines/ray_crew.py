@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import platform
 import signal
 import socket
 import threading
@@ -34,15 +33,19 @@ class _Actor:
         self._cuda, self._threads = cuda, threads
 
     def join(self, prepare: Callable[[Worker], None] | None) -> dict[str, Any]:
-        from spadwarp.hardware import pick_device
+        from spadwarp.hardware import pick_device, processor_name
 
         # Ray shows a process no GPU but its own.
         device = pick_device("cuda:0" if self._cuda else "cpu")
         self._worker = Worker(device.alias, None if self._cuda else self._threads)
         if prepare is not None:
             prepare(self._worker)
-        name = device.name if self._cuda else platform.processor() or platform.machine()
-        return {"host": socket.gethostname(), "pid": os.getpid(), "device": device.alias, "device_name": name}
+        return {
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "device": device.alias,
+            "device_name": processor_name(device),
+        }
 
     def run(self, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         return work(*arguments, self._worker)
@@ -99,6 +102,7 @@ class Crew:
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], Member]] = {}
         self.members: list[Member] = []
+        self._losses = 0  # since something was returned
 
     def __enter__(self) -> Crew:
         try:
@@ -184,14 +188,19 @@ class Crew:
             self.members.remove(member)
             with contextlib.suppress(Exception):
                 self._ray.kill(member.actor)
-            if member.about is None:
-                raise DeviceError(f"a worker of Ray could not start: {_first_line(error)}") from error
-            self._note(f"lost the worker {_place(member)}: {_first_line(error)}; another takes its place")
+            self._losses += 1
+            if self._losses > LIVES * (len(self.members) + 1):
+                raise DeviceError(
+                    f"Ray lost {self._losses} workers one after the other: {_first_line(error)}"
+                ) from error
+            self._note(f"lost the worker {_place(member)}; another takes its place")
             self._hire()
             return Event("lost", member)
         if kind == "joined":
             member.about = value
             self._note(f"worker {_place(member)}")
+        else:
+            self._losses = 0
         return Event(kind, member, value)
 
     def stop(self) -> None:
@@ -229,7 +238,7 @@ def run_on_ray(
             if not running and (stopped.is_set() or crew.idle):
                 return
             for event in crew.wait(0.2):
-                if event.kind == "joined":
+                if event.member not in running:  # it has joined, or was lost before
                     continue
                 job, lives = running.pop(event.member)
                 if event.kind == "returned":
@@ -270,7 +279,9 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
 
 
 def _place(member: Member) -> str:
-    about = member.about or {}
+    about = member.about
+    if about is None:
+        return "that was about to join"
     return f"{about['host']} {about['device']} ({about['device_name']}), process {about['pid']}"
 
 

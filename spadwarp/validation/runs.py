@@ -35,7 +35,7 @@ class Run:
 
     def records(self, tables: Mapping[str, Any], *, key: str | None = None) -> Iterator[Any]:
         """`PhotonRecords` of blocks of photons; random numbers of its own for each scene, or for each `key`."""
-        from spadwarp.simulation import trace
+        from spadwarp.records import trace
 
         traced = Scene.from_dict(tables)
         for block, start in enumerate(range(0, self.photons, BLOCK)):

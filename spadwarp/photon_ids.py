@@ -1,0 +1,84 @@
+"""Which photons: ids as [start, stop) ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from spadwarp.errors import ConfigError
+
+Range = tuple[int, int]
+Ranges = tuple[Range, ...]
+
+
+def joined(ranges: Iterable[Range]) -> Ranges:
+    """The ranges in order, those that adjoin made one.
+
+    Raises:
+        ConfigError: Ids are in more than one of them.
+    """
+    whole: list[Range] = []
+    for start, stop in sorted(ranges):
+        if whole and start < whole[-1][1]:
+            raise ConfigError(f"photon ids {start} to {min(stop, whole[-1][1]) - 1} are in more than one result")
+        if whole and start == whole[-1][1]:
+            whole[-1] = (whole[-1][0], stop)
+        elif start < stop:
+            whole.append((start, stop))
+    return tuple(whole)
+
+
+def without(span: Range, done: Ranges) -> Ranges:
+    """What `done`, joined ranges, leaves of a span."""
+    left: list[Range] = []
+    start, stop = span
+    for first, last in done:
+        if start < min(first, stop):
+            left.append((start, min(first, stop)))
+        start = max(start, last)
+    if start < stop:
+        left.append((start, stop))
+    return tuple(left)
+
+
+def count(ranges: Iterable[Range]) -> int:
+    """How many ids there are."""
+    return sum(stop - start for start, stop in ranges)
+
+
+def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
+    """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
+
+    Raises:
+        ConfigError: There is no such part, or there are more parts than units.
+    """
+    (number, parts), (start, stop) = shard, span
+    if not 1 <= number <= parts:
+        raise ConfigError(f"shard = {number}/{parts} is outside [1/{parts}, {parts}/{parts}]")
+    units = (stop - start) // unit
+    if units < parts:
+        raise ConfigError(f"shard = {number}/{parts}: {stop - start} photons are {units} units of {unit}, too few")
+    return start + unit * (units * (number - 1) // parts), start + unit * (units * number // parts)
+
+
+class Queue:
+    """Ids that wait, handed out from the front; what was lost comes back to it."""
+
+    def __init__(self, ranges: Iterable[Range]) -> None:
+        self._ranges = sorted(ranges, reverse=True)
+        self.left = count(self._ranges)
+
+    def take(self, size: int) -> Range | None:
+        """At most `size` ids; None if none are left."""
+        if not self._ranges:
+            return None
+        start, stop = self._ranges.pop()
+        if stop - start > size:
+            self._ranges.append((start + size, stop))
+            stop = start + size
+        self.left -= stop - start
+        return start, stop
+
+    def put_back(self, ranges: Iterable[Range]) -> None:
+        """Ids that are to be done again."""
+        self._ranges = sorted([*self._ranges, *ranges], reverse=True)
+        self.left = count(self._ranges)
