@@ -163,6 +163,13 @@ def _targets(shape: _Shape) -> Iterator[CheckMessage]:
         triangles = shape.triangles[shape.target == index]
         if len(triangles):
             yield from _placement(shape, f"targets[{index}]", triangles)
+    for index, target in enumerate(scene.targets):
+        if target.specular > 0.0:
+            text = (
+                f"specular = {target.specular:g} acts in `simulate` alone: the analytic simulator, budgets and the"
+                " signal named here take the target as Lambertian"
+            )
+            yield CheckMessage("note", f"targets[{index}].specular", text, {"specular": target.specular})
     (low, high), laser = scene.domain.bounds, scene.laser.position
     for place, point in (("the lens", (0.0, 0.0, 0.0)), ("the laser", laser)):
         if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):

@@ -216,3 +216,8 @@ def test_many_small_faces_agree_with_two_large_ones():
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_every_shipped_scene_is_free_of_warnings(path):
     assert warnings(check(load_scene(path))) == []
+
+
+def test_a_specular_lobe_is_said_to_be_left_out_of_budgets():
+    shiny = BASE.with_overrides({"targets[0].specular": 0.3})
+    assert find(check(shiny, plate(5.0)), "targets[0].specular", "note").values == {"specular": 0.3}

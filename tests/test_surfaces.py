@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +105,60 @@ def test_wavelength_picks_the_channel_and_encoding_and_scale_apply(tmp_path):
     for wavelength, values in ((640.0, 255 - green), (450.0, green // 2)):
         mesh = build_mesh(one.with_overrides({"laser.wavelength_nm": wavelength}))
         np.testing.assert_allclose(mesh.pattern.images[0], values / 255, atol=1e-7)
+
+
+def test_an_obj_file_with_two_materials_and_a_ply_file_with_an_image(tmp_path):
+    """Kd is linear and multiplies map_Kd, to more than the 8 bits that a colour has."""
+    chart(tmp_path, "obj")[0].unlink()
+    image = next(tmp_path.glob("*.png"))
+    materials = f"newmtl dark\nKd 0.5 0.0123 0.5\n\nnewmtl picture\nKd 0.5 0.5 0.5\nmap_Kd {image.name}\n"
+    (tmp_path / "two.mtl").write_text(materials)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    faces = "usemtl dark\nf 1/1 2/2 3/3\nusemtl picture\nf 2/2 3/3 1/1\n"
+    (tmp_path / "two.obj").write_text(f"mtllib two.mtl\n{corners}{faces}")
+    pattern = build_mesh(scene(targets=[target(tmp_path / "two.obj")])).pattern
+    order = np.argsort(pattern.texture)
+    np.testing.assert_allclose(pattern.corners[order], [[0.0123] * 3, [0.5] * 3], rtol=1e-6)
+    assert pattern.texture[order].tolist() == [-1, 0]
+    (tmp_path / "one.ply").write_text(
+        f"ply\nformat ascii 1.0\ncomment TextureFile {image.name}\nelement vertex 3\n"
+        "property float x\nproperty float y\nproperty float z\nproperty float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\n"
+        "end_header\n0 0 0 0.25 0.5\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n"
+    )
+    of_ply = build_mesh(scene(targets=[target(tmp_path / "one.ply")])).pattern
+    np.testing.assert_array_equal(of_ply.images[0], pattern.images[0])
+    assert of_ply.coordinates.tolist() == [[[0.25, 0.5], [1, 0], [0, 1]]]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_glb_colours_are_linear_at_any_depth(dtype, tmp_path):
+    """A triangle written by hand: trimesh itself would cut 16 bits to 8."""
+    greens = np.array([0.0, 0.2, 1.0])
+    top = 1.0 if dtype is np.float32 else np.iinfo(dtype).max
+    colours = (np.array([[1.0, green, 0.0, 1.0] for green in greens]) * top).astype(dtype)
+    chunks = [np.eye(3, dtype=np.float32).tobytes(), np.arange(3, dtype=np.uint32).tobytes(), colours.tobytes()]
+    starts = np.cumsum([0, *map(len, chunks)]).tolist()
+    codes = [5126, 5125, {np.uint8: 5121, np.uint16: 5123, np.float32: 5126}[dtype]]
+    accessors = zip(codes, ("VEC3", "SCALAR", "VEC4"), strict=True)
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1}]}],
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [{"buffer": 0, "byteOffset": starts[i], "byteLength": len(chunks[i])} for i in range(3)],
+        "accessors": [
+            {"bufferView": i, "componentType": code, "type": kind, "count": 3, "normalized": i == 2 and top > 1}
+            for i, (code, kind) in enumerate(accessors)
+        ],
+    }
+    text = json.dumps(document).encode()
+    parts = [(text + b" " * (-len(text) % 4), b"JSON"), (b"".join(chunks), b"BIN\0")]
+    body = b"".join(struct.pack("<I", len(part)) + name + part for part, name in parts)
+    path = tmp_path / "deep.glb"
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body)
+    mesh = build_mesh(scene(targets=[target(path)]))
+    np.testing.assert_allclose(np.sort(mesh.pattern.corners[0]), greens, atol=1 / min(top, 255) ** 2 + 1e-7)
 
 
 def test_faces_of_one_colour_need_no_pattern(tmp_path):
