@@ -122,7 +122,8 @@ def test_an_obj_file_with_two_materials_and_a_ply_file_with_an_image(tmp_path):
     assert pattern.texture[order].tolist() == [-1, 0]
     (tmp_path / "one.ply").write_text(
         f"ply\nformat ascii 1.0\ncomment TextureFile {image.name}\nelement vertex 3\n"
-        "property float x\nproperty float y\nproperty float z\nproperty float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\n"
+        "property float x\nproperty float y\nproperty float z\nproperty float s\nproperty float t\n"
+        "element face 1\nproperty list uchar int vertex_indices\n"
         "end_header\n0 0 0 0.25 0.5\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n"
     )
     of_ply = build_mesh(scene(targets=[target(tmp_path / "one.ply")])).pattern
