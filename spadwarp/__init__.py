@@ -31,6 +31,9 @@ _HOMES = {
     "PhotonRecords": "records",
     "truth_maps": "model",
     "devices": "hardware",
+    "doctor": "health",
+    "Diagnosis": "health",
+    "SelfTest": "health",
     "Result": "result",
     "merge": "sums",
     "Truth": "result",
@@ -85,6 +88,7 @@ if TYPE_CHECKING:
     from spadwarp.exports import export
     from spadwarp.files import load_result
     from spadwarp.hardware import devices
+    from spadwarp.health import Diagnosis, SelfTest, doctor
     from spadwarp.model import truth_maps
     from spadwarp.records import PhotonRecords, trace
     from spadwarp.response import InstrumentResponse, instrument_response

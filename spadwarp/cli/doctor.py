@@ -1,0 +1,55 @@
+"""`spadwarp doctor`: is everything there, and does it compute what it should?"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import typer
+
+import spadwarp
+
+from ._app import app, complain, fail, say
+from ._options import Device, Json, Quiet, rows, write_json
+
+
+@app.command()
+def doctor(
+    device: Device = None,
+    self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Trace two small scenes.")] = True,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """What is installed and seen, and a self-test.
+
+    Versions, devices, driver, kernel cache, and what is missing for a GPU.
+
+    The self-test takes a few seconds, the first time as many again to compile its kernels: light straight from a plate
+    against the lidar equation, a slab against published values. Exit code 1 if something is in the way or it fails.
+
+    \b
+    Example:
+      spadwarp doctor
+      spadwarp doctor --device cpu --json report.json
+    """
+    found = spadwarp.doctor(device=device, self_test=self_test, progress=None if quiet else complain)
+    if not quiet:
+        for title, facts in found.facts.items():
+            say(f"{title}\n{rows(facts, indent='  ')}")
+        if found.gpu:
+            say("No GPU is used\n" + "\n".join(f"  {reason}" for reason in found.gpu))
+        if found.tests:
+            took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
+            say(f"Self-test ({took})")
+            say(rows({test.name: _told(test) for test in found.tests}, indent="  "))
+    write_json({**dataclasses.asdict(found), "healthy": found.healthy}, json_path)
+    if not found.healthy:
+        failed = [f"self-test: {test.name}: {_told(test)}" for test in found.tests if not test.passed]
+        fail("\n".join([*found.problems, *failed]))
+
+
+def _told(test: spadwarp.SelfTest) -> str:
+    verdict = "ok" if test.passed else "FAILED"
+    if not test.standard_error:
+        return f"{test.value:g} ({verdict})"
+    return f"{test.value:.5f} ± {test.standard_error:.5f}, known: {test.reference:.5f} ({verdict})"
