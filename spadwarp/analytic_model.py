@@ -223,6 +223,7 @@ def pixel_maps(
     device: Any = None,
     backscatter_profile: NDArray[np.float32] | None = None,
     gate: tuple[float, float] | None = None,
+    outliers: bool = True,
 ) -> tuple[dict[str, Map], tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """The model's maps for any lines of sight, by name as in `AnalyticResult`, and the table of backscatter over path.
 
@@ -235,6 +236,7 @@ def pixel_maps(
         device: Warp device.
         backscatter_profile: float32 `[1 or P, T]`, detections per pulse and bin.
         gate: (start, stop) [s] in place of the scene's.
+        outliers: Whether `outlier_probability` is wanted, which takes most of the time; else it is NaN.
 
     Returns:
         float64 maps `[P]`; edges in path [m] and cumulative distribution of the backscatter, float32 `[1 or P, n]`.
@@ -294,6 +296,7 @@ def pixel_maps(
         count_law=chosen.count_law,
         acquisitions=chosen.pulses if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=per_frame,
+        outliers=outliers,
     )
     signal, arrival, backscatter = signal_d.numpy(), arrival_d.numpy(), total_d.numpy()
     alpha, fisher, sigma_time, level, outlier = (one.numpy() for one in statistics)

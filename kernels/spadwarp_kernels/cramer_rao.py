@@ -141,6 +141,7 @@ def _statistics(
     count_law: int,
     acquisitions: wp.float64,
     pulses_per_frame: wp.float64,
+    with_outliers: int,
     # Out:
     alpha: wp.array(dtype=wp.float64),
     fisher: wp.array(dtype=wp.float64),
@@ -211,7 +212,8 @@ def _statistics(
     if information > _ZERO:
         f = information / a
         sigma_star = _ONE / wp.sqrt(counts * f)
-        p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
+        if with_outliers == 1:
+            p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
     fisher[i] = f
     sigma_time[i] = sigma_star
     level[i] = flat * sigma
@@ -292,6 +294,7 @@ def statistics_maps(
     count_law: str,
     acquisitions: float,
     pulses_per_frame: float = 1.0,
+    outliers: bool = True,
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
@@ -307,12 +310,13 @@ def statistics_maps(
         count_law: One of `COUNT_LAWS`.
         acquisitions: Pulses (`"per_pulse"`), or frames.
         pulses_per_frame: ην, for the laws per frame.
+        outliers: Whether their probability is wanted, which takes most of the time; else it is NaN.
 
     Where no signal falls into the gate, F is 0, and σ* and the outlier probability are NaN.
     """
     count, device = view.shape[0], view.device
     out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
-    counting = [COUNT_LAWS.index(count_law), wp.float64(acquisitions), wp.float64(pulses_per_frame)]
+    counting = [COUNT_LAWS.index(count_law), wp.float64(acquisitions), wp.float64(pulses_per_frame), int(outliers)]
     inputs = [lidar, phase, profile, view, signal, arrival, backscatter, *counting, *out]
     launch_pixels(_statistics, count, inputs, device=device)
     return out

@@ -47,7 +47,9 @@ def make(
     if overrides:
         recipe = recipe.with_overrides(overrides)
     with progress(quiet=quiet, unit="frames") as report:
-        found = spadwarp.make_dataset(recipe, out, device=device, shard=_part(shard), progress=report)
+        found = spadwarp.make_dataset(
+            recipe, out, device=device, engine=crew, shard=_part(shard), progress=report, note=None if quiet else complain
+        )
     summary = {
         "folder": found.folder,
         "frames": found.frames,

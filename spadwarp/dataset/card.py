@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from .columns import FRAME_COLUMNS, scene_columns
 from .plan import Plan
 from .recipe import SPLITS
-from .shards import FRAME_COLUMNS, scene_columns
 
 __all__ = ["card"]
 

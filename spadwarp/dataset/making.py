@@ -9,20 +9,22 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from spadwarp.engines import Ray, Worker, interruptible, run_jobs
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.files import atomic_path
 from spadwarp.hardware import core_count
 
 from .card import card
+from .columns import FORMAT_VERSION
 from .plan import Plan, Shard
 from .recipe import SPLITS, Recipe, load_recipe
-from .shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
+from .shards import checksum, write_scene_index, write_shard
 
 __all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
 
@@ -55,48 +57,53 @@ def make_dataset(
     out: str | os.PathLike[str],
     *,
     device: str | None = None,
+    engine: Ray | None = None,
     shard: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> DatasetReport:
     """Makes what is missing or broken of a dataset.
 
     Args:
         recipe: From `load_recipe`, or its path.
         out: The dataset's folder; new, or that of the same recipe.
-        device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
+        device: "cpu", "cuda:0", "cuda:all", ...; by default the first GPU, else the CPU. A device that is named twice
+            ("cuda:0,cuda:0") has two processes at work.
+        engine: `spadwarp.engines.Ray` for its workers, which have to see the folder; None for this host.
         shard: (k, n): only every n-th shard, from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
         progress: Called with ("frames", done, all that will be made).
+        note: Told what a person may want to know about the workers.
 
     Raises:
         ConfigError: A recipe that cannot be used, or another one's dataset in the folder.
         FileError: The folder cannot be written or is full; whole shards stay.
+        KeyboardInterrupt: Ctrl-C, once the shards in hand are finished.
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
     part, parts = shard
     if not 1 <= part <= parts:
         raise ConfigError(f"shard = {part}/{parts}: {part} is outside [1, {parts}]")
-    folder = Path(out)
+    folder = Path(out).absolute()
     _claim(plan, folder)
     mine = [one for one in plan.shards if one.index % parts == part - 1]
-    state = _check(folder, mine)
+    state = _check(plan, folder, mine)
     todo = [one for one in mine if state[one.index] != ""]
     total = sum(one.scenes for one in todo) * plan.frames_per_scene
     _check_room(plan, folder, total)
     done = 0
-
-    def report(frames: int) -> None:
-        nonlocal done
-        done += frames
-        if progress is not None:
-            progress("frames", done, total)
-
-    for one in todo:
-        _record_path(folder, one).unlink(missing_ok=True)
-        written = write_shard(plan, one, folder, device=device, progress=report)
-        _write_json(_record_path(folder, one), written)
+    if progress is not None and total:
+        progress("compile", 0, 0)
+    jobs = [_Job(plan.recipe, folder, one.index) for one in todo]
+    with interruptible() as stopped:
+        for _, frames in run_jobs(_make_shard, jobs, engine=engine, device=device, stopped=stopped, note=note):
+            done += frames
+            if progress is not None:
+                progress("frames", done, total)
     missing = _finish(plan, folder)
+    if done < total:
+        raise KeyboardInterrupt
     return DatasetReport(
-        folder=folder,
+        folder=Path(out),
         made=tuple(one.frames_file for one in todo),
         kept=tuple(one.frames_file for one in mine if state[one.index] == ""),
         missing=missing,
@@ -117,12 +124,12 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
     plan = Plan(load_recipe(recipe))
     wrong = [
         f"{one.frames_file}: missing" if text == "missing" else text
-        for one, text in zip(plan.shards, _check(place, plan.shards).values(), strict=True)
+        for one, text in zip(plan.shards, _check(plan, place, plan.shards).values(), strict=True)
         if text
     ]
     if (place / "manifest.json").is_file():
         files = read_manifest(place)["files"]
-        known = {name for one in plan.shards for name in (one.frames_file, one.scenes_file)}
+        known = {name for one in plan.shards for name in plan.files_of(one)}
         wrong += [text for name in sorted(set(files) - known) if (text := _compare(place, name, files[name]))]
     else:
         wrong.append("manifest.json: missing")
@@ -148,6 +155,28 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
 # Parts
 
 
+class _Job(NamedTuple):
+    recipe: Recipe
+    folder: Path
+    shard: int
+
+
+def _make_shard(job: _Job, worker: Worker) -> int:
+    """Makes a shard and its record; returns its frames."""
+    known = worker.state.get("plan")
+    plan = known if known is not None and known.recipe == job.recipe else Plan(job.recipe)
+    worker.state["plan"] = plan
+    shard = plan.shards[job.shard]
+    record = _record_path(job.folder, shard)
+    try:
+        record.unlink(missing_ok=True)
+    except OSError as error:
+        raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
+    written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
+    _write_json(record, written)
+    return shard.scenes * plan.frames_per_scene
+
+
 def _record_path(folder: Path, shard: Shard) -> Path:
     return folder / "shards" / f"{shard.name}.json"
 
@@ -170,7 +199,7 @@ def _claim(plan: Plan, folder: Path) -> None:
         raise FileError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
-def _check(folder: Path, shards: Any) -> dict[int, str]:
+def _check(plan: Plan, folder: Path, shards: Sequence[Shard]) -> dict[int, str]:
     """For each shard "" (whole), "missing", or what is wrong with it."""
 
     def state(shard: Shard) -> str:
@@ -182,7 +211,7 @@ def _check(folder: Path, shards: Any) -> dict[int, str]:
             return "missing"
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             return f"{path}: cannot be read: {error}"
-        if set(files) != {shard.frames_file, shard.scenes_file}:
+        if set(files) != set(plan.files_of(shard)):
             return f"{path}: not the record of this shard"
         return next((text for name in files if (text := _compare(folder, name, record[name]))), "")
 
@@ -203,9 +232,10 @@ def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
 
 
 def _check_room(plan: Plan, folder: Path, frames: int) -> None:
-    """Frames take up to 3.2 bytes a pixel, scenes up to 20."""
-    pixels = plan.shape[0] * plan.shape[1]
-    needed = int(frames * pixels * (3.2 + 20.0 / plan.frames_per_scene))
+    """Frames take up to 3.2 bytes a pixel, scenes up to 20; of histograms a half of 2 bytes a bin is sure to be left."""
+    pixels, recipe = plan.shape[0] * plan.shape[1], plan.recipe
+    scene = 20.0 + recipe.monte_carlo.share * recipe.gate.bins
+    needed = int(frames * pixels * (3.2 + scene / plan.frames_per_scene))
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise FileError(f"{folder}: up to {needed / 1e9:.3g} GB will be written; {free / 1e9:.3g} GB are free there")

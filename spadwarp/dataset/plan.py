@@ -59,6 +59,15 @@ class Shard:
     def scenes_file(self) -> str:
         return f"scenes/scenes-{self.name}.h5"
 
+    @property
+    def histograms_file(self) -> str:
+        return f"histograms-{self.name}.h5"
+
+    @property
+    def indices(self) -> range:
+        """Of its scenes."""
+        return range(self.first_scene, self.first_scene + self.scenes)
+
 
 @dataclass(frozen=True)
 class SceneDraw:
@@ -71,7 +80,9 @@ class SceneDraw:
         distance: Of the target's centre [m].
         attenuation_lengths: Extinction times distance.
         signal_photons: Of the median pixel; None where the scene's pulses hold.
-        fractions: BS of each frame; NaN where the photon rates say.
+        fractions: BS of each frame; NaN where the photon rates say, as they do where photons are traced.
+        photons: To trace; None for the analytic model.
+        seed: Of photons and camera.
     """
 
     index: int
@@ -81,6 +92,8 @@ class SceneDraw:
     attenuation_lengths: float
     signal_photons: float | None
     fractions: tuple[float, ...]
+    photons: int | None
+    seed: int
 
 
 class Plan:
@@ -174,14 +187,27 @@ class Plan:
             attenuation_lengths=float(lengths),
             signal_photons=signal,
             fractions=tuple(self.fraction(first + k) for k in range(self.frames_per_scene)),
+            photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
+            seed=int(self.generator(split, "photons", index).integers(2**63)),
         )
+
+    def files_of(self, shard: Shard) -> tuple[str, ...]:
+        """Names of a shard's files: frames, scenes, and histograms where photons are traced."""
+        traced = self.recipe.monte_carlo.share > 0 and any(map(self.is_traced, shard.indices))
+        return (shard.frames_file, shard.scenes_file, *((shard.histograms_file,) if traced else ()))
+
+    def is_traced(self, index: int) -> bool:
+        """Whether the photons of a scene are traced."""
+        share = self.recipe.monte_carlo.share
+        return bool(self.generator(self.split_of(index), "monte_carlo.share", index).random() < share)
 
     def fraction(self, sample: int) -> float:
         """BS of a sample; NaN where the photon rates say."""
         levels = self.recipe.frames.backscatter_fraction
-        if levels == "rates":
+        scene = sample // self.frames_per_scene
+        if levels == "rates" or self.is_traced(scene):
             return math.nan
-        split = self.split_of(sample // self.frames_per_scene)
+        split = self.split_of(scene)
         return float(levels.draw(self.generator(split, "frames.backscatter_fraction", sample)))
 
     def _shards(self) -> Iterator[Shard]:

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
 
+from .histograms import HistogramFile
 from .making import read_manifest
 from .recipe import SPLITS
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
-FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior")
-"""Images that an item can hold, float32 `[1, H, W]`, normals `[3, H, W]`."""
+FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", "counts", "expected")
+"""Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
 
 _SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
 
@@ -32,6 +33,7 @@ class FrameReader:
     - `intensity`: recorded photons.
     - `bound`: Cramér–Rao bound of the depth [m], NaN for no estimate.
     - `normal`: `[3, H, W]`, unit vectors towards the camera. `albedo`: Lambertian reflectance.
+    - `counts`: histograms of the frame `[T, H, W]`; `expected`: their expectation. Of traced scenes only.
     - `prior`: density [1/m] with which the water alone reports the depth in `noisy`; NaN where `noisy` is.
 
     And numbers: `sample`, `scene`, `target` (int64), `backscatter_fraction`, `attenuation_lengths`, `distance`
@@ -184,6 +186,8 @@ class _Shard:
 
         self.frames = _opened(folder / name)
         self.scenes = _opened(folder / "scenes" / name.replace("frames-", "scenes-"))
+        cubes = folder / name.replace("frames-", "histograms-")
+        self.histograms = HistogramFile(_opened(cubes)) if cubes.is_file() else None
         depth = self.frames["depth"]
         self.step, self.offset = np.float32(depth.attrs["step"]), np.float32(depth.attrs["offset"])
         self.width: int = depth.shape[2]
@@ -212,10 +216,21 @@ class _Shard:
                 out[name] = (self.stored["intensity"][(row, *window)] * scale).astype(np.float32)[None]
             elif name == "prior":
                 out[name] = self._prior(scene, self._noisy(row, window))[None]
+            elif name in ("counts", "expected"):
+                out[name] = np.moveaxis(self._histogram(name, row)[window], -1, 0)
             else:
                 image = np.array(self.scene_images[name][(scene, *window)], np.float32)
                 out[name] = np.moveaxis(image, -1, 0) if name == "normal" else image[None]
         return out
+
+    def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
+        cube = None
+        if self.histograms is not None:
+            number = int(self.columns["sample" if name == "counts" else "scene"][row])
+            cube = self.histograms.counts(number) if name == "counts" else self.histograms.expected(number)
+        if cube is None:
+            raise FileError(f"{self.frames.filename}: frame {int(self.columns['sample'][row])} has no {name!r}")
+        return cube
 
     def numbers(self, row: int) -> dict[str, Any]:
         scene = int(self.columns["scene"][row])

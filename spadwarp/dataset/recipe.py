@@ -196,6 +196,19 @@ class Frames(_Table):
     compression: Literal["none", "gzip"] = Field("none", description="of the frames; none reads fastest")
 
 
+class MonteCarlo(_Table):
+    """Scenes whose histograms are traced photon by photon; depth frames then come from the camera's counts."""
+
+    share: float = Field(0.0, ge=0, le=1, description="part of the scenes that are traced; the others are analytic")
+    photons: Whole = Field(100_000_000, ge=1, le=10**12, description="photons of a scene")
+    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = Field(
+        "matched", description="how depth is found in counts"
+    )
+    counts: Literal["none", "sparse", "dense", "smaller"] = Field(
+        "smaller", description="how the counts of frames are stored; whichever takes less room, or not at all"
+    )
+
+
 class Recipe(_Table):
     """Everything a dataset depends on, checked and frozen."""
 
@@ -213,6 +226,7 @@ class Recipe(_Table):
     gate: Window = Window()
     exposure: Exposure = Exposure()
     frames: Frames = Frames()
+    monte_carlo: MonteCarlo = MonteCarlo()
     vary: dict[str, Annotated[Distribution, BeforeValidator(_distribution)]] = Field(
         default_factory=dict, description='further fields of the scene: "laser.preset" = ["paper", ...]'
     )
