@@ -49,7 +49,7 @@ def _lines(unit: str) -> Report:
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal told, told_done, patience
-        if stage != "trace":
+        if not total:
             complain(_COMPILING if stage == "compile" else stage)
             return
         rate, seconds = pace(done)
@@ -86,7 +86,7 @@ def _bar(unit: str) -> Iterator[Report]:
             if stage == "compile":
                 bar.update(task, description=_COMPILING, total=None)
                 return
-            if stage != "trace":
+            if not total:
                 bar.console.print(stage, markup=False, highlight=False)
                 return
             rate, _ = pace(done)

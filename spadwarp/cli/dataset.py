@@ -10,7 +10,19 @@ import typer
 import spadwarp
 
 from ._app import app, fail, say
-from ._options import Device, Json, Quiet, count, in_bytes, rows, write_json
+from ._options import (
+    Devices,
+    EngineName,
+    Json,
+    Quiet,
+    RayAddress,
+    Workers,
+    count,
+    in_bytes,
+    read_engine,
+    rows,
+    write_json,
+)
 from ._progress import progress
 
 group = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -30,7 +42,10 @@ def make(
         list[str] | None,
         typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the recipe; may be repeated."),
     ] = None,
-    device: Device = None,
+    device: Devices = None,
+    engine_name: EngineName = "local",
+    ray_address: RayAddress = None,
+    workers: Workers = None,
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
@@ -41,15 +56,15 @@ def make(
     \b
     Examples:
       spadwarp dataset make configs/datasets/small.toml --out data/small/
+      spadwarp dataset make configs/datasets/paper.toml --out data/paper/ --device cuda:all
       spadwarp dataset make configs/datasets/paper.toml --out data/paper/ --shard 3/64
     """
     recipe = spadwarp.load_recipe(recipe_path)
     if overrides:
         recipe = recipe.with_overrides(overrides)
+    engine = read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
-        found = spadwarp.make_dataset(
-            recipe, out, device=device, engine=crew, shard=_part(shard), progress=report, note=None if quiet else complain
-        )
+        found = spadwarp.make_dataset(recipe, out, device=device, engine=engine, shard=_part(shard), progress=report)
     summary = {
         "folder": found.folder,
         "frames": found.frames,

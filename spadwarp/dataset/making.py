@@ -60,7 +60,6 @@ def make_dataset(
     engine: Ray | None = None,
     shard: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
-    note: Callable[[str], None] | None = None,
 ) -> DatasetReport:
     """Makes what is missing or broken of a dataset.
 
@@ -71,8 +70,8 @@ def make_dataset(
             ("cuda:0,cuda:0") has two processes at work.
         engine: `spadwarp.engines.Ray` for its workers, which have to see the folder; None for this host.
         shard: (k, n): only every n-th shard, from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
-        progress: Called with ("frames", done, all that will be made).
-        note: Told what a person may want to know about the workers.
+        progress: Called with ("frames", done, all that will be made); any other first word is a remark for whoever
+            watches.
 
     Raises:
         ConfigError: A recipe that cannot be used, or another one's dataset in the folder.
@@ -93,6 +92,11 @@ def make_dataset(
     done = 0
     if progress is not None and total:
         progress("compile", 0, 0)
+
+    def note(text: str) -> None:
+        if progress is not None:
+            progress(text, 0, 0)
+
     jobs = [_Job(plan.recipe, folder, one.index) for one in todo]
     with interruptible() as stopped:
         for _, frames in run_jobs(_make_shard, jobs, engine=engine, device=device, stopped=stopped, note=note):
@@ -232,7 +236,7 @@ def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
 
 
 def _check_room(plan: Plan, folder: Path, frames: int) -> None:
-    """Frames take up to 3.2 bytes a pixel, scenes up to 20; of histograms a half of 2 bytes a bin is sure to be left."""
+    """Frames take up to 3.2 bytes a pixel, scenes up to 20, histograms at least half of their 2 bytes a bin."""
     pixels, recipe = plan.shape[0] * plan.shape[1], plan.recipe
     scene = 20.0 + recipe.monte_carlo.share * recipe.gate.bins
     needed = int(frames * pixels * (3.2 + scene / plan.frames_per_scene))

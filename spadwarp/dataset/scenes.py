@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from spadwarp.analytic_model import dark_rate, pixel_maps
 from spadwarp.config import SPEED_OF_LIGHT, Scene
@@ -99,7 +99,7 @@ def intensity_step(brightest: float) -> float:
     return max(1.0, math.ceil((brightest + 6.0 * math.sqrt(brightest)) / 255.0))
 
 
-def water_profile(scene: Scene, paths: ArrayLike, cumulative: ArrayLike) -> Profile:
+def water_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> Profile:
     """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
     axis = np.array([0.0, 0.0, 1.0])
     speed = SPEED_OF_LIGHT / scene.medium.group_index
@@ -154,8 +154,9 @@ def _render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rend
     guess = 0.5 * speed * (scene.gate.stop - scene.gate.start) / math.sqrt(12.0) * view.reshape(-1, 3)[:, 2]
     bound = np.where(seen, np.minimum(maps["sigma_depth"], guess), np.nan)
     axis = np.array([[0.0, 0.0, 1.0]])
-    nothing = {"distance": [np.nan], "normal": axis, "reflectance": [0.0]}
-    paths, cumulative = pixel_maps(scene, view=axis, device=device, outliers=False, **nothing)[1]
+    paths, cumulative = pixel_maps(
+        scene, view=axis, distance=[np.nan], normal=axis, reflectance=[0.0], device=device, outliers=False
+    )[1]
     return RenderedScene(
         draw=draw,
         scene=scene,

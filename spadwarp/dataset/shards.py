@@ -104,7 +104,7 @@ def _new_file(stack: ExitStack, plan: Plan, shard: Shard, folder: Path, name: st
             "target": plan.targets[shard.target].name,
             "shard": shard.index,
             "shards": len(plan.shards),
-            "read_me": "Images [frame, height, width]; camera frame +x right, +y down, +z forward; depth is planar (z).",
+            "read_me": "Images [frame, height, width]; +x right, +y down, +z away from the camera; depth is z.",
         }
     )
     return file
