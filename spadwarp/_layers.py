@@ -228,13 +228,21 @@ def key_text(key: Sequence[str | int]) -> str:
 
 
 def toml_text(tables: Mapping[str, Any]) -> str:
-    """TOML of a scene: flat tables, and lists of flat tables for `targets`."""
-    blocks = []
-    for section, fields in tables.items():
-        headed = [(f"[[{section}]]", one) for one in fields] if isinstance(fields, list) else [(f"[{section}]", fields)]
-        for header, table in headed:
-            blocks.append("\n".join([header, *(f"{name} = {toml_value(value)}" for name, value in table.items())]))
-    return "\n\n".join(blocks) + "\n"
+    """TOML of a scene: flat tables, and lists of flat tables for `targets` and `medium.layers`."""
+    return "\n\n".join(block for section, fields in tables.items() for block in _toml_blocks(section, fields)) + "\n"
+
+
+def _toml_blocks(section: str, fields: Any) -> Iterator[str]:
+    tables, header = (fields, f"[[{section}]]") if isinstance(fields, list) else ([fields], f"[{section}]")
+    for table in tables:
+        inner = {name: value for name, value in table.items() if isinstance(value, list) and _are_tables(value)}
+        yield "\n".join([header, *(f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner)])
+        for name, value in inner.items():
+            yield from _toml_blocks(f"{section}.{name}", value)
+
+
+def _are_tables(value: list[Any]) -> bool:
+    return bool(value) and all(isinstance(one, Mapping) for one in value)
 
 
 def toml_value(value: Any) -> str:

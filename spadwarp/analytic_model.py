@@ -365,6 +365,8 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
             f"analytic.form = 'paper' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
             f"of {laser.half_angle_deg}"
         )
+    if scene.medium.layers:
+        problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
     if chosen.backscatter == "single_scatter" and laser.profile == "collimated":
         problems.append(
             "analytic.backscatter = 'single_scatter' needs a diverging laser.profile, not 'collimated'; "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ._frustum import beam_planes, points_inside, view_planes
 from .catalog import WATER_INDICES
-from .config import SPEED_OF_LIGHT, Laser, Scene
+from .config import SPEED_OF_LIGHT, Laser, Layer, Medium, Scene
 from .water import group_index, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
         "albedo": scene.medium.scattering / scene.medium.extinction,
         "target_range": shape.target_range,
         "target_arrival_ns": shape.arrival_ns,
-        "optical_depth": None if shape.target_range is None else scene.medium.extinction * shape.target_range[0],
+        "optical_depth": shape.optical_depth,
         "gate_range": (shape.range_of(gate.start), shape.range_of(gate.stop)),
         "bin_range": shape.range_of(gate.bin_width),
         "path_limit": scene.path_limit,
@@ -102,6 +102,8 @@ class _Shape:
         paths = np.linalg.norm(self.lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(self.lit, axis=1)
         ranges = np.linalg.norm(self.lit, axis=1)
         self.target_range = (float(ranges.min()), float(ranges.max())) if len(ranges) else None
+        nearest = self.lit[ranges.argmin()].tolist() if len(ranges) else None
+        self.optical_depth = None if nearest is None else scene.medium.optical_depth((0.0, 0.0, 0.0), nearest)
         self.target_path = (float(paths.min()), float(paths.max())) if len(paths) else None
 
     @property
@@ -138,20 +140,20 @@ class _Shape:
 
     @property
     def samples_per_pixel(self) -> float | None:
-        if self.target_range is None or self.target_range[0] == 0.0:
+        if self.target_range is None or self.optical_depth is None or self.target_range[0] == 0.0:
             return None
         distance = self.target_range[0]
-        arriving = math.exp(-self.scene.medium.extinction * distance)
+        arriving = math.exp(-self.optical_depth)
         return self.scene.transport.photons * arriving * self._pixel_share(distance)
 
     @property
     def signal_per_pulse(self) -> float | None:
-        if self.target_range is None or self.target_range[0] == 0.0:
+        if self.target_range is None or self.optical_depth is None or self.target_range[0] == 0.0:
             return None
         scene, distance = self.scene, self.target_range[0]
         reflectance = float(self.reflectance.max())
         collected = reflectance / math.pi * scene.camera.aperture_area / distance**2  # Lambertian, towards the lens
-        fraction = self._pixel_share(distance) * math.exp(-2.0 * scene.medium.extinction * distance) * collected
+        fraction = self._pixel_share(distance) * math.exp(-2.0 * self.optical_depth) * collected
         return fraction * scene.laser.photons_per_pulse * scene.detector.pde
 
 
@@ -287,14 +289,19 @@ def _water(shape: _Shape) -> Iterator[CheckMessage]:
     medium, transport, laser = shape.scene.medium, shape.scene.transport, shape.scene.laser
     if _visible(laser):
         pure = pure_water_absorption(laser.wavelength_nm)
-        if medium.absorption < 0.95 * pure:
-            text = f"absorption = {medium.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
-            yield CheckMessage("note", "medium.absorption", text, {"absorption": medium.absorption, "pure_water": pure})
-    if medium.preset is not None and abs(laser.wavelength_nm - 532.0) > 10.0:
-        yield _preset_at_another_wavelength(medium.preset, laser)
+        for name, water in _named_waters(medium):
+            if water.absorption < 0.95 * pure:
+                text = f"absorption = {water.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
+                values = {"absorption": water.absorption, "pure_water": pure}
+                yield CheckMessage("note", f"{name}.absorption", text, values)
+    if abs(laser.wavelength_nm - 532.0) > 10.0:
+        for name, water in _named_waters(medium):
+            if water.preset is not None:
+                yield _preset_at_another_wavelength(name, water.preset, laser)
     if medium.chlorophyll is not None:
         yield from _molecular_scattering(shape.scene)
-    mean = medium.extinction * shape.scene.path_limit  # collisions along the longest path that counts
+    thickest = max(water.extinction for water in medium.waters)
+    mean = thickest * shape.scene.path_limit  # collisions along the longest path that counts
     most = mean + 3.0 * math.sqrt(mean)
     cutoff = _cutoff_collisions(shape.scene)
     values = {"path_collisions": mean, "cutoff_collisions": cutoff}
@@ -317,7 +324,13 @@ def _visible(laser: Laser) -> bool:
     return 400.0 <= laser.wavelength_nm <= 700.0
 
 
-def _preset_at_another_wavelength(preset: str, laser: Laser) -> CheckMessage:
+def _named_waters(medium: Medium) -> Iterator[tuple[str, Medium | Layer]]:
+    yield "medium", medium
+    for i, layer in enumerate(medium.layers):
+        yield f"medium.layers[{i}]", layer
+
+
+def _preset_at_another_wavelength(name: str, preset: str, laser: Laser) -> CheckMessage:
     text = f"the coefficients of {preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
     values = {"wavelength_nm": laser.wavelength_nm}
     if _visible(laser):
@@ -326,7 +339,7 @@ def _preset_at_another_wavelength(preset: str, laser: Laser) -> CheckMessage:
             "pure_water_532": pure_water_absorption(532.0),
         }
         text += f", where pure water absorbs {values['pure_water']:.3g} 1/m and not {values['pure_water_532']:.3g}"
-    return CheckMessage("warning", "medium.preset", text, values)
+    return CheckMessage("warning", f"{name}.preset", text, values)
 
 
 def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
@@ -352,6 +365,8 @@ def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
 def _cutoff_collisions(scene: Scene) -> float:
     """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
     transport, albedo = scene.transport, scene.medium.albedo
+    if albedo != "paper":
+        albedo = max(water.scattering / water.extinction for water in scene.medium.waters)
     if transport.termination != "cutoff" or transport.weight_cutoff == 0.0 or albedo == 1.0:
         return math.inf
     if albedo == 0.0:
@@ -370,7 +385,7 @@ def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
     samples, signal = shape.samples_per_pixel, shape.signal_per_pulse
     if shape.target_range is None or samples is None or signal is None:
         return
-    depth = scene.medium.extinction * shape.target_range[0]
+    depth = shape.optical_depth or 0.0
     text = (
         f"optical depth to the nearest lit point {depth:.3g} one way ({shape.target_range[0]:.4g} m); a pixel on the "
         f"beam's axis detects {signal:.3g} unscattered photons a pulse"

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
 import os
 import tomllib
@@ -38,6 +40,7 @@ __all__ = [
     "Domain",
     "Gate",
     "Laser",
+    "Layer",
     "Medium",
     "Output",
     "Scene",
@@ -101,11 +104,8 @@ class Section(BaseModel):
         return {name: value for name, value in self if value is not None}
 
 
-class Medium(Section):
-    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
-
-    What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene).
-    """
+class _Water(Section):
+    """What water does to light: two of four coefficients, or chlorophyll, from which they follow."""
 
     section: ClassVar[str] = "medium"
     preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
@@ -116,6 +116,60 @@ class Medium(Section):
         0.0,
         description='single-scattering albedo b/c, or "paper": uniform in (0, 0.97) at each collision',
     )
+    chlorophyll: float | None = Field(
+        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        if self.chlorophyll is None:
+            self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
+        elif self.given or self.preset is not None:
+            raise ValueError(f"chlorophyll = {self.chlorophyll} goes without {', '.join(self.given or ['preset'])}")
+        return self
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Names of the two coefficients that define the water, none with chlorophyll; the others follow."""
+        return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
+
+    @property
+    def attenuation_length(self) -> float:
+        """1/c [m]."""
+        return 1.0 / self.extinction
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again: of the coefficients the given ones."""
+        hidden = set(_layers.COEFFICIENTS) - set(self.given)
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
+
+
+class Layer(_Water):
+    """Water from a plane on, up to the next layer; given as a medium is."""
+
+    start: float = Field(..., description="where it begins along `layer_axis`, the scene's z if not given [m]")
+    anisotropy: float | None = Field(
+        None, gt=-1, lt=1, description="mean cosine g of the scattering angle; the medium's if not given"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        whole = _layers.merge_section(cls.section, {}, fields)
+        # A preset has indices, but one pair of them holds for all layers: the medium's.
+        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
+
+
+class Medium(_Water):
+    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
+
+    What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene). With
+    `layers` it is the water before the first of them.
+    """
+
     phase_function: Literal["henyey_greenstein"] = Field("henyey_greenstein", description="law of the scattering angle")
     anisotropy: float = Field(0.924, gt=-1, lt=1, description="mean cosine g of the scattering angle")
     group_index: float = Field(
@@ -130,13 +184,14 @@ class Medium(Section):
         le=3,
         description='refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350',
     )
-    chlorophyll: float | None = Field(
-        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
-    )
     temperature: float | None = Field(
         None, ge=0, le=30, description="gives the indices that are not given, with salinity 35 [°C]"
     )
     salinity: float | None = Field(None, ge=0, le=40, description="the same, with temperature 20 [g/kg]")
+    layers: Annotated[tuple[Layer, ...], BeforeValidator(_listed)] = Field(
+        (), description="other waters further along `layer_axis`, in its order"
+    )
+    layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers; any length but 0")
 
     @field_validator("phase_index", "group_index", mode="before")
     @classmethod
@@ -148,59 +203,86 @@ class Medium(Section):
         return value
 
     @model_validator(mode="after")
-    def _complete(self) -> Self:
-        # What was given stays in model_fields_set, from where to_dict() knows it.
-        if self.chlorophyll is None:
-            self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
-        elif self.given or self.preset is not None:
-            raise ValueError(f"chlorophyll = {self.chlorophyll} goes without {', '.join(self.given or ['preset'])}")
+    def _resolved(self) -> Self:
+        if not any(self.layer_axis):
+            raise ValueError(f"layer_axis = {list(self.layer_axis)} has no length")
+        for i, layer in enumerate(self.layers):
+            if i and layer.start <= self.layers[i - 1].start:
+                before = self.layers[i - 1].start
+                raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
+            if (layer.albedo == "paper") != (self.albedo == "paper"):
+                raise ValueError(
+                    f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
+                )
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
-        if not self.follows_wavelength:
-            return
         from .water import water_optics
 
-        optics = water_optics(
-            wavelength_nm,
-            chlorophyll=self.chlorophyll or 0.0,
-            temperature=20.0 if self.temperature is None else self.temperature,
-            salinity=35.0 if self.salinity is None else self.salinity,
-        )
-        names = ("phase_index", "group_index") + (() if self.chlorophyll is None else _layers.COEFFICIENTS)
-        self.__dict__.update({name: getattr(optics, name) for name in names if name not in self.model_fields_set})
+        temperature = 20.0 if self.temperature is None else self.temperature
+        salinity = 35.0 if self.salinity is None else self.salinity
+
+        def follow(water: _Water, names: Sequence[str]) -> None:
+            optics = water_optics(
+                wavelength_nm, chlorophyll=water.chlorophyll or 0.0, temperature=temperature, salinity=salinity
+            )
+            water.__dict__.update({name: getattr(optics, name) for name in names})
+
+        self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
+        for water in self.waters:
+            if water.chlorophyll is not None:
+                follow(water, _layers.COEFFICIENTS)
+        if self.follows_wavelength:
+            follow(self, [name for name in ("phase_index", "group_index") if name not in self.model_fields_set])
 
     @property
     def follows_wavelength(self) -> bool:
-        """Whether indices or coefficients follow from the laser's wavelength."""
+        """Whether the indices that are not given follow from the laser's wavelength."""
         return any(value is not None for value in (self.chlorophyll, self.temperature, self.salinity))
 
     def at_wavelength(self, wavelength_nm: float) -> Medium:
-        """The medium as light of a vacuum wavelength [nm] meets it; raises `ValueError` outside [400, 700]."""
-        if not self.follows_wavelength:
-            return self
+        """The medium as light of a vacuum wavelength [nm] meets it.
+
+        Raises `ValueError` outside [400, 700] if anything depends on it.
+        """
         medium = self.model_copy()
         medium._follow(wavelength_nm)
         return medium
 
     @property
-    def given(self) -> tuple[str, ...]:
-        """Names of the two coefficients that define the medium, none with chlorophyll; the others follow."""
-        return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
+    def waters(self) -> tuple[Medium | Layer, ...]:
+        """Itself and its layers, in the order of `layer_axis`."""
+        return (self, *self.layers)
 
-    @property
-    def attenuation_length(self) -> float:
-        """1/c [m]."""
-        return 1.0 / self.extinction
+    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
+        """∫c ds on the straight way between two points of the scene [m]."""
+        length = math.dist(begin, end)
+        if not self.layers or length == 0.0:
+            return self.extinction * length
+        scale = math.hypot(*self.layer_axis)
+        first, last = sorted(
+            sum(a * x for a, x in zip(self.layer_axis, point, strict=True)) / scale for point in (begin, end)
+        )
+        edges = [-math.inf, *(layer.start for layer in self.layers), math.inf]
+        if first == last:
+            return length * self.waters[bisect.bisect_right(edges, first) - 1].extinction
+        parts = (
+            water.extinction * max(0.0, min(high, last) - max(low, first))
+            for water, (low, high) in zip(self.waters, itertools.pairwise(edges), strict=True)
+        )
+        return length / (last - first) * math.fsum(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields that make an equal section again: of the coefficients the two given ones."""
-        hidden = set(_layers.COEFFICIENTS) - set(self.given)
+        """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""
+        hidden = {"layers", "layer_axis"}
         if self.follows_wavelength:
             hidden |= {"phase_index", "group_index"} - self.model_fields_set
-        return {name: value for name, value in super().to_dict().items() if name not in hidden}
+        fields = {name: value for name, value in super().to_dict().items() if name not in hidden}
+        if self.layers:
+            fields |= {"layer_axis": self.layer_axis, "layers": [layer.to_dict() for layer in self.layers]}
+        return fields
 
 
 class Laser(Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,9 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
         lit = min(max(math.pi * (spread / camera.pixel_tangent) ** 2, 1.0), pixels)
     baseline = math.hypot(laser.position[0], laser.position[1])
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
-    water = medium.scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
+    scattering = max(water.scattering for water in medium.waters)
+    extinction = min(water.extinction for water in medium.waters)
+    water = scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
     surface = 0.0
     if mesh is not None:
         lower, upper = mesh.bounds.astype(float)
@@ -57,7 +60,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
             # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
             surface *= max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
     path = 2.0 * nearest
-    brightest = 16.0 * camera.aperture_area * max(water, surface) * math.exp(-medium.extinction * path) / lit
+    brightest = 16.0 * camera.aperture_area * max(water, surface) * math.exp(-extinction * path) / lit
     brightest = min(max(brightest, 1e-30), 1.0)
     exponent = math.floor(62 - math.log2(PHOTON_CAPACITY) - math.log2(brightest))
     # Beyond 2^52 an analog photon of weight 1 would not fit into one contribution.
@@ -125,7 +128,11 @@ def build_model(
 
     # Measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long. Each event divides the weight of
     # light that was left alone by 1 - probability, so that thick water, where events are many, wants less.
-    thickness = max(scene.medium.extinction * limits.max_path, 1e-6)
+    there = [p + 0.5 * limits.max_path * u for p, u in zip(scene.laser.position, scene.laser.axis, strict=True)]
+    depth = scene.medium.extinction * limits.max_path
+    if scene.medium.layers:
+        depth = 2.0 * scene.medium.optical_depth(scene.laser.position, there)
+    thickness = max(depth, 1e-6)
     guiding = sk.Guiding()
     guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))
     guiding.surface_probability = 0.3
@@ -151,6 +158,8 @@ def build_model(
     model = sk.Model(
         device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
     )
+    if scene.medium.layers:
+        model = dataclasses.replace(model, layers=_layers(scene, device))
     if camera:
         _check_size(scene, model, copies)
     return model
@@ -175,6 +184,22 @@ def _appearance(mesh: TriangleMesh, device: wp.Device) -> dict[str, Any]:
     return arrays
 
 
+def _layers(scene: Scene, device: wp.Device) -> Any:
+    """The medium and its layers as the kernels take them."""
+    import spadwarp_kernels as sk
+
+    medium = scene.medium
+    scale = math.hypot(*medium.layer_axis)
+    return sk.make_layers(
+        [-_UNLIMITED, *(layer.start for layer in medium.layers)],
+        [water.extinction for water in medium.waters],
+        [PAPER_ALBEDO if water.albedo == "paper" else water.albedo for water in medium.waters],
+        [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
+        axis=[component / scale for component in medium.layer_axis],
+        device=device,
+    )
+
+
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
     """The compile-time choices of a scene; `choices` override them."""
     import spadwarp_kernels as sk
@@ -188,6 +213,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         roulette=scene.transport.termination == "roulette",
         pattern=mesh is not None and mesh.pattern is not None,
         specular=mesh is not None and mesh.specular is not None,
+        layered=bool(scene.medium.layers),
     )
     return spec._replace(**choices)
 

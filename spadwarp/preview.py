@@ -256,14 +256,17 @@ def _decorate(axis: Axes, title: str) -> None:
 def _caption(result: Result, figure: Figure) -> None:
     medium = result.scene.medium
     albedo = "U(0, 0.97)" if medium.albedo == "paper" else f"{medium.albedo:.3g}"
+    water = f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, g = {medium.anisotropy:.3g}"
+    if medium.layers:
+        extinctions = ", ".join(f"{one.extinction:.3g}" for one in medium.waters)
+        water = f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
     photons = f"{result.photons:.3g}" if result.photons >= 1e6 else str(result.photons)
     if "e+" in photons:
         mantissa, power = photons.split("e+")
         photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"
     partial = ", stopped early" if result.partial else ""
     figure.suptitle(
-        f"{photons} photons{partial}; water c = {medium.extinction:.3g} 1/m, albedo {albedo},"
-        f" g = {medium.anisotropy:.3g}; seed {result.seed}",
+        f"{photons} photons{partial}; {water}; seed {result.seed}",
         fontsize=9,
         color="0.25",
     )

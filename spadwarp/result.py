@@ -271,6 +271,7 @@ class Result:
                 "albedo": scene.medium.albedo,
                 "anisotropy": scene.medium.anisotropy,
                 "group_index": scene.medium.group_index,
+                **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
             },
             "collected_fraction": dict(zip(COMPONENTS, map(float, fractions), strict=True)),
             "detections_per_pulse": float(fractions.sum() * scene.laser.photons_per_pulse * scene.detector.pde),

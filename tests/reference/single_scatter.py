@@ -31,11 +31,25 @@ class Lidar:
     albedo: float = 0.8
     anisotropy: float = 0.924
     edges: NDArray[np.float64] = field(default_factory=lambda: np.arange(2.0, 8.0))  # of the bins of optical path [m]
+    # (z where it begins, extinction, albedo, anisotropy) of further waters; laser and camera are then at z = 0. The
+    # quadrature converges with narrow bins only.
+    layers: tuple[tuple[float, float, float, float], ...] = ()
 
     @property
     def solid_angle(self) -> float:
         """Of the laser's cone [sr]."""
         return 2 * math.pi * (1 - math.cos(self.half_angle))
+
+    def scattered(self, z: NDArray, path: NDArray, cos_scatter: NDArray) -> NDArray:
+        """b·p(cosΘ)·exp(−∫c) at depth z, with `path` the way from the laser and on to the lens [1/m/sr]."""
+        waters = ((-np.inf, self.extinction, self.albedo, self.anisotropy), *self.layers)
+        ends = (*(start for start, *_ in self.layers), np.inf)
+        value, depth = np.zeros_like(z), np.zeros_like(z)
+        for (start, extinction, albedo, g), end in zip(waters, ends, strict=True):
+            depth += extinction * (np.clip(z, None, end) - max(start, 0.0)).clip(0.0)
+            here = (z >= start) & (z < end)
+            value += here * albedo * extinction * henyey_greenstein(cos_scatter, g)
+        return value * np.exp(-depth / z * path)
 
     @property
     def pixel_edges(self) -> NDArray[np.float64]:
@@ -97,15 +111,7 @@ def single_scatter_total(lidar: Lidar, *, order: int = 300) -> NDArray:
     point = start + distance[..., None] * ray[:, :, None, None, :]
     r = np.linalg.norm(point, axis=-1)
     cos_scatter = -(point * ray[:, :, None, None, :]).sum(-1) / r
-    value = (
-        lidar.albedo
-        * lidar.extinction
-        * np.exp(-lidar.extinction * (distance + r))
-        * henyey_greenstein(cos_scatter, lidar.anisotropy)
-        * lidar.aperture_area
-        * (point[..., 2] / r)
-        / r**2
-    )
+    value = lidar.scattered(point[..., 2], distance + r, cos_scatter) * lidar.aperture_area * (point[..., 2] / r) / r**2
     along = np.einsum("aptn,aptn->apt", value, weight)
     return np.einsum("a,apt->t", gauss / 2, along) / order
 
@@ -140,12 +146,9 @@ def _along_ray(lidar: Lidar, ray: NDArray) -> NDArray:
     beam = r[..., None] * ray[..., None, None, :] - laser
     s = np.linalg.norm(beam, axis=-1)
     cos_scatter = -(beam * ray[..., None, None, :]).sum(-1) / s
-    value = (
-        lidar.albedo
-        * lidar.extinction
-        * np.exp(-lidar.extinction * (s + r))
-        * henyey_greenstein(cos_scatter, lidar.anisotropy)
-        / (lidar.solid_angle * s**2)
+    depth = r * ray[..., None, None, 2]
+    value = lidar.scattered(depth, s + r, cos_scatter) / (
+        lidar.solid_angle * s**2
     )  # r² of the volume element and 1/r² of the aperture's solid angle cancel
     return (value * weight).sum(-1) * lidar.aperture_area * ray[..., 2, None]
 
