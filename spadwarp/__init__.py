@@ -54,6 +54,9 @@ _HOMES = {
     "to_torch": "tensors",
     "TorchResult": "tensors",
     "validate": "validation",
+    "denoise": "denoising.inference",
+    "evaluate": "denoising.evaluation",
+    "train": "denoising.run",
     "load_recipe": "dataset.recipe",
     "Recipe": "dataset.recipe",
     "make_dataset": "dataset.making",
@@ -81,6 +84,9 @@ if TYPE_CHECKING:
     from spadwarp.dataset.making import make_dataset, verify_dataset
     from spadwarp.dataset.reading import FrameReader, SpadDataset, iterate_dataset
     from spadwarp.dataset.recipe import Recipe, load_recipe
+    from spadwarp.denoising.evaluation import evaluate
+    from spadwarp.denoising.inference import denoise
+    from spadwarp.denoising.run import train
     from spadwarp.depth import arrival_time
     from spadwarp.detector import Detection, coates, detect
     from spadwarp.engines import Ray, interruptible, run_jobs

@@ -3,7 +3,20 @@
 Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
 """
 
-from . import bench, dataset, doctor, exports, inspect, plan, reduce, runs, simulate
+from . import bench, dataset, denoise, doctor, exports, inspect, plan, reduce, runs, simulate
 from ._app import app, main
 
-__all__ = ["app", "bench", "dataset", "doctor", "exports", "inspect", "main", "plan", "reduce", "runs", "simulate"]
+__all__ = [
+    "app",
+    "bench",
+    "dataset",
+    "denoise",
+    "doctor",
+    "exports",
+    "inspect",
+    "main",
+    "plan",
+    "reduce",
+    "runs",
+    "simulate",
+]

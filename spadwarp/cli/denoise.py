@@ -1,0 +1,267 @@
+"""`spadwarp denoise`, `evaluate` and `train`: denoisers of depth frames."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spadwarp.errors import ConfigError
+
+from ._app import app, complain, say
+from ._options import (
+    Json,
+    Out,
+    Overwrite,
+    Quiet,
+    arguments_checked,
+    check_writable,
+    count,
+    in_bytes,
+    prepare_directory,
+    rows,
+    show_table,
+    whole_number,
+    write_json,
+)
+from ._progress import progress
+
+_TorchDevice = Annotated[
+    str | None,
+    typer.Option("--device", metavar="NAME", help='"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
+]
+
+
+@app.command()
+def denoise(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IN",
+            help="A result or frames (.h5), depth (.exr, .npy, .mat), measured histograms (.npy, .mat, .ptu), or a "
+            "folder of them.",
+            show_default=False,
+        ),
+    ],
+    out: Out,
+    model: Annotated[
+        str, typer.Option(metavar="NAME", help="pyramid, dncnn, usdn; or median, gating, bm3d.")
+    ] = "pyramid",
+    gate: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="START STOP", help="Gate in depth [m]. By default the file's, else the depths in it."),
+    ] = None,
+    profile: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help=".npy with the water's backscatter over the gate in equal bins."),
+    ] = None,
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of spadwarp train. By default the package's.")
+    ] = None,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Three dimensions in .npy and .mat are frames of depth, not a histogram.")
+    ] = False,
+    channel: Annotated[str | None, typer.Option(metavar="NAME", help="Channel of an EXR that holds depth.")] = None,
+    scale: Annotated[float, typer.Option(metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")] = 1.0,
+    variable: Annotated[str | None, typer.Option(metavar="NAME", help="Array in a .mat file.")] = None,
+    bin_width_ps: Annotated[
+        float | None, typer.Option(metavar="PS", help="Width of a bin; measured histograms need it, .ptu knows it.")
+    ] = None,
+    gate_start_ns: Annotated[
+        float | None, typer.Option(metavar="NS", help="Time of flight at the start of bin 0 of measured histograms.")
+    ] = None,
+    group_index: Annotated[
+        float | None,
+        typer.Option(metavar="N", help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; measured ones need it."),
+    ] = None,
+    irf_fwhm_ps: Annotated[
+        float | None, typer.Option(metavar="PS", help="Width of the instrument response of measured histograms.")
+    ] = None,
+    device: _TorchDevice = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Denoise depth frames.
+
+    Writes NAME.npy (all frames), NAME.exr and NAME.png (the first) for each file. Histograms become depth first, by the
+    log-matched filter where the instrument response is known. Needs pip install "spadwarp[denoise]".
+
+    \b
+    Examples:
+      spadwarp denoise out/result.h5 --out denoised/
+      spadwarp denoise depth.npy --gate 13.5 16 --model dncnn --out denoised/
+      spadwarp denoise engine/ --channel A --scale 0.01 --gate 13.5 16 --out denoised/
+    """
+    import numpy as np
+
+    from spadwarp.denoising.depth_files import denoise_file, depth_files
+
+    if path.is_dir() and (path / "result.h5").is_file():
+        path = path / "result.h5"
+    paths = depth_files(path)
+    prepare_directory(out, overwrite=overwrite, needed=sum(one.stat().st_size for one in paths if one.is_file()))
+    with arguments_checked():
+        given = None if profile is None else np.load(profile, allow_pickle=False)
+    told, summary = {}, []
+    for number, one in enumerate(paths, 1):
+        with arguments_checked():
+            done = denoise_file(
+                one,
+                out,
+                model=model,
+                gate=gate,
+                profile=given,
+                weights=weights,
+                device=device,
+                as_depth=depth,
+                channel=channel,
+                scale=scale,
+                variable=variable,
+                bin_width_ps=bin_width_ps,
+                gate_start_ns=gate_start_ns,
+                group_index=group_index,
+                irf_fwhm_ps=irf_fwhm_ps,
+            )
+        there = float(np.isfinite(done.depth).mean())
+        told[one.name] = f"{len(done.depth)} frames, {100 * there:.3g} % of the pixels have a depth"
+        summary.append({"file": one, "gate": done.gate, "filled": there, "files": done.files, "notes": done.notes})
+        if not quiet:
+            for note in done.notes:
+                complain(f"{one.name}: {note}")
+            if len(paths) > 1:
+                complain(f"{number} of {len(paths)}")
+    if not quiet:
+        say(rows({**told, "written": f"{3 * len(paths)} files in {out}"}))
+    write_json({"model": model, "files": summary}, json_path)
+
+
+@app.command()
+def evaluate(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="A dataset's folder.", show_default=False)],
+    models: Annotated[
+        str,
+        typer.Option(metavar="NAMES", help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid.'),
+    ] = "all",
+    split: Annotated[str, typer.Option(metavar="NAME", help="test, validation, train or all.")] = "test",
+    frames: Annotated[
+        int, typer.Option(parser=whole_number, metavar="N", help="Frames of each target and level.")
+    ] = 20,
+    bm3d_frames: Annotated[
+        int, typer.Option(parser=whole_number, metavar="N", help="Frames of each level for BM3D, up to a minute each.")
+    ] = 0,
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Also write a report: HTML, pictures, scores.json.")
+    ] = None,
+    device: _TorchDevice = None,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Compare denoisers on a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved.
+
+    \b
+    Example:
+      spadwarp dataset make configs/datasets/paper.toml --out data/paper/
+      spadwarp evaluate data/paper/ --models all --report report/
+    """
+    from rich.table import Table
+
+    from spadwarp.denoising.evaluation import evaluate as run
+    from spadwarp.denoising.report import TITLES, write_report
+
+    chosen = ["median", "gating", "usdn", "dncnn", "pyramid"] if models == "all" else models.split(",")
+    chosen = [name.strip() for name in chosen]
+    if "bm3d" in chosen and bm3d_frames == 0:
+        bm3d_frames = 20
+    if report is not None:
+        check_writable(report)
+    with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+        found = run(
+            data, models=chosen, split=split, frames=frames, bm3d_frames=bm3d_frames, device=device, progress=told
+        )
+    written = write_report(found, report) if report is not None else []
+    if not quiet:
+        table = Table("method", *(f"BS {level}" if "photons" not in level else level for level in found.levels), "mean")
+        for method in found.ranking():
+            gains = []
+            for level in (*found.levels, None):
+                one, before = found.mean(method, level=level), found.mean("input", level=level)
+                gains.append(f"{one.psnr:.2f}" if method == "input" else f"{one.psnr - before.psnr:+.2f}")
+            table.add_row(TITLES[method], *gains)
+        say(f"PSNR of the input, and gain over it [dB]; {found.about}")
+        show_table(table)
+        if found.steps:
+            steps = {
+                method: [one for (name, _), one in found.steps.items() if name == method] for method in found.methods
+            }
+            say(
+                rows(
+                    {
+                        TITLES[method]: f"{sum(one.resolved for one in all_)} of {sum(one.total for one in all_)} steps"
+                        for method, all_ in steps.items()
+                    }
+                )
+            )
+        if written:
+            say(f"written: {written[0]}")
+    write_json({**found.to_dict(), "files": written}, json_path)
+
+
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Argument(metavar="RECIPE", help="Training recipe (TOML).", show_default=False)],
+    out: Out,
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Dataset in place of the recipe's.", show_default=False)
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(parser=whole_number, metavar="N", help="Updates. By default the recipe's.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(parser=whole_number, metavar="N", help="Seed. By default the recipe's.")
+    ] = None,
+    device: _TorchDevice = None,
+    quiet: Quiet = False,
+    json_path: Json = None,
+) -> None:
+    """Train a denoiser on the clean scenes of a dataset; noise is drawn anew for each step.
+
+    Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same command goes on with a run that was
+    cut short. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+
+    \b
+    Example:
+      spadwarp dataset make configs/datasets/training.toml --out data/training/
+      spadwarp train configs/training/pyramid.toml --out runs/pyramid/
+    """
+    from spadwarp.denoising.recipe import load_training_recipe
+    from spadwarp.denoising.run import train as run
+
+    changes: dict[str, Any] = {}
+    if data is not None:
+        changes["data"] = str(data)
+    if seed is not None:
+        changes["seed"] = seed
+    if steps is not None:
+        changes["optimiser"] = {"steps": steps}
+    chosen = load_training_recipe(recipe, overrides=changes)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out: {out} is a file; a directory is needed")
+    check_writable(out)
+    with arguments_checked(), progress(quiet=quiet, unit="steps") as told:
+        trained = run(chosen, out, device=device, progress=told)
+    if int(os.environ.get("RANK", "0")) == 0:
+        if not quiet:
+            say(
+                rows(
+                    {
+                        "model": f"{chosen.model}, {count(chosen.optimiser.steps)} steps, seed {chosen.seed}",
+                        "validation": f"{trained.psnr:.2f} dB PSNR, mean over six levels of backscatter",
+                        "time": f"{trained.seconds:.0f} s",
+                        "written": f"{trained.weights} ({in_bytes(trained.weights.stat().st_size)})",
+                    }
+                )
+            )
+        write_json({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights}, json_path)
