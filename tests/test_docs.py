@@ -1,8 +1,10 @@
-"""The documentation: links lead somewhere, its Python runs against the interface, figures can be drawn."""
+"""The documentation: links lead somewhere, its code runs, its references are current, figures can be drawn."""
 
 import ast
 import importlib.util
 import re
+import runpy
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import spadwarp
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
 FIGURES = sorted((ROOT / "docs" / "figures").glob("*.py"))
 
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -35,6 +38,16 @@ def by_name(path):
     return path.name
 
 
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder in which the configurations lie as in a checkout."""
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    (folder / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(folder)
+    return folder
+
+
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_relative_links_and_images_exist(page):
     text = page.read_text(encoding="utf-8")
@@ -55,6 +68,35 @@ def test_python_in_the_text_uses_names_that_exist(page):
             for node in ast.walk(ast.parse(code)):
                 if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spadwarp":
                     assert hasattr(spadwarp, node.attr) or importlib.util.find_spec(f"spadwarp.{node.attr}")
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=by_name)
+def test_python_in_the_text_runs(page, checkout, tmp_path):
+    """The blocks of a page, one after the other, as one program in a checkout."""
+    blocks = [code for language, code in _FENCE.findall(page.read_text(encoding="utf-8")) if language == "python"]
+    program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
+    program.write_text("\n".join(blocks), encoding="utf-8")
+    runpy.run_path(str(program))
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "docs" / "reference" / "scene.md"], ids=by_name)
+def test_scenes_in_the_text_are_valid(page, checkout):
+    """A block of TOML is a scene, or sections that lie over one."""
+    for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
+        if language == "toml":
+            tables = tomllib.loads(code)
+            spadwarp.load_scene("configs/scenes/plane_5m.toml", {} if {"camera", "gate"} <= set(tables) else tables)
+            if {"camera", "gate"} <= set(tables):
+                spadwarp.Scene.from_dict(tables)
+
+
+def test_pages_of_the_site_exist():
+    """Every page is in the navigation, and leads to a file."""
+    text = (ROOT / "mkdocs.yml").read_text()
+    named = set(re.findall(r": ([\w/]+\.md)$", text, re.MULTILINE))
+    elsewhere = set(re.findall(r'": "([\w/]+\.md)"', (ROOT / "docs" / "hooks.py").read_text()))
+    here = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert named == here | elsewhere
 
 
 def test_every_image_is_shown_somewhere():

@@ -1,0 +1,305 @@
+"""Writes the pages in docs/reference that come from the code: `python docs/reference.py`.
+
+scene.md and recipe.md: every field of a scene and of a dataset recipe, from their models. cli.md: the help of every
+command. python.md and kernels.md: the public names, whose docstrings mkdocstrings shows.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import math
+import types
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import typer
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import AfterValidator, BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+import spadwarp
+from spadwarp._layers import COEFFICIENTS
+from spadwarp.cli import app
+from spadwarp.config import Scene
+from spadwarp.dataset.recipe import Distribution, Recipe
+
+FOLDER = Path(__file__).parent / "reference"
+MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"
+
+
+def pages() -> dict[str, str]:
+    """Every page by its file name."""
+    return {
+        "scene.md": scene(),
+        "recipe.md": recipe(),
+        "cli.md": commands(),
+        "python.md": python(),
+        "kernels.md": kernels(),
+    }
+
+
+# Scene
+
+
+def scene() -> str:
+    """Sections and fields with kinds, ranges, defaults and units, and the presets."""
+    parts = [
+        MADE + "# Scene file\n\n"
+        "A scene is a TOML file of sections. Units are SI where the name carries none; lengths are in the camera frame "
+        "(lens at the origin, +x right, +y down, +z forward). A field that a file leaves out has its default, or the "
+        "value of the section's `preset`; `--set SECTION.FIELD=VALUE` lies over both. What is not valid is "
+        "refused with the field, its value and its range; `spadwarp check FILE` does so without running anything.\n\n"
+        "```toml\n" + _EXAMPLE + "```\n"
+    ]
+    for name, field in Scene.model_fields.items():
+        parts.append(_section(name, _model(field), repeated=name == "targets"))
+    return "\n".join(parts)
+
+
+_EXAMPLE = """\
+[medium]
+preset = "uwoc-coastal"
+
+[laser]
+half_angle_deg = 10.0
+position = [0.1, 0.0, 0.0]
+
+[camera]
+width = 64
+height = 48
+horizontal_fov_deg = 20.0
+aperture_diameter = 0.02
+
+[gate]
+start_ns = 40.0
+bin_width_ps = 55.0
+bins = 256
+
+[[targets]]
+builtin = "staircase"
+translation = [0.0, 0.0, 5.0]
+"""
+
+
+def recipe() -> str:
+    """Tables and fields of a dataset recipe."""
+    top = {name: field for name, field in Recipe.model_fields.items() if _model(field) in (None, Distribution)}
+    parts = [
+        MADE + "# Dataset recipe\n\n"
+        "What `spadwarp dataset make RECIPE` draws from. A *distribution* is a number (always that), a list (one of "
+        "these) or a table `{low = …, high = …}`, with `log = true` even in the logarithm. Recipes that run as they "
+        "are: [configs/datasets](../../configs/datasets).\n",
+        "## Top level\n\n" + _table(top),
+    ]
+    for name, field in Recipe.model_fields.items():
+        model = _model(field)
+        if model is not None and name not in top:
+            parts.append(_section(name, model))
+    return "\n".join(parts)
+
+
+def _model(field: FieldInfo) -> type[BaseModel] | None:
+    models = (one for one in _flat(field.annotation) if inspect.isclass(one) and issubclass(one, BaseModel))
+    return next(models, None)
+
+
+def _table(fields: Mapping[str, FieldInfo]) -> str:
+    lines = ["| field | kind | range | default | what it is |", "|---|---|---|---|---|"]
+    for field, info in fields.items():
+        about = (info.description or "").replace("|", "\\|")
+        # Of the coefficients of water two are given, and the others follow.
+        default = "" if field in COEFFICIENTS else _default(info)
+        lines.append(f"| {' | '.join((f'`{field}`', _kind(info), _range(info), default, about))} |")
+    return "\n".join(lines) + "\n"
+
+
+def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> str:
+    lines = [f"## {name}", "", inspect.cleandoc(model.__doc__ or ""), ""]
+    if repeated:
+        lines += ["Written as `[[targets]]`, once for each.", ""]
+    lines.append(_table(model.model_fields))
+    presets = [one for one in spadwarp.presets().values() if one.section == name]
+    if presets:
+        lines += ['Presets (`preset = "…"`), with their sources:']
+        source = None
+        for one in presets:
+            if one.source != source:
+                source = one.source
+                lines += ["", f"- {source}:"]
+            values = ", ".join(f"{key} {_short(value)}" for key, value in one.values.items())
+            lines.append(f"    - `{one.name}`: {values}")
+    return "\n".join(lines) + "\n"
+
+
+def _flat(annotation: Any) -> Iterator[Any]:
+    """The parts of a union, through `Annotated` and tuples."""
+    if get_origin(annotation) in (Union, types.UnionType, Annotated, tuple):
+        for one in get_args(annotation):
+            yield from _flat(one)
+    else:
+        yield annotation
+
+
+def _kind(info: FieldInfo) -> str:
+    options = [one for one in _union(info.annotation) if one is not type(None)]
+    return " or ".join(dict.fromkeys(_one_kind(one) for one in options))
+
+
+def _union(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
+
+
+def _one_kind(annotation: Any) -> str:
+    if get_origin(annotation) is Annotated:
+        return _one_kind(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return ", ".join(f'`"{value}"`' for value in get_args(annotation))
+    if get_origin(annotation) is tuple:
+        parts = get_args(annotation)
+        what = "texts" if parts[0] is str else "numbers"
+        return f"list of {what}" if parts[-1] is Ellipsis else f"{len(parts)} {what}"
+    if get_origin(annotation) is dict:
+        return "table"
+    names = {Distribution: "distribution", float: "number", int: "integer", bool: "true or false", str: "text"}
+    return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+def _range(info: FieldInfo) -> str:
+    low, high = "(-∞", "∞)"
+    for one in _constraints(info):
+        match one:
+            case Ge(ge=value):
+                low = f"[{_short(value)}"
+            case Gt(gt=value):
+                low = f"({_short(value)}"
+            case Le(le=value):
+                high = f"{_short(value)}]"
+            case Lt(lt=value):
+                high = f"{_short(value)})"
+            case AfterValidator(func=check):  # of a distribution's values
+                limits = inspect.getclosurevars(check).nonlocals
+                if math.isfinite(limits["low"]):
+                    low = ("(" if limits["open_low"] else "[") + _short(limits["low"])
+                if math.isfinite(limits["high"]):
+                    high = f"{_short(limits['high'])}]"
+    return "" if (low, high) == ("(-∞", "∞)") else f"{low}, {high}"
+
+
+def _constraints(info: FieldInfo) -> Iterator[Any]:
+    yield from info.metadata
+    waiting = list(_union(info.annotation))
+    while waiting:
+        one = waiting.pop()
+        if get_origin(one) is Annotated:
+            inner, *more = get_args(one)
+            for constraint in more:
+                yield from constraint.metadata if isinstance(constraint, FieldInfo) else [constraint]
+            waiting.append(inner)
+
+
+def _default(info: FieldInfo) -> str:
+    value = info.default_factory() if callable(info.default_factory) else info.default  # type: ignore[call-arg]
+    if isinstance(value, Distribution):
+        value = value.to_dict()
+    if value == {} or value == ():
+        return ""
+    if value is PydanticUndefined:
+        return "needed"
+    if value is None:
+        return ""
+    if isinstance(value, tuple) and len(set(map(repr, value))) == 1 and math.isinf(value[0]):
+        value = value[0]
+    if isinstance(value, str):
+        return f'`"{value}"`'
+    if isinstance(value, tuple):
+        return f"`[{', '.join(map(_short, value))}]`"
+    return f"`{_short(value)}`"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int):
+        power = value.bit_length()
+        for exponent, offset in ((power, 0), (power, 1)):
+            if value > 10**12 and value == 2**exponent - offset:
+                return f"2^{exponent}" + (" - 1" if offset else "")
+        return f"{value:_}" if value < 10**9 else f"{value:g}"
+    if isinstance(value, float):
+        return f"{value:g}" if math.isfinite(value) else ("inf" if value > 0 else "-inf")
+    return str(value)
+
+
+# Command line
+
+
+def commands() -> str:
+    """The help of every command, 100 columns wide."""
+    group: Any = typer.main.get_command(app)
+    parts = [
+        MADE + "# Command line\n\n"
+        "Every command has a twin in [Python](python.md). stdout is for the answer, stderr for progress, warnings and "
+        "errors. Exit codes: 0 done, 1 failed, 2 wrong use or a scene that is not valid, 130 interrupted."
+    ]
+    parts += _help(group, "spadwarp")
+    return "\n\n".join(parts) + "\n"
+
+
+def _help(command: Any, path: str) -> Iterator[str]:
+    context = command.make_context(path, [], resilient_parsing=True, terminal_width=100, max_content_width=100)
+    text = "\n".join(line.rstrip() for line in command.get_help(context).splitlines())
+    yield f"## {path}\n\n```text\n{text}\n```"
+    for name, one in sorted(getattr(command, "commands", {}).items()):
+        yield from _help(one, f"{path} {name}")
+
+
+# Python
+
+
+def python() -> str:
+    """The names of `spadwarp.__all__`, by module."""
+    homes: dict[str, list[str]] = {}
+    for name, home in spadwarp._HOMES.items():
+        homes.setdefault(home, []).append(name)
+    parts = [
+        MADE + "# Python\n\n`import spadwarp` loads what is used when it is used. Everything here is `spadwarp.NAME`."
+    ]
+    for home, names in homes.items():
+        about = inspect.cleandoc(import_module(f"spadwarp.{home}").__doc__ or "").splitlines()[0]
+        parts.append(f"## {home.split('.')[-1].replace('_', ' ').capitalize()}\n\n{about}")
+        parts += [f"::: spadwarp.{home}.{name}" for name in names]
+    return "\n\n".join(parts) + "\n"
+
+
+def kernels() -> str:
+    """The names of `spadwarp_kernels.__all__`, by module."""
+    import spadwarp_kernels
+
+    home = {}
+    for path in sorted(Path(spadwarp_kernels.__file__ or "").parent.glob("[a-z]*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            for name in (getattr(node, "name", None), *(getattr(one, "id", None) for one in targets)):
+                home[name] = path.stem
+    homes: dict[str, list[str]] = {}
+    for name in sorted(spadwarp_kernels.__all__):
+        homes.setdefault(home[name], []).append(name)
+    parts = [
+        MADE
+        + "# Kernel library\n\n`import spadwarp_kernels as sk`; what it is for: [README](../../kernels/README.md). "
+        "Warp functions (`wp.func`) go into kernels of your own; structs and the other functions are for Python."
+    ]
+    for module, names in sorted(homes.items()):
+        parts.append(f"## {module.replace('_', ' ').capitalize()}")
+        parts += [f"::: spadwarp_kernels.{module}.{name}" for name in names]
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for file, text in pages().items():
+        (FOLDER / file).write_text(text, encoding="utf-8")
