@@ -14,7 +14,7 @@ from .detector import dark_count_rates, event_counts, expected_detections, first
 from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance
 from .gate import C0, Gate, gate_bin
-from .guided import Guiding
+from .guided import Guiding, PhaseGuide
 from .laser import LASER_PROFILES, Laser, emit_photon
 from .launch import (
     Data,
@@ -30,13 +30,20 @@ from .launch import (
     surface_choices,
 )
 from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
-from .medium import Medium, free_path
+from .medium import Medium, PhaseTables, free_path
 from .microfacet import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
 from .phase import (
     HENYEY_GREENSTEIN,
     PhaseFunction,
     henyey_greenstein_pdf,
     sample_henyey_greenstein,
+)
+from .phase_densities import (
+    fournier_forand_density,
+    henyey_greenstein_density,
+    interpolated_density,
+    sphere_integral,
+    two_term_henyey_greenstein_density,
 )
 from .philox import philox4x32, random_block, u01, u01_fine
 from .shadow import near_depth_map
@@ -51,6 +58,7 @@ from .surface import (
     reflectance_at,
     segment_meets_box,
 )
+from .tabulated import TABULATED, make_phase_tables
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
 from .transport import (
     COMPONENTS,
@@ -75,6 +83,7 @@ __all__ = [
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
+    "TABULATED",
     "Batches",
     "Camera",
     "Data",
@@ -87,6 +96,8 @@ __all__ = [
     "Medium",
     "Model",
     "PhaseFunction",
+    "PhaseGuide",
+    "PhaseTables",
     "Records",
     "SurfaceHit",
     "Surfaces",
@@ -99,12 +110,15 @@ __all__ = [
     "exit_distance",
     "expected_detections",
     "first_photon_counts",
+    "fournier_forand_density",
     "free_path",
     "gate_bin",
     "ggx_brdf",
     "ggx_normals",
     "ggx_pdf",
+    "henyey_greenstein_density",
     "henyey_greenstein_pdf",
+    "interpolated_density",
     "intersect_mesh",
     "intersect_mesh_aimed",
     "lambert_brdf",
@@ -117,6 +131,7 @@ __all__ = [
     "load_transport_kernel",
     "make_data",
     "make_layers",
+    "make_phase_tables",
     "make_records",
     "make_surfaces",
     "make_textures",
@@ -141,10 +156,12 @@ __all__ = [
     "signal_map",
     "single_scatter_table",
     "snap_direction",
+    "sphere_integral",
     "statistics_maps",
     "surface_choices",
     "to_fixed_point",
     "truth_kernel",
+    "two_term_henyey_greenstein_density",
     "u01",
     "u01_fine",
     "unshadowed",

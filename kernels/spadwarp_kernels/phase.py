@@ -5,11 +5,14 @@ of
 natural water lies, while cos(theta) loses every angle below 3e-4 rad.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import warp as wp
 
 from .medium import Medium
+
+if TYPE_CHECKING:
+    from .guided import PhaseGuide
 
 _INV_4PI = wp.constant(0.07957747154594767)
 
@@ -41,11 +44,14 @@ class PhaseFunction(NamedTuple):
         name: Told apart by name in the kernel cache and in files.
         pdf: Warp function ``(t: float, medium: Medium) -> float``, density [1/sr].
         sample: Warp function ``(xi: float, medium: Medium) -> float``, returns t = 1 - cos(theta).
+        guide: How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's
+            anisotropy. No guide makes it wrong, a poor one makes it noisy.
     """
 
     name: str
     pdf: wp.Function
     sample: wp.Function
+    guide: "PhaseGuide | None" = None
 
 
 @wp.func

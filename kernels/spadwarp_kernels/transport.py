@@ -16,7 +16,7 @@ from .camera import Camera, lens_point, project
 from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
 from .domain import Limits, exit_distance, exit_face
 from .gate import Gate, gate_bin
-from .guided import Guiding, clip_flight, sample_flight
+from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_flight, make_sample_flight
 from .laser import Laser, emit_photon
 from .layers import HOMOGENEOUS, LAYERED, Layers
 from .medium import Medium
@@ -223,6 +223,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
     reflectance_at = pattern_reflectance if pattern else face_reflectance
+    guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
+    aimed = spec.phase.guide is not None
+    sample_flight, lobe_pdf, lobe_sample = make_sample_flight(guide), guide.lobe_pdf, guide.lobe_sample
     waiting_lanes = WAITING_LANES[has_bvh]
 
     @wp.kernel(
@@ -301,7 +304,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
                         s.stage = _EVENT
                         if s.interval[0] < s.interval[1]:
-                            g = medium.anisotropy
                             # Layers: a density with the mean extinction; what is scored weighs with the exact one.
                             flight = sample_flight(
                                 s.x - s.lens,
@@ -314,7 +316,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.u,
                                     s.interval[1] - s.interval[0],
                                 ),
-                                (1.0 - g) * (1.0 - g) / wp.max(g, 0.05),
+                                medium,
                                 u01(s.sample_block[0]),
                                 u01_fine(s.sample_block[1]),
                             )
@@ -525,6 +527,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(guided):
                             # Towards the lens, or back into the view, with some chance; the weight makes up for it.
                             v = -wp.normalize(s.x)
+                            if wp.static(aimed):
+                                # To the point of the lens at which the flight to come will be scored: a lobe about
+                                # the lens's centre could not have a peak narrower than the lens.
+                                id = first_id + wp.uint64(s.photon)
+                                ahead = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+                                v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
                             inward = wp.vec3(-s.x[0], -s.x[1], 0.0)
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
                             to_view_chance = float(0.0)
@@ -536,7 +544,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             axis = snapped
                             if choice < to_lens_chance:
                                 axis = v
-                                t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.anisotropy)
+                                t = lobe_sample(u01_fine(s.block[1]), medium, guiding)
                             elif choice < to_lens_chance + to_view_chance:
                                 axis = inward
                                 t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.return_anisotropy)
@@ -553,9 +561,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 if wp.static(specular):
                                     density = reflection_pdf(incoming, s.u, s.normal, surfaces.roughness[s.face], lobe)
                             mixture = (1.0 - to_lens_chance - to_view_chance) * density
-                            mixture += to_lens_chance * henyey_greenstein_pdf(
-                                one_minus_cosine(v, s.u), guiding.anisotropy
-                            )
+                            mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, s.u), medium, guiding)
                             if to_view_chance > 0.0:
                                 mixture += to_view_chance * henyey_greenstein_pdf(
                                     one_minus_cosine(inward, s.u), guiding.return_anisotropy
