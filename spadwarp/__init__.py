@@ -21,6 +21,8 @@ _HOMES = {
     "group_index": "water",
     "pure_water_absorption": "water",
     "pure_water_scattering": "water",
+    "phase_function": "phase_functions",
+    "PhaseFunction": "phase_functions",
     "check": "checks",
     "bench": "benchmark",
     "simulate": "simulation",
@@ -96,6 +98,7 @@ if TYPE_CHECKING:
     from spadwarp.hardware import devices
     from spadwarp.health import Diagnosis, SelfTest, doctor
     from spadwarp.model import truth_maps
+    from spadwarp.phase_functions import PhaseFunction, phase_function
     from spadwarp.records import PhotonRecords, trace
     from spadwarp.response import InstrumentResponse, instrument_response
     from spadwarp.result import Result, Truth

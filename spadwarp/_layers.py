@@ -37,6 +37,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     },
+    "medium": {"phase_function": ("g1", "g2", "alpha", "phase_table")},
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
 }
 

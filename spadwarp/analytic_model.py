@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import ConfigError
+from .phase_functions import phase_function
 from .response import FWHM_PER_SIGMA
 from .result import SPEED_OF_LIGHT, Result, Truth, pixel_directions
 
@@ -402,10 +403,8 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
 
 
 def _phase_table(scene: Scene) -> Map:
-    """Henyey–Greenstein density [1/sr] at scattering angles uniform on [0, π]."""
-    g = scene.medium.anisotropy
-    t = 2.0 * np.sin(0.5 * np.linspace(0.0, np.pi, 4097)) ** 2  # 1 − cos θ
-    return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
+    """Density [1/sr] at scattering angles uniform on [0, π]; at 0, where it may be infinite, that of 2e-5 rad."""
+    return phase_function(scene.medium).density(np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5))
 
 
 def depth_per_time(scene: Scene, view: Map, distance: Map) -> Map:

@@ -11,11 +11,21 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["PRESETS", "WATER_INDICES", "Preset", "presets"]
+__all__ = ["PHASE_TABLES", "PRESETS", "WATER_INDICES", "Preset", "presets"]
 
 # (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
 # Time of flight uses the group index.
 WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
+
+_AVERAGE_PARTICLE = (
+    "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own scattering, "
+    "as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)"
+)
+
+# Tabulated phase functions: name -> (file in spadwarp/data, source).
+PHASE_TABLES: dict[str, tuple[str, str]] = {
+    "petzold-average-particle": ("petzold_average_particle.csv", _AVERAGE_PARTICLE)
+}
 
 _WATER_G = (
     0.924  # mean cosine of Petzold's average particle phase function; the paper and most of the literature use it
@@ -100,6 +110,10 @@ _PF32 = {"pdp": 0.247, "jitter_fwhm_ps": 200.0, "dark_count_rate": 100.0}
 
 def _media() -> Iterator[tuple[str, dict[str, Any], str]]:
     yield from _waters("petzold-{}", _PETZOLD, _PETZOLD_SOURCE)
+    measured = {"phase_function": "tabulated", "phase_table": "petzold-average-particle"}
+    harbours = {key: value for key, value in _PETZOLD.items() if key.startswith("nuc")}
+    for name, values, _ in _waters("petzold-{}-tabulated", harbours, _PETZOLD_SOURCE):
+        yield name, {**values, **measured}, f"{_PETZOLD_SOURCE}; phase function: {_AVERAGE_PARTICLE}"
     yield from _waters("uwoc-{}", _UWOC, _UWOC_SOURCE)
     yield from _waters("jerlov-{}-williamson", _WILLIAMSON, _WILLIAMSON_SOURCE)
     yield from _waters("jerlov-{}-solonenko", _SOLONENKO, _SOLONENKO_SOURCE)

@@ -29,7 +29,7 @@ from pydantic import (
 from . import _layers
 from ._layers import parse_override
 from ._problems import describe
-from .catalog import PRESETS, WATER_INDICES
+from .catalog import PHASE_TABLES, PRESETS, WATER_INDICES
 from .errors import ConfigError, FileError
 
 __all__ = [
@@ -163,6 +163,10 @@ class Layer(_Water):
         return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
 
 
+# Fields that a phase function needs and no other takes.
+_PHASE_FIELDS = {"two_term_henyey_greenstein": ("g1", "g2", "alpha"), "tabulated": ("phase_table",)}
+
+
 class Medium(_Water):
     """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
 
@@ -170,8 +174,22 @@ class Medium(_Water):
     `layers` it is the water before the first of them.
     """
 
-    phase_function: Literal["henyey_greenstein"] = Field("henyey_greenstein", description="law of the scattering angle")
-    anisotropy: float = Field(0.924, gt=-1, lt=1, description="mean cosine g of the scattering angle")
+    phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = Field(
+        "henyey_greenstein", description="law of the scattering angle"
+    )
+    anisotropy: float = Field(0.924, gt=-1, lt=1, description="henyey_greenstein: mean cosine g of the scattering angle")
+    g1: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the first term")
+    g2: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the second term")
+    alpha: float | None = Field(None, ge=0, le=1, description="two_term_henyey_greenstein: weight of the first term")
+    particle_index: float = Field(
+        1.10, gt=1, le=1.35, description="fournier_forand: index n of the particles over that of the water"
+    )
+    junge_slope: float = Field(3.5835, ge=3.05, lt=5, description="fournier_forand: slope µ of the size distribution")
+    phase_table: str | None = Field(
+        None,
+        description="tabulated: the path of a .csv file of angle [°] and value of any scale, or "
+        + " or ".join(f'"{name}"' for name in PHASE_TABLES),
+    )
     group_index: float = Field(
         WATER_INDICES["seawater"][1],
         ge=1,
@@ -201,6 +219,24 @@ class Medium(_Water):
                 raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
             return WATER_INDICES[value][info.field_name == "group_index"]
         return value
+
+    @field_validator("phase_table")
+    @classmethod
+    def _known_table(cls, value: str | None) -> str | None:
+        if value is not None and value not in PHASE_TABLES and not value.lower().endswith(".csv"):
+            raise ValueError("choice", tuple(PHASE_TABLES), "the path of a .csv file")
+        return value
+
+    @model_validator(mode="after")
+    def _fields_of_the_phase_function(self) -> Self:
+        for law, names in _PHASE_FIELDS.items():
+            missing = [name for name in names if getattr(self, name) is None]
+            if law == self.phase_function and missing:
+                raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
+            if law != self.phase_function and len(missing) < len(names):
+                given = next(name for name in names if name not in missing)
+                raise ValueError(f"{given} = {getattr(self, given)!r} goes with phase_function = {law!r} only")
+        return self
 
     @model_validator(mode="after")
     def _resolved(self) -> Self:
@@ -236,6 +272,12 @@ class Medium(_Water):
                 follow(water, _layers.COEFFICIENTS)
         if self.follows_wavelength:
             follow(self, [name for name in ("phase_index", "group_index") if name not in self.model_fields_set])
+
+    @property
+    def phase_parameters(self) -> dict[str, float | str]:
+        """The fields that `phase_function` takes."""
+        names = {"henyey_greenstein": ("anisotropy",), "fournier_forand": ("particle_index", "junge_slope")}
+        return {name: getattr(self, name) for name in {**names, **_PHASE_FIELDS}[self.phase_function]}
 
     @property
     def follows_wavelength(self) -> bool:
@@ -720,7 +762,7 @@ def _build(
 
 
 def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables with relative mesh and response paths made absolute."""
+    """The tables with relative paths of meshes, responses and phase functions made absolute."""
 
     def absolute(fields: Any, name: str, ending: str = "") -> Any:
         value = fields.get(name) if isinstance(fields, Mapping) else None
@@ -734,6 +776,8 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
     elif isinstance(targets, (list, tuple)):
         changed["targets"] = [absolute(target, "mesh") for target in targets]
+    if "medium" in tables:
+        changed["medium"] = absolute(tables["medium"], "phase_table", ".csv")
     if "detector" in tables:
         changed["detector"] = absolute(tables["detector"], "irf", ".csv")
     return changed

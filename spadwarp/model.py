@@ -11,6 +11,7 @@ import numpy as np
 from spadwarp.config import SPEED_OF_LIGHT, Scene
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.hardware import physical_memory, pick_device
+from spadwarp.phase_functions import phase_function
 from spadwarp.result import COMPONENTS, Truth
 
 if TYPE_CHECKING:
@@ -80,7 +81,9 @@ def build_model(
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
     Raises:
-        ConfigError: The histogram has more bins than an index can count, or the laser stands outside the domain.
+        ConfigError: The histogram has more bins than an index can count, the laser stands outside the domain, or the
+            phase function's table is not one.
+        FileError: That table cannot be read.
         DeviceError: The device has too little memory.
     """
     import warp as wp
@@ -93,6 +96,8 @@ def build_model(
     medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
     medium.anisotropy = scene.medium.anisotropy
     medium.axis_threshold = scene.transport.axis_threshold
+    if scene.medium.phase_function != "henyey_greenstein":
+        medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
 
     laser = sk.Laser()
     laser.position = wp.vec3(*scene.laser.position)
@@ -206,6 +211,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
 
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
+        phase=sk.HENYEY_GREENSTEIN if scene.medium.phase_function == "henyey_greenstein" else sk.TABULATED,
         paper_albedo=scene.medium.albedo == "paper",
         mesh=mesh is not None,
         few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,

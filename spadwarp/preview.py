@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.config import Medium
 from spadwarp.depth import Method
 from spadwarp.files import atomic_path
 from spadwarp.result import COMPONENTS, Component, Result, pixel_directions, range_from_path
@@ -256,7 +257,7 @@ def _decorate(axis: Axes, title: str) -> None:
 def _caption(result: Result, figure: Figure) -> None:
     medium = result.scene.medium
     albedo = "U(0, 0.97)" if medium.albedo == "paper" else f"{medium.albedo:.3g}"
-    water = f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, g = {medium.anisotropy:.3g}"
+    water = f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, {_phase_text(medium)}"
     if medium.layers:
         extinctions = ", ".join(f"{one.extinction:.3g}" for one in medium.waters)
         water = f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
@@ -270,6 +271,13 @@ def _caption(result: Result, figure: Figure) -> None:
         fontsize=9,
         color="0.25",
     )
+
+
+def _phase_text(medium: Medium) -> str:
+    if medium.phase_function == "tabulated":
+        return f"phase function {Path(str(medium.phase_table)).stem}"
+    symbols = {"anisotropy": "g", "alpha": "α", "particle_index": "n", "junge_slope": "µ"}
+    return ", ".join(f"{symbols.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())
 
 
 def shown_limits(image: NDArray[Any], *, beyond: float = 0.0) -> tuple[float, float]:

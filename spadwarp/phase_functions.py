@@ -1,0 +1,108 @@
+"""The phase function of a scene's water as a density of the scattering angle, in float64."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .catalog import PHASE_TABLES
+from .config import Medium
+from .errors import ConfigError, FileError
+
+__all__ = ["PhaseFunction", "phase_function", "read_phase_table"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseFunction:
+    """Probability density of the direction of scattered light, of unit integral over the sphere.
+
+    Attributes:
+        name: `medium.phase_function`.
+        parameters: The medium's fields that it takes.
+        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
+    """
+
+    name: str
+    parameters: dict[str, float | str]
+    over_t: Callable[[Floats], Floats]
+
+    def density(self, angle: ArrayLike) -> Floats:
+        """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
+        return self.over_t(2.0 * np.sin(0.5 * np.asarray(angle, np.float64)) ** 2)
+
+    @cached_property
+    def mean_cosine(self) -> float:
+        """⟨cosθ⟩, the asymmetry parameter g."""
+        from spadwarp_kernels import sphere_integral
+
+        return sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
+
+    @cached_property
+    def backscatter_fraction(self) -> float:
+        """Part of the light that is scattered by more than 90°."""
+        from spadwarp_kernels import sphere_integral
+
+        return sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
+
+
+def phase_function(medium: Medium) -> PhaseFunction:
+    """The phase function of a scene's medium, `phase_function(scene.medium)`.
+
+    Raises `FileError` if its table cannot be read, `ConfigError` if the table is not a phase function.
+    """
+    import spadwarp_kernels as sk
+
+    name, parameters = medium.phase_function, medium.phase_parameters
+    if name == "tabulated":
+        table = str(medium.phase_table)
+        path = Path(__file__).parent / "data" / PHASE_TABLES[table][0] if table in PHASE_TABLES else Path(table)
+        angles, values = read_phase_table(path)
+        try:
+            density = sk.interpolated_density(np.radians(angles), values)
+        except ValueError as error:
+            raise ConfigError(f"medium.phase_table: {path}: {error}") from None
+    else:
+        density = partial(
+            {
+                "henyey_greenstein": sk.henyey_greenstein_density,
+                "two_term_henyey_greenstein": sk.two_term_henyey_greenstein_density,
+                "fournier_forand": sk.fournier_forand_density,
+            }[name],
+            **({"g": medium.anisotropy} if name == "henyey_greenstein" else parameters),
+        )
+    return PhaseFunction(name, parameters, density)
+
+
+def read_phase_table(path: str | Path) -> tuple[Floats, Floats]:
+    """Scattering angles [°] and values of any scale from a .csv file of two columns.
+
+    Lines that begin with # and one line of names are passed over. Raises `FileError`, `ConfigError` for a line that is
+    not two numbers.
+    """
+    rows: list[tuple[float, float]] = []
+    named = False
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            for number, row in enumerate(csv.reader(file), 1):
+                if not row or row[0].lstrip().startswith("#"):
+                    continue
+                try:
+                    angle, value = (float(cell) for cell in row)
+                except ValueError:
+                    if rows or named:
+                        problem = f"{path}, line {number}: {','.join(row)!r} is not angle_deg,value"
+                        raise ConfigError(problem) from None
+                    named = True
+                    continue
+                rows.append((angle, value))
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'it is not text'}") from None
+    return np.array([angle for angle, _ in rows]), np.array([value for _, value in rows])
