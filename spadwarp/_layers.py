@@ -30,6 +30,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "chlorophyll": (*COEFFICIENTS, "preset"),
         "temperature": ("phase_index", "group_index"),
         "salinity": ("phase_index", "group_index"),
+        "phase_function": ("g1", "g2", "alpha", "phase_table"),
     },
     "camera": {
         "horizontal_fov_deg": ("pixel_pitch_um",),
@@ -37,7 +38,6 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     },
-    "medium": {"phase_function": ("g1", "g2", "alpha", "phase_table")},
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
 }
 

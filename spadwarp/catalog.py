@@ -22,7 +22,7 @@ _AVERAGE_PARTICLE = (
     "as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)"
 )
 
-# Tabulated phase functions: name -> (file in spadwarp/data, source).
+# Tabulated phase functions: name -> (file in spadwarp/tables, source).
 PHASE_TABLES: dict[str, tuple[str, str]] = {
     "petzold-average-particle": ("petzold_average_particle.csv", _AVERAGE_PARTICLE)
 }

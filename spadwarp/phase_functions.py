@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +44,8 @@ class PhaseFunction:
         """⟨cosθ⟩, the asymmetry parameter g."""
         from spadwarp_kernels import sphere_integral
 
+        if self.name == "henyey_greenstein":
+            return float(self.parameters["anisotropy"])
         return sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
 
     @cached_property
@@ -60,24 +63,19 @@ def phase_function(medium: Medium) -> PhaseFunction:
     """
     import spadwarp_kernels as sk
 
+    density: Callable[[Floats], Floats]
     name, parameters = medium.phase_function, medium.phase_parameters
     if name == "tabulated":
         table = str(medium.phase_table)
-        path = Path(__file__).parent / "data" / PHASE_TABLES[table][0] if table in PHASE_TABLES else Path(table)
+        path = Path(__file__).parent / "tables" / PHASE_TABLES[table][0] if table in PHASE_TABLES else Path(table)
         angles, values = read_phase_table(path)
         try:
             density = sk.interpolated_density(np.radians(angles), values)
         except ValueError as error:
             raise ConfigError(f"medium.phase_table: {path}: {error}") from None
     else:
-        density = partial(
-            {
-                "henyey_greenstein": sk.henyey_greenstein_density,
-                "two_term_henyey_greenstein": sk.two_term_henyey_greenstein_density,
-                "fournier_forand": sk.fournier_forand_density,
-            }[name],
-            **({"g": medium.anisotropy} if name == "henyey_greenstein" else parameters),
-        )
+        numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
+        density = partial(getattr(sk, f"{name}_density"), **numbers)
     return PhaseFunction(name, parameters, density)
 
 

@@ -340,6 +340,15 @@ section_values = {
         st.fixed_dictionaries({"absorption": st.floats(1e-3, 9), "scattering": st.floats(0, 9)}),
         st.fixed_dictionaries({"preset": st.sampled_from(sorted(presets("medium")))}),
         st.fixed_dictionaries({"preset": st.just("uwoc-clear"), "scattering": st.floats(0, 9)}),
+        st.fixed_dictionaries(
+            {
+                "preset": st.just("uwoc-clear"),
+                "phase_function": st.just("two_term_henyey_greenstein"),
+                "g1": st.floats(0, 0.99),
+                "g2": st.floats(-0.9, 0),
+                "alpha": st.floats(0, 1),
+            }
+        ),
     ),
     "laser": st.fixed_dictionaries(
         {"position": vector},

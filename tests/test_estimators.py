@@ -46,6 +46,45 @@ def test_estimators_agree_in_every_component(axis_threshold, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_estimators_agree_with_a_tabulated_phase_function(device):
+    """Two terms, one of them backward, under a raised near-axis threshold."""
+    water = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
+    cells = {
+        estimator: _cells(estimator, device, photons, medium=water, transport={"axis_threshold": 0.97})
+        for estimator, photons in {"analog": 40_000, "next_event": 20_000, "guided": 20_000}.items()
+    }
+    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
+    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
+    total = cells["guided"].sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
+    """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
+    water = {"phase_function": "fournier_forand"}
+    analog, guided = (
+        _cells(estimator, device, photons, medium=water)
+        for estimator, photons in (("analog", 60_000), ("guided", 15_000))
+    )
+    assert equal_means_p(analog, guided) > 1e-3
+    total = guided.sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
+    """Through the file, the table, and the directions and angles of its own that guided takes from it."""
+    angle = np.concatenate([[0.0], np.geomspace(0.01, 20.0, 400), np.linspace(20.0, 180.0, 641)[1:]])
+    value = sk.henyey_greenstein_density(2.0 * np.sin(np.radians(angle) / 2) ** 2, 0.8)
+    np.savetxt(tmp_path / "hg.csv", np.column_stack([angle, value]), delimiter=",", header="angle_deg,value")
+    table = {"phase_function": "tabulated", "phase_table": str(tmp_path / "hg.csv")}
+    one, other = (_cells("guided", device, 20_000, medium=water) for water in ({}, table))
+    assert equal_means_p(one, other) > 1e-3
+    assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator, device):
     """Pencil beam onto a plate: R/pi exp(-2 c d) A/d^2 to 1 %, for a lens small against the distance."""

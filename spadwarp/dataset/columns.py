@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from spadwarp.config import SPEED_OF_LIGHT
+from spadwarp.phase_functions import phase_function
 
 from .plan import Plan
 from .scenes import PROFILE_BINS, RenderedScene
@@ -99,7 +100,7 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "absorption": medium.absorption,
         "scattering": medium.scattering,
         "extinction": medium.extinction,
-        "anisotropy": medium.anisotropy,
+        "anisotropy": phase_function(medium).mean_cosine,
         "group_index": medium.group_index,
         "gate_near": per_second * scene.gate.start,
         "gate_far": per_second * scene.gate.stop,

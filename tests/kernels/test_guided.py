@@ -7,13 +7,47 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from spadwarp_kernels import Camera, Gate, free_path, lens_point, random_block, u01, u01_fine
-from spadwarp_kernels.guided import clip_flight, sample_flight
+from spadwarp_kernels import (
+    TABULATED,
+    Camera,
+    Gate,
+    Medium,
+    fournier_forand_density,
+    free_path,
+    lens_point,
+    make_phase_tables,
+    random_block,
+    u01,
+    u01_fine,
+)
+from spadwarp_kernels.guided import HENYEY_GREENSTEIN_GUIDE, clip_flight, make_sample_flight
 from statistics_of_samples import DEVICES, chi2_p
 
 COUNT = 10_000_000
 G = 0.924
 A2 = (1 - G) ** 2 / G
+
+
+def _hg_angle(theta):
+    """q ~ (a^2 + theta^2)^(-3/2) and its integral from theta on."""
+    return (A2 + theta**2) ** -1.5, (1 - theta / np.sqrt(A2 + theta**2)) / A2
+
+
+_THETA = np.concatenate([np.geomspace(2.2e-5, 1.0, 40_001), np.linspace(1.0, np.pi, 20_001)[1:]])
+_Q = fournier_forand_density(2 * np.sin(_THETA / 2) ** 2, 1.10, 3.5835)
+_REST = np.append(np.cumsum((0.5 * (_Q[1:] + _Q[:-1]) * np.diff(_THETA))[::-1])[::-1], 0.0)
+
+
+def _table_angle(theta):
+    """Fournier-Forand over the angle itself, and its integral from theta on."""
+    return np.interp(theta, _THETA, _Q), np.interp(theta, _THETA, _REST)
+
+
+# What the angle follows: the guide, its law, how closely a density in a cell of the table keeps to it, draws.
+LAWS = {
+    "henyey_greenstein": (HENYEY_GREENSTEIN_GUIDE, _hg_angle, 1e-4, COUNT),
+    "tabulated": (TABULATED.guide, _table_angle, 1e-3, COUNT // 10),
+}
 
 # Flights x + s u, s in [0, length], as the lens at the origin sees them: towards it, away from it, past it.
 FLIGHTS = {
@@ -26,15 +60,29 @@ FLIGHTS = {
 }
 
 
-@wp.kernel(enable_backward=False)
-def _flights(
-    x: wp.vec3, u: wp.vec3, interval: wp.vec2, c: float, a2: float, s: wp.array(dtype=float), p: wp.array(dtype=float)
-):
-    i = wp.tid()
-    block = random_block(wp.uint64(2), wp.uint64(i), wp.uint32(0), wp.uint32(2))
-    sample = sample_flight(x, u, interval, c, a2, u01(block[0]), u01_fine(block[1]))
-    s[i] = sample.s
-    p[i] = sample.density
+def _flights(guide):
+    sample_flight = make_sample_flight(guide)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def flights(
+        x: wp.vec3,
+        u: wp.vec3,
+        interval: wp.vec2,
+        c: float,
+        medium: Medium,
+        s: wp.array(dtype=float),
+        p: wp.array(dtype=float),
+    ):
+        i = wp.tid()
+        block = random_block(wp.uint64(2), wp.uint64(i), wp.uint32(0), wp.uint32(2))
+        sample = sample_flight(x, u, interval, c, medium, u01(block[0]), u01_fine(block[1]))
+        s[i] = sample.s
+        p[i] = sample.density
+
+    return flights
+
+
+FLIGHT_KERNELS = {name: _flights(guide) for name, (guide, *_) in LAWS.items()}
 
 
 @wp.kernel(enable_backward=False)
@@ -63,7 +111,7 @@ def _clips(
     out[i] = clip_flight(camera, gate, x[i], u[i], path, wp.vec3(0.001, -0.002, 0.0), 9.0)
 
 
-def _mixture(s, x, u, s0, s1, c):
+def _mixture(law, s, x, u, s0, s1, c):
     """The density in float64, from its definition: half exp(-c s), half in the angle."""
     x, u = np.asarray(x), np.asarray(u) / np.linalg.norm(u)
     t_c, d = -x @ u, np.linalg.norm(np.cross(x, u))
@@ -72,31 +120,37 @@ def _mixture(s, x, u, s0, s1, c):
     if s0 >= t_c:
         angular = d / r2 / (np.arctan2(d, s0 - t_c) - np.arctan2(d, s1 - t_c))
     else:
-        theta = np.arctan2(d, t_c - np.array([s0, s1]))
-        law = theta / (A2 * np.sqrt(A2 + theta**2))
-        angular = (A2 + np.arctan2(d, t_c - s) ** 2) ** -1.5 / (law[1] - law[0]) * d / r2
+        rest = law(np.arctan2(d, t_c - np.array([s0, s1])))[1]
+        angular = law(np.arctan2(d, t_c - s))[0] / (rest[0] - rest[1]) * d / r2
     return 0.5 * linear + 0.5 * angular
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("extinction", [0.3, 2.5])
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_flight_samples_follow_their_density(flight, extinction, device):
+@pytest.mark.parametrize(
+    ("name", "extinction"), [("henyey_greenstein", 0.3), ("henyey_greenstein", 2.5), ("tabulated", 0.3)]
+)
+def test_flight_samples_follow_their_density(name, flight, extinction, device):
+    _, law, closeness, count = LAWS[name]
+    medium = Medium()
+    medium.anisotropy = G
+    medium.phase = make_phase_tables(lambda t: fournier_forand_density(t, 1.10, 3.5835), device=device)
     x, u, (s0, s1) = FLIGHTS[flight]
     direction = np.asarray(u) / np.linalg.norm(u)
-    s, p = (wp.empty(COUNT, dtype=float, device=device) for _ in range(2))
-    wp.launch(_flights, COUNT, [wp.vec3(*x), wp.vec3(*direction), wp.vec2(s0, s1), extinction, A2, s, p], device=device)
+    s, p = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    inputs = [wp.vec3(*x), wp.vec3(*direction), wp.vec2(s0, s1), extinction, medium]
+    wp.launch(FLIGHT_KERNELS[name], count, [*inputs, s, p], device=device)
     s, p = s.numpy().astype(np.float64), p.numpy().astype(np.float64)
     assert s.min() >= np.float32(s0) and s.max() <= np.float32(s1)
     # What is claimed is what the definition says, to float32's resolution of the position.
     fine = np.isfinite(p)
     assert fine.all()
-    claimed = p[:2000] / _mixture(s[:2000], x, u, s0, s1, extinction) - 1
-    assert np.abs(np.median(claimed)) < 1e-4 and np.quantile(np.abs(claimed), 0.9) < 5e-3
+    claimed = p[:2000] / _mixture(law, s[:2000], x, u, s0, s1, extinction) - 1
+    assert np.abs(np.median(claimed)) < closeness and np.quantile(np.abs(claimed), 0.9) < 5e-3
     # And what is drawn: equal parts by the integral of the density, with nodes where the density is.
     grid = np.unique(np.concatenate([np.linspace(s0, s1, 100_001), np.quantile(s, np.linspace(0, 1, 100_001))]))
     mass = np.concatenate(
-        [[0], np.cumsum(np.diff(grid) * _mixture(0.5 * (grid[1:] + grid[:-1]), x, u, s0, s1, extinction))]
+        [[0], np.cumsum(np.diff(grid) * _mixture(law, 0.5 * (grid[1:] + grid[:-1]), x, u, s0, s1, extinction))]
     )
     assert mass[-1] == pytest.approx(1.0, abs=1e-3)
     edges = np.interp(np.linspace(0, 1, 41), mass / mass[-1], grid)
