@@ -177,7 +177,9 @@ class Medium(_Water):
     phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = Field(
         "henyey_greenstein", description="law of the scattering angle"
     )
-    anisotropy: float = Field(0.924, gt=-1, lt=1, description="henyey_greenstein: mean cosine g of the scattering angle")
+    anisotropy: float = Field(
+        0.924, gt=-1, lt=1, description="henyey_greenstein: mean cosine g of the scattering angle"
+    )
     g1: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the first term")
     g2: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the second term")
     alpha: float | None = Field(None, ge=0, le=1, description="two_term_henyey_greenstein: weight of the first term")

@@ -30,7 +30,7 @@ from .launch import (
     surface_choices,
 )
 from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
-from .medium import Medium, PhaseTables, free_path
+from .medium import Medium, free_path
 from .microfacet import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -97,7 +97,6 @@ __all__ = [
     "Model",
     "PhaseFunction",
     "PhaseGuide",
-    "PhaseTables",
     "Records",
     "SurfaceHit",
     "Surfaces",

@@ -2,22 +2,7 @@
 
 import warp as wp
 
-from .tables import DensityTable
-
-
-@wp.struct
-class PhaseTables:
-    """A tabulated phase function p, from `make_phase_tables`.
-
-    Attributes:
-        scattering: 4 pi p over t/2, t = 1 - cos(theta).
-        turning: ~ p over 1 - theta/pi: what a flight that passes the lens is sampled by.
-        lobe: Over t/2: directions towards the lens, ~ what the flight in such a direction can then bring.
-    """
-
-    scattering: DensityTable
-    turning: DensityTable
-    lobe: DensityTable
+from .tables import DensityTables
 
 
 @wp.struct
@@ -30,14 +15,14 @@ class Medium:
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
         axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
             switches it off.
-        phase: Of the phase function TABULATED; left alone otherwise.
+        phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
     """
 
     extinction: float
     albedo: float
     anisotropy: float
     axis_threshold: float
-    phase: PhaseTables
+    phase: DensityTables
 
 
 @wp.func

@@ -32,17 +32,18 @@ _NEAREST = wp.constant(1.0e-12)  # a folded place of the upper half stays at lea
 
 
 @wp.struct
-class DensityTable:
-    """A density on [0, 1], from `make_density_table`.
+class DensityTables:
+    """Densities on [0, 1], one a row, from `make_density_tables`.
 
     Attributes:
-        cells: In ascending order of x: probability below the cell, below its upper end, density at its end nearer to 0
-            or 1, density at its other end.
-        guide: For each cell of a uniform number, on the same grid, the first cell that its sample can lie in.
+        cells: `[row, cell]`, cells in ascending order of x: probability below the cell, below its upper end, density at
+            its end nearer to 0 or 1, density at its other end.
+        guide: `[row, cell]`: for each cell of a uniform number, on the same grid, the first cell that its sample can
+            lie in.
     """
 
-    cells: wp.array(dtype=wp.vec4)
-    guide: wp.array(dtype=int)
+    cells: wp.array2d(dtype=wp.vec4)
+    guide: wp.array2d(dtype=int)
 
 
 @wp.func
@@ -71,31 +72,31 @@ def _part(z: float, k: int) -> float:
 
 
 @wp.func
-def table_density(table: DensityTable, z: float) -> float:
+def table_density(tables: DensityTables, row: int, z: float) -> float:
     """Density over x at the folded place z."""
     k = _cell_at(z)
-    cell = table.cells[k]
+    cell = tables.cells[row, k]
     return cell[2] + (cell[3] - cell[2]) * _part(z, k)
 
 
 @wp.func
-def table_cumulative(table: DensityTable, z: float) -> float:
+def table_cumulative(tables: DensityTables, row: int, z: float) -> float:
     """Probability below the folded place z."""
     k = _cell_at(z)
-    cell = table.cells[k]
+    cell = tables.cells[row, k]
     f = _part(z, k)
     part = f * (2.0 * cell[2] + (cell[3] - cell[2]) * f) / wp.max(cell[2] + cell[3], 1.0e-30)
     return cell[0] + (cell[1] - cell[0]) * wp.where(z < 0.0, 1.0 - part, part)
 
 
 @wp.func
-def table_sample(table: DensityTable, xi: float) -> float:
+def table_sample(tables: DensityTables, row: int, xi: float) -> float:
     """The folded place below which the probability is xi, in [0, 1)."""
-    k = table.guide[_cell_at(fold(xi))]
-    cell = table.cells[k]
+    k = tables.guide[row, _cell_at(fold(xi))]
+    cell = tables.cells[row, k]
     while xi >= cell[1] and k < _LAST_CELL:
         k += 1
-        cell = table.cells[k]
+        cell = tables.cells[row, k]
     upper = k > _LAST
     r = wp.clamp((xi - cell[0]) / wp.max(cell[1] - cell[0], 1.0e-30), 0.0, 1.0)
     r = wp.where(upper, 1.0 - r, r)
@@ -124,7 +125,7 @@ def folded_quadrature() -> tuple[Floats, Floats]:
 
 
 def tabulate(density: Callable[[Floats], Floats]) -> Floats:
-    """The cells of a `DensityTable` in float64, `[cells, 4]`, from a density of any scale over folded places.
+    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded places.
 
     Up to 2^-33 from an end the density is replaced by its mean there. Raises `ValueError` if it is negative, not finite
     or zero everywhere.
@@ -153,11 +154,11 @@ def lower_ends() -> Floats:
     return np.concatenate([_NODES[:-1], 1.0 - _NODES[:0:-1]])
 
 
-def make_density_table(cells: Floats, *, device: wp.DeviceLike = None) -> DensityTable:
-    """The table that kernels take, from `tabulate`'s cells."""
-    cells = cells.astype(np.float32)
-    first = np.searchsorted(cells[:, 1], lower_ends(), side="right")
-    table = DensityTable()
-    table.cells = wp.array(cells, dtype=wp.vec4, device=device)
-    table.guide = wp.array(np.minimum(first, len(cells) - 1), dtype=int, device=device)
-    return table
+def make_density_tables(*rows: Floats, device: wp.DeviceLike = None) -> DensityTables:
+    """The tables that kernels take, from the cells that `tabulate` gives for each row."""
+    cells = np.stack(rows).astype(np.float32)
+    guide = [np.searchsorted(row[:, 1], lower_ends(), side="right") for row in cells]
+    tables = DensityTables()
+    tables.cells = wp.array(cells, dtype=wp.vec4, device=device)
+    tables.guide = wp.array(np.minimum(guide, cells.shape[1] - 1), dtype=int, device=device)
+    return tables

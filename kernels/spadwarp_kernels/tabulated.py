@@ -11,13 +11,14 @@ import numpy as np
 import warp as wp
 
 from .guided import Guiding, PhaseGuide
-from .medium import Medium, PhaseTables
+from .medium import Medium
 from .phase import PhaseFunction
 from .tables import (
+    DensityTables,
     Floats,
     fold,
     lower_ends,
-    make_density_table,
+    make_density_tables,
     table_cumulative,
     table_density,
     table_sample,
@@ -27,6 +28,10 @@ from .tables import (
 _INV_4PI = wp.constant(0.07957747154594767)
 _PI = wp.constant(3.141592653589793)
 _INV_PI = wp.constant(0.3183098861837907)
+
+# Rows of the tables: 4 pi p over t/2; p over 1 - theta/pi, from which the angle by which a flight turns to the lens is
+# drawn; over t/2 the directions towards the lens.
+_SCATTERING, _TURNING, _LOBE = (wp.constant(i) for i in range(3))
 
 _FLAT = 2.0**-32  # t up to which a table takes the density for constant
 
@@ -45,38 +50,38 @@ def _turn(theta: float) -> float:
 
 @wp.func
 def _pdf(t: float, medium: Medium) -> float:
-    return _INV_4PI * table_density(medium.phase.scattering, fold(0.5 * t))
+    return _INV_4PI * table_density(medium.phase, _SCATTERING, fold(0.5 * t))
 
 
 @wp.func
 def _sample(xi: float, medium: Medium) -> float:
-    return _one_minus_cosine(table_sample(medium.phase.scattering, xi))
+    return _one_minus_cosine(table_sample(medium.phase, _SCATTERING, xi))
 
 
 @wp.func
 def _complement(theta: float, medium: Medium) -> float:
-    return table_cumulative(medium.phase.turning, _turn(theta))
+    return table_cumulative(medium.phase, _TURNING, _turn(theta))
 
 
 @wp.func
 def _angle(value: float, medium: Medium) -> float:
-    z = table_sample(medium.phase.turning, value)
+    z = table_sample(medium.phase, _TURNING, value)
     return wp.where(z < 0.0, -_PI * z, _PI * (1.0 - z))
 
 
 @wp.func
 def _angle_density(theta: float, medium: Medium) -> float:
-    return _INV_PI * table_density(medium.phase.turning, _turn(theta))
+    return _INV_PI * table_density(medium.phase, _TURNING, _turn(theta))
 
 
 @wp.func
 def _lobe_pdf(t: float, medium: Medium, guiding: Guiding) -> float:
-    return _INV_4PI * table_density(medium.phase.lobe, fold(0.5 * t))
+    return _INV_4PI * table_density(medium.phase, _LOBE, fold(0.5 * t))
 
 
 @wp.func
 def _lobe_sample(xi: float, medium: Medium, guiding: Guiding) -> float:
-    return _one_minus_cosine(table_sample(medium.phase.lobe, xi))
+    return _one_minus_cosine(table_sample(medium.phase, _LOBE, xi))
 
 
 TABULATED = PhaseFunction(
@@ -84,7 +89,7 @@ TABULATED = PhaseFunction(
 )
 
 
-def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceLike = None) -> PhaseTables:
+def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceLike = None) -> DensityTables:
     """The tables of a phase function, for `Medium.phase` with the phase function TABULATED.
 
     Args:
@@ -109,8 +114,4 @@ def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceL
         place = np.where(z < 0.0, angle, np.pi - angle) / np.pi
         return np.interp(place, below[1], below[0]) / np.sin(angle)
 
-    tables = PhaseTables()
-    tables.scattering = make_density_table(scattering, device=device)
-    tables.turning = make_density_table(turning, device=device)
-    tables.lobe = make_density_table(tabulate(lobe), device=device)
-    return tables
+    return make_density_tables(scattering, turning, tabulate(lobe), device=device)
