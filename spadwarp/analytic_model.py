@@ -89,11 +89,10 @@ class AnalyticResult:
         `frames`: this many are drawn and written in parts, whatever the memory, instead of those held. Raises
         `FileError` where it cannot be written.
         """
-        import h5py
 
-        from .files import atomic_path
+        from .files import hdf5_file
 
-        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        with hdf5_file(path) as file:
             file.attrs.update(_attributes(self))
             file.create_dataset("config", data=self.scene.to_toml())
             for name, unit in _MAP_UNITS.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import tomllib
@@ -16,12 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import FileError, SpadwarpError
 
 if TYPE_CHECKING:
+    import h5py
+
     from spadwarp.result import Result, Truth
 
 __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
     "atomic_path",
+    "hdf5_file",
     "load_result",
     "load_truth_exr",
     "read_exr",
@@ -75,6 +79,21 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 # HDF5
 
 
+@contextmanager
+def hdf5_file(path: str | Path, **options: Any) -> Iterator[h5py.File]:
+    """An HDF5 file to write to, which is at `path` when the block ends well; see `atomic_path`.
+
+    It is made in memory: HDF5 brings the whole process down when it meets a full disk.
+    """
+    import h5py
+
+    memory = io.BytesIO()
+    with atomic_path(path) as temporary:
+        with h5py.File(memory, "w", **options) as file:
+            yield file
+        temporary.write_bytes(memory.getbuffer())
+
+
 def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Path:
     """Writes a result to one HDF5 file from which `load_result` makes an equal one; returns its path.
 
@@ -86,8 +105,6 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     Raises:
         FileError: The file cannot be written.
     """
-    import h5py
-
     if not 1 <= compression <= 9:
         raise ValueError(f"compression = {compression} is outside [1, 9]")
     _, height, width, bins = result.tallies.shape
@@ -95,7 +112,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
     packed = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5_file(path) as file:
         file.attrs.update(
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.depth import METHODS, Method
 from spadwarp.detector import Detection, detect
-from spadwarp.files import atomic_path
+from spadwarp.files import hdf5_file
 from spadwarp.result import Result, pixel_directions, range_from_path
 
 if TYPE_CHECKING:
@@ -110,7 +110,6 @@ def record_frames(
         ValueError: An argument out of range.
         FileError: The file cannot be written.
     """
-    import h5py
 
     from spadwarp.crlb import crlb_map
 
@@ -129,7 +128,7 @@ def record_frames(
     depth: dict[Method, NDArray[np.float64]] = {}
     errors: dict[Method, FrameErrors] = {}
     detections = 0
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5_file(path) as file:
         for start in range(0, frames, part) if frames > 0 else (0,):
             some = detect(result, frames=min(part, frames - start), first_frame=start, **options)
             depths = {

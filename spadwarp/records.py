@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.files import atomic_path
+from spadwarp.files import hdf5_file
 from spadwarp.hardware import pick_device
 from spadwarp.model import build_model, transport_spec
 from spadwarp.passes import CPU_PASS, CUDA_PASS, Lane, check_range
@@ -121,9 +121,8 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     Raises:
         FileError: The file cannot be written.
     """
-    import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5_file(path) as file:
         file.attrs.update(
             {
                 "format": FORMAT,
