@@ -85,8 +85,9 @@ class ClusterTracer:
     def about(self) -> dict[str, Any]:
         """The workers, for a result's provenance."""
         names = sorted({about["device_name"] for about in self._about.values()})
+        count = len(self._crew.members)
         return {
-            "device": f"{len(self._about)} Ray worker{'s' * (len(self._about) != 1)}",
+            "device": f"{count} Ray worker{'s' * (count != 1)}",
             "device_name": ", ".join(names),
             "workers": list(self._about.values()),
         }
@@ -141,7 +142,7 @@ class ClusterTracer:
                 report(count(done) + sum(count(ids) for ids in held.values()))
             if handing_over is not None and not handing_over:
                 handing_over = None
-                if not stopped.is_set():
+                if done and not stopped.is_set():
                     keep(joined(done))
 
     def _size(self, member: Member, left: int) -> int:

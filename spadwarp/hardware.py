@@ -79,9 +79,11 @@ def devices() -> list[dict[str, Any]]:
     return found
 
 
-def processor_name(device: wp.Device) -> str:
-    """What a device calls itself."""
-    return device.name if device.is_cuda else platform.processor() or platform.machine()
+def processor_name(device: wp.Device | None = None) -> str:
+    """What a device calls itself; by default the CPU."""
+    if device is not None and device.is_cuda:
+        return device.name
+    return platform.processor() or platform.machine()
 
 
 @functools.cache

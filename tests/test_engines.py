@@ -1,6 +1,9 @@
-"""Promises of `run_jobs`: every job is done once, wherever it runs, whatever happens to its worker."""
+"""Promises of the engines: every job is done once, wherever it runs, whatever happens to its worker; a run over Ray
+has the bits of a run without."""
 
 import os
+import random
+import re
 import signal
 import sys
 
@@ -11,6 +14,10 @@ import engine_jobs
 import spadwarp
 from scenes import scene
 from spadwarp.engines import Ray, interruptible, run_jobs
+from test_many import PHOTONS, RUN, same, whole  # noqa: F401
+
+# One Ray for all tests of this file, also where they are dealt out to several processes.
+pytestmark = pytest.mark.xdist_group("ray")
 
 ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
 
@@ -39,8 +46,9 @@ def test_every_job_is_done_once_and_workers_keep_their_state(engine, cluster):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_an_error_of_a_job_is_raised_as_it_is(engine, cluster):
+    options = {"engine": Ray(workers=1)} if engine == "ray" else ENGINES[engine]
     with pytest.raises(ValueError, match="job 0 is wrong"):
-        list(run_jobs(engine_jobs.fails, [0], **ENGINES[engine]))
+        list(run_jobs(engine_jobs.fails, [0], **options))
 
 
 def test_a_job_whose_worker_was_killed_runs_again(cluster, tmp_path):
@@ -81,3 +89,70 @@ def test_simulations_do_not_depend_on_who_runs_them(cluster):
             np.testing.assert_array_equal(
                 tallies, spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu").tallies
             )
+
+
+# Runs over Ray
+
+
+class Killer:
+    """Kills one of the workers that have joined, with each of so many reports of progress."""
+
+    def __init__(self, kills, seed):
+        self.left, self.random, self.pids, self.remarks = kills, random.Random(seed), [], []
+
+    def __call__(self, stage, done, total):
+        if stage != "trace":
+            self.remarks.append(stage)
+            if found := re.match(r"worker .*process (\d+)$", stage):
+                self.pids.append(int(found[1]))
+        elif self.left and 0 < done < total and self.pids:
+            self.left -= 1
+            pid = self.pids.pop(self.random.randrange(len(self.pids)))
+            os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("uncertainty", "kills"), [(False, 3), (True, 1)])
+def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, uncertainty, kills, whole, tmp_path):  # noqa: F811
+    killer = Killer(kills, seed=kills)
+    options = {"uncertainty": uncertainty, "checkpoint": tmp_path / "checkpoint.h5", "checkpoint_every": 0.0}
+    run = spadwarp.simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
+    same(run, whole[uncertainty])
+    assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == kills
+    assert kills + 1 <= len(run.provenance["workers"]) <= kills + 2 and run.provenance["device"] == "2 Ray workers"
+    # What was written down on the way is consistent, whatever was lost, and can be gone on from.
+    kept = spadwarp.load_result(tmp_path / "checkpoint.h5")
+    assert kept.partial and 0 < kept.photons < PHOTONS and kept.ledger_report()["exact"]
+    same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
+
+
+def test_a_run_can_be_gone_on_with_over_ray(cluster, whole):  # noqa: F811
+    parts = [spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, shard=(n, 5)) for n in (5, 1)]
+    gaps = spadwarp.merge(parts)
+    same(spadwarp.simulate(scene(), engine=Ray(workers=1), resume=gaps), whole[True])
+    assert gaps.photons < PHOTONS / 2  # untouched
+
+
+def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):  # noqa: F811
+    def interrupt(stage, done, total):
+        if stage == "trace" and done >= 50_000 and not fired:
+            fired.append(done)
+            signal.raise_signal(signal.SIGINT)
+
+    fired = []
+    part = spadwarp.simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
+    assert part.partial and 50_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
+    # The photons it has, whichever they are, are those of a local run.
+    parts = [
+        spadwarp.simulate(scene(), photons=stop - start, first_photon=start, seed=5, device="cpu")
+        for start, stop in part.photon_ranges
+    ]
+    assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()
+
+
+def test_what_ray_cannot_do_is_said(cluster):
+    with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
+        spadwarp.simulate(scene(), **RUN, device="cuda:1", engine=Ray())
+    with pytest.raises(spadwarp.DeviceError, match="no GPU"):
+        spadwarp.simulate(scene(), **RUN, device="cuda", engine=Ray())
+    with pytest.raises(spadwarp.ConfigError, match="workers = 0"):
+        spadwarp.simulate(scene(), **RUN, engine=Ray(workers=0))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.hardware import core_count, pick_device, processor_name
 
 from . import Ray, Worker
 
@@ -33,19 +34,15 @@ class _Actor:
         self._cuda, self._threads = cuda, threads
 
     def join(self, prepare: Callable[[Worker], None] | None) -> dict[str, Any]:
-        from spadwarp.hardware import pick_device, processor_name
-
-        # Ray shows a process no GPU but its own.
-        device = pick_device("cuda:0" if self._cuda else "cpu")
-        self._worker = Worker(device.alias, None if self._cuda else self._threads)
+        device, name = "cpu", processor_name()
+        if self._cuda:
+            # Ray shows a process no GPU but its own.
+            cuda = pick_device("cuda:0")
+            device, name = cuda.alias, processor_name(cuda)
+        self._worker = Worker(device, None if self._cuda else self._threads)
         if prepare is not None:
             prepare(self._worker)
-        return {
-            "host": socket.gethostname(),
-            "pid": os.getpid(),
-            "device": device.alias,
-            "device_name": processor_name(device),
-        }
+        return {"host": socket.gethostname(), "pid": os.getpid(), "device": device, "device_name": name}
 
     def run(self, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         return work(*arguments, self._worker)
@@ -111,9 +108,12 @@ class Crew:
             raise ConfigError("engine = Ray needs the package ray: pip install 'spadwarp[ray]'") from error
         self._ray = ray
         self._started = not ray.is_initialized()
-        if self._started:
-            _start(ray, self._engine, self._value_bytes)
+        # Ray tells of a worker's death on stdout, which is for answers, and knows no option against it.
+        self._print = getattr(ray._private.worker, "print_to_stdstream", None)
+        ray._private.worker.print_to_stdstream = lambda *_, **__: None
         try:
+            if self._started:
+                _start(ray, self._engine, self._value_bytes)
             self._options, count = self._plan()
             for _ in range(count):
                 self._hire()
@@ -128,6 +128,8 @@ class Crew:
                 self._ray.kill(member.actor)
         if self._started:
             self._ray.shutdown()
+        if self._print is not None:
+            self._ray._private.worker.print_to_stdstream = self._print
 
     def _plan(self) -> tuple[dict[str, Any], int]:
         """Options of an actor, and how many there shall be."""
@@ -251,10 +253,9 @@ def run_on_ray(
 
 def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     """Connects to a cluster, or starts Ray on this machine, without a word of its own."""
-    from spadwarp.hardware import core_count
-
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else a warning in every worker
+    os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # those that matter are raised by `Crew.wait`
     address = engine.address or os.environ.get("RAY_ADDRESS")
     options: dict[str, Any] = {"address": address}
     if address is None:
