@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -328,14 +329,16 @@ def test_exit_code_of_a_process_that_was_used_wrongly(scene):
     assert "Traceback" not in complaints
 
 
-@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT")
-def test_interrupt_writes_what_is_done(scene, tmp_path):
+@pytest.mark.skipif(os.name == "nt", reason="sends signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_writes_what_is_done(scene, tmp_path, number):
+    """Ctrl-C, and what a job scheduler sends before it kills."""
     out = tmp_path / "out"
     process = start("simulate", scene, "--out", out, "--device", "cpu", "--photons", "1e11", "--seed", 3)
     for line in process.stderr:
         if " % " in line:
             break
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, complaints = process.communicate(timeout=120)
     assert process.returncode == 130, complaints
     assert "marked partial" in complaints
@@ -345,3 +348,59 @@ def test_interrupt_writes_what_is_done(scene, tmp_path):
     assert result.ledger_report()["exact"]
     assert {path.name for path in out.iterdir()} == FILES
     assert "stopped early" in run("info", out).stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGKILL")
+def test_a_killed_run_goes_on_from_its_checkpoint(scene, tmp_path):
+    """Killed twice; the outcome is that of one run."""
+    out, kept = tmp_path / "out", tmp_path / "out" / "checkpoint.h5"
+    first = start("simulate", scene, "--out", out, "--device", "cpu", "--photons", "1e11", "--checkpoint", 0.1)
+    before = kill_after_checkpoint(first, kept, newer_than=0)
+    assert before.partial and before.ledger_report()["exact"] and before.requested == (0, 10**11)
+    assert not (out / "result.h5").exists()
+    second = start("simulate", "--resume", out, "--device", "cpu", "--checkpoint", 0.1)
+    after = kill_after_checkpoint(second, kept, newer_than=kept.stat().st_mtime_ns)
+    assert after.photons > before.photons
+
+    total = after.photons + 50_000
+    run("simulate", "--resume", out, "--device", "cpu", "--photons", total)
+    result = spadwarp.load_result(out / "result.h5")
+    long = spadwarp.simulate(spadwarp.load_scene(scene), photons=total, device="cpu")
+    assert np.array_equal(result.tallies, long.tallies) and result.ledger == long.ledger
+    assert not result.partial and len(result.provenance["parts"]) == 3
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def kill_after_checkpoint(process, kept, *, newer_than):
+    while not kept.exists() or kept.stat().st_mtime_ns <= newer_than:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.kill()
+    process.communicate(timeout=60)
+    return spadwarp.load_result(kept)
+
+
+def test_shards_are_merged(scene, tmp_path):
+    parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
+    for number, out in enumerate(parts, 1):
+        run("simulate", scene, "--out", out, "--device", "cpu", "--shard", f"{number}/3", "--uncertainty", "--quiet")
+    told = run("merge", *parts, "--out", tmp_path / "all", "--device", "cpu")
+    merged = spadwarp.load_result(tmp_path / "all" / "result.h5")
+    whole = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu", uncertainty=True)
+    assert np.array_equal(merged.tallies, whole.tallies) and np.array_equal(merged.squares, whole.squares)
+    assert f"photon ids  0 to {whole.photons - 1:,}".replace(",", " ") in told.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--shard", "4/3"), "4/3 is outside"),
+        (("--shard", "half"), "such as 3/64"),
+        (("--engine", "slurm"), "is not local or ray"),
+        (("--workers", "2"), "needs --engine ray"),
+        (("--shard", "1/2", "--records"), "photon 0"),
+        (("--device", "cuda:1", "--engine", "ray"), "cuda:1"),
+    ],
+)
+def test_wrong_parts_and_engines_are_named(scene, tmp_path, arguments, words):
+    assert words in run("simulate", scene, "--out", tmp_path / "out", *arguments, code=2).stderr
