@@ -2,6 +2,13 @@
 
 import json
 import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -162,6 +169,115 @@ def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
         np.rot90(one, k) for one in (item["noisy"][0].numpy(), item["noisy"][0].numpy()[:, ::-1]) for k in range(4)
     ]
     assert any(np.array_equal(np.nan_to_num(a), np.nan_to_num(b)) for a in windows for b in turned)
+
+
+ROOT = Path(__file__).parents[1]
+MAKE = """
+import sys, spadwarp
+spadwarp.make_dataset(spadwarp.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
+"""
+
+
+def start(recipe_path, out, **options):
+    paths = os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))
+    command = [sys.executable, "-c", MAKE, str(recipe_path), str(out)]
+    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, **options)
+
+
+def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
+    small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
+    (tmp_path / "recipe.toml").write_text(small.to_toml())
+    spadwarp.make_dataset(small, tmp_path / "whole", device="cpu")
+    out, generator = tmp_path / "cut", np.random.default_rng(5)
+    for shards in (2, 6, 9):
+        process = start(tmp_path / "recipe.toml", out)
+        while len(list(out.glob("shards/*.json"))) < shards and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(generator.uniform(0.0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        before = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
+    spadwarp.make_dataset(small, out, device="cpu")
+    assert checksums(out) == checksums(tmp_path / "whole")
+    kept = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
+    assert before and all(kept[name] == when for name, when in before.items())
+
+
+def test_a_full_disk_is_told_and_loses_nothing_else(tmp_path):
+    """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
+    small = recipe(**{"frames.per_scene": 1})
+    (tmp_path / "recipe.toml").write_text(small.to_toml())
+    out = tmp_path / "data"
+    spadwarp.make_dataset(small, out, device="cpu", shard=(1, 6))
+    before = checksums(out)
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+
+    process = start(tmp_path / "recipe.toml", out, preexec_fn=limit)
+    last = process.communicate()[1].decode().splitlines()[-1]
+    assert process.returncode == 1
+    assert "FileError" in last and "cannot be written" in last and "-00001.h5" in last
+    assert checksums(out) == before and not list(out.rglob(".*.tmp"))
+
+
+def test_folders_that_will_not_do_are_refused(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used/thesis.txt").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file/below", tmp_path / "used"):
+        with pytest.raises(spadwarp.FileError, match=str(place)):
+            spadwarp.make_dataset(recipe(), place, device="cpu")
+    with pytest.raises(spadwarp.ConfigError, match="another recipe"):
+        spadwarp.make_dataset(recipe(seed=12), folder, device="cpu")
+    with pytest.raises(spadwarp.FileError, match="no dataset there"):
+        spadwarp.FrameReader(tmp_path)
+    with pytest.raises(spadwarp.FileError, match="no dataset there"):
+        spadwarp.verify_dataset(tmp_path)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_told(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(spadwarp.FileError, match="cannot be written"):
+        spadwarp.make_dataset(recipe(), tmp_path / "data", device="cpu")
+
+
+def test_traced_scenes_hold_their_histograms(tmp_path):
+    changes = {
+        "targets.builtin": ["staircase"],
+        "targets.validation": [],
+        "frames.per_scene": 2,
+        "monte_carlo.share": 1.0,
+        "monte_carlo.photons": 40_000,
+        "scene.camera.width": 12,
+        "scene.camera.height": 8,
+        "gate.bins": 64,
+        "scenes_per_target": 1,
+    }
+    totals = {}
+    for how in ("sparse", "dense"):
+        spadwarp.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
+        assert not spadwarp.verify_dataset(tmp_path / how)
+        fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
+        items = list(spadwarp.iterate_dataset(tmp_path / how, "test", fields=fields))
+        totals[how] = [item["counts"] for item in items]
+        for item in items:
+            counts, expected = item["counts"], item["expected"]
+            assert counts.shape == expected.shape == (64, 8, 12)
+            assert math.isnan(item["backscatter_fraction"])
+            # Without pile-up to speak of, counts are Poisson about their expectation.
+            chi2 = float(((counts.sum(axis=0) - expected.sum(axis=0)) ** 2 / expected.sum(axis=0)).sum())
+            assert 1e-3 < stats.chi2(96).sf(chi2) < 0.999
+            np.testing.assert_array_equal(np.minimum(item["intensity"][0], 255), np.minimum(counts.sum(axis=0), 255))
+            found = np.isfinite(item["noisy"][0])
+            assert (found == (counts.sum(axis=0) > 0)).all()
+            # What reports no background and looks past the target saw light that went astray on its way back.
+            right = found & (item["label"][0] == 0) & np.isfinite(item["clean"][0])
+            assert np.median(np.abs(item["noisy"] - item["clean"])[0][right]) < 0.05
+    for sparse, dense in zip(totals["sparse"], totals["dense"], strict=True):
+        np.testing.assert_array_equal(sparse, dense)
 
 
 def test_plan_needs_no_order():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from ._options import (
     Quiet,
     RayAddress,
     Workers,
+    arguments_checked,
     count,
     in_bytes,
     read_engine,
@@ -132,4 +134,33 @@ def info(folder: Folder, json_path: Json = None) -> None:
     write_json(manifest, json_path)
 
 
-__all__ = ["group", "info", "make", "verify"]
+class Split(enum.StrEnum):
+    """What `spadwarp.FrameReader` takes as split."""
+
+    train = "train"
+    validation = "validation"
+    test = "test"
+    all = "all"
+
+
+@group.command()
+def preview(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(metavar="PNG", help="The picture; by default preview.png in DIR.")] = None,
+    split: Annotated[Split, typer.Option(help="Which frames.")] = Split.all,
+    frames: Annotated[int, typer.Option(min=1, metavar="N", help="How many, evenly over the split.")] = 20,
+) -> None:
+    """Draws frames of a dataset on one sheet: true depth, measured depth, recorded photons.
+
+    \b
+    Example:
+      spadwarp dataset preview data/small/ --out sheet.png
+    """
+    from spadwarp.dataset.sheet import draw_dataset
+
+    with arguments_checked():
+        path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
+    say(f"written: {path}")
+
+
+__all__ = ["group", "info", "make", "preview", "verify"]

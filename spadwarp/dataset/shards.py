@@ -33,26 +33,23 @@ def write_shard(
 ) -> dict[str, dict[str, Any]]:
     """Makes a shard's files in `folder`, each whole or not at all; returns their sizes and checksums by name.
 
-    Raises `FileError` where they cannot be written.
+    They are put together in memory. Raises `FileError` where they cannot be written.
     """
     names = plan.files_of(shard)
     for name in names:
         _remove_leftovers(folder / name)
-    # All are renamed at the end, so that a shard that is being made again is replaced when it is whole.
     with ExitStack() as stack:
-        files = [_new_file(stack, plan, shard, folder, name) for name in names]
+        files = [_new_file(stack, plan, shard, name) for name in names]
         _fill(plan, shard, files, device=device, threads=threads)
-        for file in files:
-            file.close()
-    return {name: checksum(folder / name) for name in names}
+        images = [_image(file) for file in files]
+    return {name: _write(folder / name, image) for name, image in zip(names, images, strict=True)}
 
 
 def write_scene_index(plan: Plan, folder: Path) -> None:
     """`scenes.h5`: the scenes of all shards as one, by reference; rows of shards that are not there are NaN or 0."""
-    import h5py
     from h5py import h5d, h5p, h5s, h5t
 
-    with atomic_path(folder / "scenes.h5") as temporary, h5py.File(temporary, "w", libver=_LIBRARY) as file:
+    with _in_memory("scenes.h5") as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
         for name, (shape, kind, unit, text) in scene_columns(plan).items():
             # h5py's own virtual datasets hold the time of day.
@@ -70,6 +67,7 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
                 how.set_fill_value(np.array([np.nan], dtype))
             h5d.create(file.id, name.encode(), h5t.py_create(dtype, logical=True), h5s.create_simple(whole), how)
             file[name].attrs.update({"unit": unit, "description": text})
+        _write(folder / "scenes.h5", _image(file))
 
 
 def checksum(path: Path) -> dict[str, Any]:
@@ -86,12 +84,29 @@ def _remove_leftovers(path: Path) -> None:
             one.unlink()
 
 
-def _new_file(stack: ExitStack, plan: Plan, shard: Shard, folder: Path, name: str) -> Any:
+def _in_memory(name: str) -> Any:
+    """A new HDF5 file in memory: HDF5 ends the process where a disk becomes full under it."""
     import h5py
 
+    return h5py.File(name, "w", driver="core", backing_store=False, block_size=1 << 22, libver=_LIBRARY)
+
+
+def _image(file: Any) -> bytes:
+    file.flush()
+    return file.id.get_file_image()
+
+
+def _write(path: Path, image: bytes) -> dict[str, Any]:
+    """Writes a file whole or not at all; returns its size and checksum."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(image)
+    return {"bytes": len(image), "sha256": hashlib.sha256(image).hexdigest()}
+
+
+def _new_file(stack: ExitStack, plan: Plan, shard: Shard, name: str) -> Any:
     from spadwarp import __version__
 
-    file = stack.enter_context(h5py.File(stack.enter_context(atomic_path(folder / name)), "w", libver=_LIBRARY))
+    file = stack.enter_context(_in_memory(name))
     file.attrs.update(
         {
             "format": f"spadwarp {Path(name).name.partition('-')[0]}",
