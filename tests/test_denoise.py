@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import spadwarp
 from spadwarp import ConfigError, FileError
 from spadwarp.cli import app
-from spadwarp.denoising import baselines, depth_files, inference, metrics
+from spadwarp.denoising import baselines, depth_files, inference, metrics, photons
 from spadwarp.denoising.frames import depth_frames, fill_missing
 from spadwarp.files import write_exr
 
@@ -243,6 +243,42 @@ def test_training_from_a_dataset(dataset, tmp_path):
     assert CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "other")]).exit_code == 2
     with pytest.raises(ConfigError, match="data"):
         spadwarp.train(recipe, tmp_path / "other")
+
+
+# Few photons
+
+
+def wall(reflectance=0.5):
+    """A Monte Carlo result of a plane at 3 m, 16 x 12 pixels."""
+    scene = spadwarp.Scene.from_dict(
+        {
+            "medium": {"extinction": 0.3, "albedo": 0.7, "group_index": 1.36},
+            "laser": {"half_angle_deg": 12.0, "pulse_fwhm_ps": 300.0},
+            "camera": {"width": 16, "height": 12, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+            "gate": {"start_ns": 18.0, "bin_width_ps": 200.0, "bins": 64},
+            "targets": [
+                {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0], "reflectance": reflectance}
+            ],
+        }
+    )
+    return spadwarp.simulate(scene, photons=200_000, seed=2, device="cpu")
+
+
+def test_frames_of_few_photons_meet_the_bound_where_they_are_many(tmp_path):
+    result = wall()
+    frames = [photons.photon_frame(result, photons=2000.0, sbr=20.0, seed=seed) for seed in range(8)]
+    sigma = frames[0][1]
+    spread = np.std([frame.depth[0] for frame, _ in frames], axis=0, ddof=1) / sigma
+    # 192 pixels, each with 7 degrees of freedom; the estimator treats scattered light as a Gaussian return, too.
+    assert 0.8 < np.sqrt(np.nanmedian(spread**2)) < 1.6
+    sweep = photons.photon_sweep(result, photons=(1, 30), sbr=(0.3,), models=("median",), seed=3)
+    assert (sweep.rmse["median"] < sweep.rmse["input"]).all()
+    assert (sweep.bound < sweep.rmse["input"]).all()
+    assert (np.diff(sweep.rmse["input"]) < 0).all()
+    assert sweep.saving("input")[0, 0] == pytest.approx(1.0)
+    assert photons.draw_photon_sweep(sweep, tmp_path / "photons.png").stat().st_size > 10_000
+    with pytest.raises(ValueError, match="sbr"):
+        photons.photon_sweep(result, sbr=(0.0,))
 
 
 # No leakage

@@ -20,6 +20,7 @@ from ._options import (
     check_writable,
     count,
     in_bytes,
+    load_run,
     prepare_directory,
     rows,
     show_table,
@@ -140,7 +141,10 @@ def denoise(
 
 @app.command()
 def evaluate(
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="A dataset's folder.", show_default=False)],
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="A dataset's folder; or a Monte Carlo result.", show_default=False),
+    ],
     models: Annotated[
         str,
         typer.Option(metavar="NAMES", help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid.'),
@@ -155,16 +159,23 @@ def evaluate(
     report: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Also write a report: HTML, pictures, scores.json.")
     ] = None,
+    seed: Annotated[
+        int, typer.Option(parser=whole_number, metavar="N", help="Of the counts that are drawn from a result.")
+    ] = 0,
     device: _TorchDevice = None,
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """Compare denoisers on a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved.
+    """Compare denoisers on a dataset, or on frames of few photons.
+
+    On a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved. On a Monte Carlo result:
+    frames of 1 to 100 signal photons a pixel at several signal-to-background ratios, RMSE beside the Cramér-Rao bound.
 
     \b
-    Example:
+    Examples:
       spadwarp dataset make configs/datasets/paper.toml --out data/paper/
       spadwarp evaluate data/paper/ --models all --report report/
+      spadwarp evaluate out/result.h5 --report photons/
     """
     from rich.table import Table
 
@@ -177,6 +188,9 @@ def evaluate(
         bm3d_frames = 20
     if report is not None:
         check_writable(report)
+    if data.is_file() or (data / "result.h5").is_file():
+        _sweep(data, chosen, report, seed=seed, device=device, quiet=quiet, json_path=json_path)
+        return
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
         found = run(
             data, models=chosen, split=split, frames=frames, bm3d_frames=bm3d_frames, device=device, progress=told
@@ -204,6 +218,42 @@ def evaluate(
                     }
                 )
             )
+        if written:
+            say(f"written: {written[0]}")
+    write_json({**found.to_dict(), "files": written}, json_path)
+
+
+def _sweep(
+    data: Path,
+    models: list[str],
+    report: Path | None,
+    *,
+    seed: int,
+    device: str | None,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Frames of few photons from a result."""
+    from rich.table import Table
+
+    from spadwarp.denoising.photons import draw_photon_sweep, photon_sweep
+    from spadwarp.denoising.report import TITLES
+
+    result = load_run(data)
+    with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+        found = photon_sweep(
+            result, models=[one for one in models if one != "bm3d"], seed=seed, device=device, progress=told
+        )
+    written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
+    if not quiet:
+        say(f"RMSE [mm]; {found.about}")
+        for row, ratio in enumerate(found.sbr):
+            table = Table(f"SBR {ratio:g}", *(f"{n:g} photons" for n in found.photons))
+            for name, values in found.rmse.items():
+                title = "likelihood of each pixel" if name == "input" else TITLES[name]
+                table.add_row(title, *(f"{1e3 * one:.3g}" for one in values[row]))
+            table.add_row("Cramér–Rao bound", *(f"{1e3 * one:.3g}" for one in found.bound[row]))
+            show_table(table)
         if written:
             say(f"written: {written[0]}")
     write_json({**found.to_dict(), "files": written}, json_path)

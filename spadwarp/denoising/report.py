@@ -16,7 +16,7 @@ from spadwarp.files import atomic_path
 from .evaluation import Evaluation, Sample
 from .metrics import LARGER_IS_BETTER
 
-__all__ = ["TITLES", "write_report"]
+__all__ = ["COLOURS", "TITLES", "write_report"]
 
 TITLES = {
     "input": "noisy input",
@@ -27,7 +27,7 @@ TITLES = {
     "dncnn": "DnCNN",
     "pyramid": "PyramidNet",
 }
-_COLOURS = {
+COLOURS = {
     "input": "0.55",
     "median": "#E69F00",
     "gating": "#56B4E9",
@@ -107,7 +107,7 @@ def _metrics(evaluation: Evaluation) -> Any:
                 if points:
                     bold = method == "pyramid"
                     (lines[method],) = axis.plot(
-                        *zip(*points, strict=True), color=_COLOURS[method], marker="o", markersize=3.5,
+                        *zip(*points, strict=True), color=COLOURS[method], marker="o", markersize=3.5,
                         linewidth=2.2 if bold else 1.2, zorder=3 if bold else 2,
                         linestyle="--" if method == "input" else "-",
                     )  # fmt: skip
@@ -173,7 +173,7 @@ def _ranking(evaluation: Evaluation) -> Any:
     figure = _figure(12.0, 0.42 * len(order) + 1.5)
     for axis, field in zip(figure.subplots(1, len(fields), sharey=True), fields, strict=True):
         values = [getattr(evaluation.mean(method), field) for method in order]
-        axis.barh(range(len(order)), values, color=[_COLOURS[one] for one in order], height=0.7)
+        axis.barh(range(len(order)), values, color=[COLOURS[one] for one in order], height=0.7)
         for y, value in enumerate(values):
             axis.text(value, y, " " + _FIELDS[field][1].format(value), va="center", fontsize=8)
         axis.set_yticks(range(len(order)), [TITLES[one] for one in order])
