@@ -28,6 +28,14 @@ _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 
+def on_config(config: Any) -> Any:
+    """Pages that the navigation does not name go to its end."""
+    named = re.findall(r"[\w/]+\.md", str(config.nav))
+    pages = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+    config.nav += [{"More": others}] if (others := [page for page in pages if page not in named]) else []
+    return config
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Adds the pages from elsewhere."""
     for source, page in ELSEWHERE.items():

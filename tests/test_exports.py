@@ -53,7 +53,7 @@ def test_npy(origin, frames, detection, tmp_path):
     source = frames if origin == "file" else detection
     assert spadwarp.export(source, tmp_path / "all.npy") == [tmp_path / "all.npy"]
     assert np.array_equal(np.load(tmp_path / "all.npy"), detection.counts)
-    spadwarp.export(source, tmp_path / "one.npy", frame=1)
+    spadwarp.export(source, tmp_path / "one.npy", frames=1)
     assert np.array_equal(np.load(tmp_path / "one.npy"), detection.counts[1])
     assert np.array_equal(read_histograms(tmp_path / "one.npy").values, detection.counts[1])
 
@@ -114,7 +114,7 @@ def test_ptu_is_read_back_by_ptufile(frames, detection, tmp_path):
         image = file.decode_image(channel=0, keepdims=True)  # [frame, y, x, channel, bin]
     assert np.array_equal(image[:, :, :, 0, :], detection.counts[..., : image.shape[-1]])
     assert not detection.counts[..., image.shape[-1] :].any()
-    spadwarp.export(frames, tmp_path / "one.ptu", frame=0)
+    spadwarp.export(frames, tmp_path / "one.ptu", frames=0)
     again = read_histograms(tmp_path / "one.ptu")
     assert again.values.sum() == detection.counts[0].sum()
 
@@ -144,9 +144,9 @@ def test_analytic_frames(tmp_path):
     path = analytic.save(tmp_path / "analytic.h5")
     spadwarp.export(path, tmp_path / "depth.npy")
     assert np.array_equal(np.load(tmp_path / "depth.npy"), analytic.depth, equal_nan=True)
-    [exr] = spadwarp.export(path, tmp_path / "depth.exr", frame=2)
+    [exr] = spadwarp.export(path, tmp_path / "depth.exr", frames=2)
     assert np.array_equal(read_exr_channels(exr)["Z"], analytic.depth[2], equal_nan=True)
-    with pytest.raises(ValueError, match=r"holds depth and no counts, which \.mat is for"):
+    with pytest.raises(ValueError, match=r"frame 0 is depth without counts, which \.mat is for"):
         spadwarp.export(path, tmp_path / "a.mat")
 
 
@@ -154,8 +154,8 @@ def test_what_cannot_be_written_is_said(frames, detection, result, tmp_path):
     for ending in ("mat", "ptu"):
         with pytest.raises(ValueError, match="draw frames first"):
             spadwarp.export(result, tmp_path / f"a.{ending}")
-    with pytest.raises(ValueError, match=r"frame = 2 is outside \[0, 1\]"):
-        spadwarp.export(frames, tmp_path / "a.npy", frame=2)
+    with pytest.raises(ValueError, match=r"frames = 2 is outside \[0, 1\]"):
+        spadwarp.export(frames, tmp_path / "a.npy", frames=2)
     with pytest.raises(ValueError, match="result is missing"):
         spadwarp.export(detection, tmp_path / "a.mat")
     with pytest.raises(FileError, match=r"'\.tif' is not one of \.npy"):
@@ -178,7 +178,76 @@ def test_command(frames, tmp_path):
         "frames-00001.mat",
         "frames.npy",
     ]
-    run(frames, "--format", "npy", "--frame", 1, "--out", tmp_path / "b", "--quiet")
+    run(frames, "--format", "npy", "--frames", "1:2", "--out", tmp_path / "b", "--quiet")
     assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
     assert "holds none of" in run(tmp_path, "--format", "npy", "--out", tmp_path / "c", code=1).output
-    assert "outside" in run(frames, "--format", "npy", "--frame", 9, "--out", tmp_path / "d", code=2).output
+    assert "outside" in run(frames, "--format", "npy", "--frames", 9, "--out", tmp_path / "d", code=2).output
+
+
+RECIPE = {
+    "name": "both kinds",
+    "seed": 3,
+    "scenes_per_target": 2,
+    "scenes_per_shard": 2,
+    "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
+    "pose": {"distance": 5.0},
+    "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
+    "exposure": {"pulses": 3000},
+    "frames": {"per_scene": 2},
+    "monte_carlo": {"share": 1.0, "photons": 20_000},
+    "scene": {
+        "medium": {"extinction": 0.3, "albedo": 0.8},
+        "laser": {"half_angle_deg": 12.0, "position": [-0.05, 0.0, 0.0], "repetition_rate": 5e6},
+        "camera": {"width": 7, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    place = tmp_path_factory.mktemp("dataset") / "traced"
+    spadwarp.make_dataset(spadwarp.Recipe.from_dict(RECIPE), place, device="cpu")
+    return place
+
+
+def test_datasets_with_histograms(dataset, tmp_path):
+    items = list(spadwarp.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
+    written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
+    assert len(written) == len(items) == 4
+    for path, item in zip(written, items, strict=True):
+        file = io.loadmat(path)
+        counts = np.asarray(file["spad"].todense()).reshape(7, 4, -1).transpose(2, 1, 0)
+        assert np.array_equal(counts, item["counts"]) and counts.any()
+        assert np.array_equal(file["rates"].transpose(2, 0, 1), item["expected"])
+        assert np.array_equal(file["depth"], np.nan_to_num(item["clean"][0]))
+        assert file["SBR"] > 0
+    # Where light comes straight back, the bin of the truth holds most of what was expected of the target.
+    seen = file["bin"] > 0
+    rates, at = file["rates"], file["bin"].astype(int) - 1
+    near = sum(np.take_along_axis(rates, np.clip(at + k, 0, 39)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1, 2))
+    assert seen.sum() > 10 and np.median(near[seen] / rates.sum(axis=-1)[seen]) > 0.5
+
+    spadwarp.export(dataset, tmp_path / "a.npy", split="train", frames=slice(1, 3))
+    stacked = np.stack([item["counts"].transpose(1, 2, 0) for item in items[1:3]])
+    assert np.array_equal(np.load(tmp_path / "a.npy"), stacked)
+    spadwarp.export(dataset, tmp_path / "a.ptu", split="train", frames=0)
+    assert read_histograms(tmp_path / "a.ptu").values.sum() == items[0]["counts"].sum()
+
+
+def test_datasets_of_depth(dataset, tmp_path):
+    """Images of a frame with those of its scene; a split of its own."""
+    items = list(spadwarp.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
+    written = spadwarp.export(dataset, tmp_path / "a.exr", split="test")
+    assert len(written) == len(items)
+    for path, item in zip(written, items, strict=True):
+        channels = read_exr_channels(path)
+        for name, field in {"Z": "noisy", "truth.Z": "clean", "background": "label"}.items():
+            assert np.array_equal(channels[name], item[field][0], equal_nan=True), name
+    with pytest.raises(FileError, match="name the dataset's folder"):
+        spadwarp.export(next(dataset.glob("frames-*.h5")), tmp_path / "b.npy")
+    outcome = CliRunner().invoke(
+        app,
+        ["export", str(dataset), "--split", "test", "--frames", "0:1", "--format", "exr", "--out", str(tmp_path / "c")],
+    )
+    assert outcome.exit_code == 0, outcome.output
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["traced.exr"]

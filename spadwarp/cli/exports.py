@@ -39,15 +39,18 @@ def export(
         typer.Option("--format", help="Format to write; may be repeated.", show_default=False),
     ],
     out: Out,
-    frame: Annotated[int | None, typer.Option(min=0, metavar="N", help="Only this frame; by default all.")] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="N or A:B", help="Only frame N, or A to B - 1; by default all.")
+    ] = None,
+    split: Annotated[str, typer.Option(metavar="NAME", help="Of a dataset: train, validation, test or all.")] = "all",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """Results and frames in the formats of other programs.
+    """Results, frames and datasets in the formats of other programs.
 
     \b
-    npy  NumPy: [height, width, bin], with frames before that
+    npy  NumPy: [height, width, bin], with frames before that; depth where there are no counts
     mat  MATLAB, one file a frame, as the simulated data that single-photon
          denoisers read: sparse spad, rates, 1-based bin, bin_size in seconds
     ptu  PicoQuant T3 image, one record a detection
@@ -59,13 +62,16 @@ def export(
     Examples:
       spadwarp export frames/frames.h5 --format mat --format ptu --out exported/
       spadwarp export run1/result.h5 --format npy --out exported/
+      spadwarp export data/small/ --split test --frames 0:20 --format exr --out exported/
     """
     source = _inside(path)
+    chosen = _frames(frames)
     prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
     written: dict[str, list[Path]] = {}
     with arguments_checked():
         for one in dict.fromkeys(formats):
-            written[one.value] = spadwarp.export(source, out / f"{source.stem}.{one.value}", frame=frame)
+            path = out / f"{source.resolve().stem}.{one.value}"
+            written[one.value] = spadwarp.export(source, path, frames=chosen, split=split)
     if not quiet:
         lines = {}
         for name, paths in written.items():
@@ -77,7 +83,7 @@ def export(
 
 def _inside(place: Path) -> Path:
     """The file, or the one that can be exported in a directory."""
-    if not place.is_dir():
+    if not place.is_dir() or (place / "manifest.json").is_file():
         return place
     names = ("frames.h5", "result.h5", "analytic.h5")
     found = [place / name for name in names if (place / name).is_file()]
@@ -85,3 +91,13 @@ def _inside(place: Path) -> Path:
         what = " and ".join(one.name for one in found) if found else f"none of {', '.join(names)}"
         raise FileError(f"{place}: holds {what}; name the file")
     return found[0]
+
+
+def _frames(text: str | None) -> int | slice | None:
+    if text is None:
+        return None
+    first, colon, stop = text.partition(":")
+    numbers = [int(one) if one else None for one in (first, stop) if not one or one.isdecimal()]
+    if len(numbers) != 2 or (not colon and not first):
+        raise typer.BadParameter(f"{text!r} is not of the form N or A:B", param_hint="--frames")
+    return slice(*numbers) if colon else int(first)
