@@ -1,7 +1,8 @@
 """Writes the pages in docs/reference that come from the code: `python docs/reference.py`.
 
-scene.md and recipe.md: every field of a scene and of a dataset recipe, from their models. cli.md: the help of every
-command. python.md and kernels.md: the public names, whose docstrings mkdocstrings shows.
+scene.md and recipe.md: every field of a scene and of a dataset recipe, from their models. dataset.md: what the files
+of a dataset hold. cli.md: the help of every command. python.md and kernels.md: the public names, whose docstrings
+mkdocstrings shows.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 import typer
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import AfterValidator, BaseModel
@@ -36,6 +38,7 @@ def pages() -> dict[str, str]:
     return {
         "scene.md": scene(),
         "recipe.md": recipe(),
+        "dataset.md": dataset(),
         "cli.md": commands(),
         "python.md": python(),
         "kernels.md": kernels(),
@@ -232,6 +235,34 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}" if math.isfinite(value) else ("inf" if value > 0 else "-inf")
     return str(value)
+
+
+def dataset() -> str:
+    """Datasets in the files of a dataset."""
+    from spadwarp.dataset.columns import FRAME_COLUMNS, scene_columns
+    from spadwarp.dataset.histograms import MEANING
+    from spadwarp.dataset.plan import Plan
+
+    def table(rows: Mapping[str, tuple[str, str]]) -> str:
+        lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]
+        return "\n".join(["| dataset | unit | what |", "|---|---|---|", *lines])
+
+    plan = Plan(spadwarp.load_recipe(FOLDER.parents[1] / "configs" / "datasets" / "small.toml"))
+    scenes = {
+        name: (unit, f"{text}; {np.dtype(kind)}" + (f" `{list(shape)}` a scene" if shape else ""))
+        for name, (shape, kind, unit, text) in scene_columns(plan).items()
+    }
+    parts = [
+        MADE
+        + "# Files of a dataset\n\nHow they lie together: [file formats](../formats.md#datasets). Shapes are those of "
+        "[configs/datasets/small.toml](../../configs/datasets/small.toml), 64 × 48 pixels.",
+        "## frames-NNNNN.h5\n\nOne row a frame.\n\n" + table(FRAME_COLUMNS),
+        "## scenes-NNNNN.h5 and scenes.h5\n\nOne row a scene.\n\n" + table(scenes),
+        "## histograms-NNNNN.h5\n\nOf traced scenes: `scene`, `expected`, `gate_start` and `bin_width` have a row "
+        "a scene, `sample` and the counts a row a frame. Counts are stored as cubes (`counts`), or event by event.\n\n"
+        + table(MEANING),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 # Command line

@@ -17,7 +17,7 @@ __all__ = ["HistogramFile", "HistogramWriter"]
 
 _PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
-_MEANING = {
+MEANING = {
     "scene": ("1", "index into scenes.h5"),
     "expected": ("1", "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"),
     "gate_start": ("s", "start of bin 0 after the pulse left the laser"),
@@ -68,7 +68,7 @@ class HistogramWriter:
         if self._events:
             self._write_counts()
         for name, one in self._file.items():
-            unit, text = _MEANING[name]
+            unit, text = MEANING[name]
             one.attrs.update({"unit": unit, "description": text})
 
     def _write_counts(self) -> None:
