@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ._frustum import beam_planes, points_inside, view_planes
 from .catalog import WATER_INDICES
 from .config import SPEED_OF_LIGHT, Laser, Layer, Medium, Scene
-from .water import group_index, pure_water_absorption, water_optics
+from .water import group_index, molecular_density, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
     from .targets import TriangleMesh
@@ -298,7 +298,7 @@ def _water(shape: _Shape) -> Iterator[CheckMessage]:
         for name, water in _named_waters(medium):
             if water.preset is not None:
                 yield _preset_at_another_wavelength(name, water.preset, laser)
-    if medium.chlorophyll is not None:
+    if medium.layers:
         yield from _molecular_scattering(shape.scene)
     thickest = max(water.extinction for water in medium.waters)
     mean = thickest * shape.scene.path_limit  # collisions along the longest path that counts
@@ -344,22 +344,26 @@ def _preset_at_another_wavelength(name: str, preset: str, laser: Laser) -> Check
 
 def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
     """Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back."""
-    optics = water_optics(
-        scene.laser.wavelength_nm,
-        chlorophyll=scene.medium.chlorophyll or 0.0,
-        temperature=20.0 if scene.medium.temperature is None else scene.medium.temperature,
-        salinity=35.0 if scene.medium.salinity is None else scene.medium.salinity,
-    )
-    molecules = optics.water_scattering * 0.1171  # 3/(4π(2 + δ)) per steradian at 180°, depolarization δ = 0.039
-    g = scene.medium.anisotropy
-    particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
-    back, share = molecules / (molecules + particles), optics.water_scattering / optics.scattering
-    if scene.medium.phase_function == "henyey_greenstein" and back > 0.1:
-        text = (
-            f"{100.0 * share:.2g} % of the scattering is the water's own, nearly even in all directions; the phase "
-            f"function, of particles, leaves it out: {100.0 * back:.2g} % of what is scattered straight back is missing"
+    medium = scene.medium
+    for name, water in _named_waters(medium):
+        if water.chlorophyll is None or medium.phase_function != "henyey_greenstein":
+            continue
+        optics = water_optics(
+            scene.laser.wavelength_nm,
+            chlorophyll=water.chlorophyll,
+            temperature=20.0 if medium.temperature is None else medium.temperature,
+            salinity=35.0 if medium.salinity is None else medium.salinity,
         )
-        yield CheckMessage("note", "medium.anisotropy", text, {"molecular_share": share, "missing": back})
+        molecules = optics.water_scattering * float(molecular_density(np.array(2.0)))
+        g = medium.anisotropy if water.anisotropy is None else water.anisotropy
+        particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
+        missing = molecules / (molecules + particles)
+        if missing > 0.1:
+            text = (
+                f"layers have the phase function of particles alone: {100.0 * missing:.2g} % of what would be "
+                "scattered straight back is the water's own and is missing"
+            )
+            yield CheckMessage("note", f"{name}.chlorophyll", text, {"missing": missing})
 
 
 def _cutoff_collisions(scene: Scene) -> float:

@@ -212,6 +212,7 @@ class Medium(_Water):
         (), description="other waters further along `layer_axis`, in its order"
     )
     layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers; any length but 0")
+    _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")
     @classmethod
@@ -262,24 +263,38 @@ class Medium(_Water):
         temperature = 20.0 if self.temperature is None else self.temperature
         salinity = 35.0 if self.salinity is None else self.salinity
 
-        def follow(water: _Water, names: Sequence[str]) -> None:
+        self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
+        for water in self.waters:
+            names = [] if water.chlorophyll is None else [*_layers.COEFFICIENTS]
+            if water is self and self.follows_wavelength:
+                names += [name for name in ("phase_index", "group_index") if name not in self.model_fields_set]
+            if not names:
+                continue
             optics = water_optics(
                 wavelength_nm, chlorophyll=water.chlorophyll or 0.0, temperature=temperature, salinity=salinity
             )
             water.__dict__.update({name: getattr(optics, name) for name in names})
-
-        self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
-        for water in self.waters:
-            if water.chlorophyll is not None:
-                follow(water, _layers.COEFFICIENTS)
-        if self.follows_wavelength:
-            follow(self, [name for name in ("phase_index", "group_index") if name not in self.model_fields_set])
+            if water is self and self.chlorophyll is not None and not self.layers:
+                self._molecular_share = optics.water_scattering / optics.scattering
 
     @property
     def phase_parameters(self) -> dict[str, float | str]:
         """The fields that `phase_function` takes."""
         names = {"henyey_greenstein": ("anisotropy",), "fournier_forand": ("particle_index", "junge_slope")}
         return {name: getattr(self, name) for name in {**names, **_PHASE_FIELDS}[self.phase_function]}
+
+    @property
+    def molecular_share(self) -> float:
+        """Part of the scattering that is the water's own, beside `phase_function`, which is then of particles alone.
+
+        Known with chlorophyll, 0 without it; 0 with layers too, which share one phase function.
+        """
+        return self._molecular_share
+
+    @property
+    def has_phase_table(self) -> bool:
+        """Whether scattering is drawn from a table rather than from Henyey and Greenstein's formula."""
+        return self.phase_function != "henyey_greenstein" or self.molecular_share > 0.0
 
     @property
     def follows_wavelength(self) -> bool:

@@ -207,6 +207,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "extinction": medium.extinction,
         "albedo": medium.albedo,
         "phase_function": medium.phase_function,
+        "molecular_share": medium.molecular_share,
         **medium.phase_parameters,
         "group_index": medium.group_index,
         "phase_index": medium.phase_index,

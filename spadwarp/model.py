@@ -96,7 +96,7 @@ def build_model(
     medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
     medium.anisotropy = scene.medium.anisotropy
     medium.axis_threshold = scene.transport.axis_threshold
-    if scene.medium.phase_function != "henyey_greenstein":
+    if scene.medium.has_phase_table:
         medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
 
     laser = sk.Laser()
@@ -211,7 +211,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
 
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
-        phase=sk.HENYEY_GREENSTEIN if scene.medium.phase_function == "henyey_greenstein" else sk.TABULATED,
+        phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
         paper_albedo=scene.medium.albedo == "paper",
         mesh=mesh is not None,
         few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .catalog import PHASE_TABLES
 from .config import Medium
 from .errors import ConfigError, FileError
+from .water import molecular_density
 
 __all__ = ["PhaseFunction", "phase_function", "read_phase_table"]
 
@@ -28,11 +29,13 @@ class PhaseFunction:
     Attributes:
         name: `medium.phase_function`.
         parameters: The medium's fields that it takes.
+        molecular_share: Part of the scattering that is the water's own and not of that name.
         over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
     """
 
     name: str
     parameters: dict[str, float | str]
+    molecular_share: float
     over_t: Callable[[Floats], Floats]
 
     def density(self, angle: ArrayLike) -> Floats:
@@ -45,7 +48,7 @@ class PhaseFunction:
         from spadwarp_kernels import sphere_integral
 
         if self.name == "henyey_greenstein":
-            return float(self.parameters["anisotropy"])
+            return (1.0 - self.molecular_share) * float(self.parameters["anisotropy"])
         return sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
 
     @cached_property
@@ -76,7 +79,14 @@ def phase_function(medium: Medium) -> PhaseFunction:
     else:
         numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
         density = partial(getattr(sk, f"{name}_density"), **numbers)
-    return PhaseFunction(name, parameters, density)
+    share = medium.molecular_share
+    if share > 0.0:
+        of_particles = density
+
+        def density(t: Floats) -> Floats:
+            return (1.0 - share) * of_particles(t) + share * molecular_density(t)
+
+    return PhaseFunction(name, parameters, share, density)
 
 
 def read_phase_table(path: str | Path) -> tuple[Floats, Floats]:

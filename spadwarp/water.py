@@ -36,6 +36,8 @@ _RANGES = {
     "chlorophyll": (0.0, 30.0),
 }
 
+_DEPOLARIZATION = 0.039  # of light scattered by 90° (Farinato & Rowell 1976)
+
 Value = Any  # a float for a float, else an array
 
 
@@ -173,12 +175,17 @@ def pure_water_scattering(
     stiffness = (n2 - 1.0) * (1.0 + 2.0 / 3.0 * (n2 + 2.0) * (index / 3.0 - 1.0 / (3.0 * index)) ** 2)
 
     boltzmann, avogadro, molar_mass = 1.380649e-23, 6.02214076e23, 0.018
-    depolarization = 0.039  # Farinato & Rowell 1976
-    cabannes = (6.0 + 6.0 * depolarization) / (6.0 - 7.0 * depolarization)
+    cabannes = (6.0 + 6.0 * _DEPOLARIZATION) / (6.0 - 7.0 * _DEPOLARIZATION)
     of_density = 0.5 * boltzmann * (t + 273.15) * compressibility * stiffness**2
     of_salt = 2.0 * n2 * s * molar_mass * slope**2 / (density * -activity * avogadro)
     at_90_degrees = np.pi**2 / (wavelength * 1e-9) ** 4 * (of_density + of_salt) * cabannes
-    return _value(8.0 * np.pi / 3.0 * at_90_degrees * (2.0 + depolarization) / (1.0 + depolarization))
+    return _value(8.0 * np.pi / 3.0 * at_90_degrees * (2.0 + _DEPOLARIZATION) / (1.0 + _DEPOLARIZATION))
+
+
+def molecular_density(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Phase function [1/sr] of pure water over t = 1 − cosθ: 1 + cos²θ·(1 − δ)/(1 + δ), δ the depolarization ratio."""
+    spread = 1.0 + _DEPOLARIZATION + (1.0 - _DEPOLARIZATION) * (1.0 - t) ** 2
+    return 3.0 / (4.0 * np.pi) * spread / (4.0 + 2.0 * _DEPOLARIZATION)
 
 
 def _quan_fry(temperature: ArrayLike, salinity: ArrayLike) -> tuple[Any, Any, float, float]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp
+from scenes import scene as make_scene
 from spadwarp import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 from spadwarp.catalog import WATER_INDICES
 from spadwarp.config import Medium, Scene
@@ -193,8 +194,47 @@ def test_a_preset_at_another_wavelength_is_warned_about():
     assert "850 nm" in findings(scene({"preset": "uwoc-clear"}, 850.0), "medium.preset")["warning"].text
 
 
-def test_scattering_by_the_water_itself_is_told_where_it_matters():
-    values = findings(scene({"chlorophyll": 0.05}), "medium.anisotropy")["note"].values
-    assert values["molecular_share"] == pytest.approx(0.04, abs=0.01)
-    assert 0.6 < values["missing"] < 0.8
-    assert not findings(scene({"chlorophyll": 20.0}), "medium.anisotropy")
+@pytest.mark.parametrize("law", [{"anisotropy": 0.924}, {"phase_function": "fournier_forand"}])
+@pytest.mark.parametrize("chlorophyll", [0.05, 0.5])
+def test_the_water_s_own_scattering_is_in_the_phase_function(chlorophyll, law):
+    medium = Medium(chlorophyll=chlorophyll, **law)
+    optics = water_optics(532.0, chlorophyll=chlorophyll)
+    share = optics.water_scattering / optics.scattering
+    particles = spadwarp.phase_function(Medium(extinction=1.0, albedo=0.5, **law))
+    both = spadwarp.phase_function(medium)
+    angles = np.radians([1.0, 45.0, 90.0, 135.0, 180.0])
+    # 3/(4 pi) (1 + delta + (1 - delta) cos^2)/(4 + 2 delta): at 90 degrees 0.0608, at 180 degrees 0.1171 per steradian.
+    molecules = 3.0 / (4.0 * np.pi) * (1.039 + 0.961 * np.cos(angles) ** 2) / 4.078
+    assert molecules[[2, 4]] == pytest.approx([0.0608, 0.1171], abs=5e-5)
+    expected = share * molecules + (1.0 - share) * particles.density(angles)
+    np.testing.assert_allclose(both.density(angles), expected, rtol=1e-9)
+    assert both.mean_cosine == pytest.approx((1.0 - share) * particles.mean_cosine, rel=1e-4)
+    backward = share * 0.5 + (1.0 - share) * particles.backscatter_fraction
+    assert both.backscatter_fraction == pytest.approx(backward, rel=1e-4)
+
+
+def test_estimators_agree_in_water_that_scatters_by_itself():
+    totals = {}
+    for estimator in ("next_event", "guided"):
+        one = make_scene(
+            medium={"extinction": None, "albedo": None, "chlorophyll": 0.05},
+            transport={"estimator": estimator},
+        )
+        runs = [
+            spadwarp.simulate(one, photons=40_000, seed=seed, device="cpu").component("backscatter").sum()
+            for seed in range(8)
+        ]
+        totals[estimator] = np.mean(runs), np.std(runs, ddof=1) / math.sqrt(8)
+    (mean, error), (other, other_error) = totals.values()
+    assert mean == pytest.approx(other, abs=4.0 * math.hypot(error, other_error))
+    assert other_error < 0.02 * other
+
+
+def test_what_layers_leave_out_is_told():
+    layers = {"chlorophyll": 0.05, "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "chlorophyll": 0.5}]}
+    told = [message for message in spadwarp.check(scene(layers)) if message.field.endswith("chlorophyll")]
+    assert [message.field for message in told] == ["medium.chlorophyll", "medium.layers[1].chlorophyll"]
+    assert told[0].values["missing"] == pytest.approx(0.7655, abs=0.002)
+    assert told[1].values["missing"] == pytest.approx(0.363, abs=0.002)
+    assert scene(layers).medium.molecular_share == 0.0
+    assert not [m for m in spadwarp.check(scene({"chlorophyll": 0.05})) if m.field.endswith("chlorophyll")]
