@@ -7,7 +7,7 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 from .analytic import sample_frames
 from .analytic_budget import BACKSCATTER_SOURCES, Lidar, signal_map, single_scatter_table
 from .batches import Batches
-from .camera import Camera, lens_point, pixel_direction, project
+from .camera import Camera, lens_point, pixel_direction, project, project_calibrated
 from .cramer_rao import COUNT_LAWS, statistics_maps
 from .depth import arrival_bins
 from .detector import dark_count_rates, event_counts, expected_detections, first_photon_counts
@@ -15,7 +15,7 @@ from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sa
 from .domain import Limits, exit_distance
 from .gate import C0, Gate, gate_bin
 from .guided import Guiding, PhaseGuide
-from .laser import LASER_PROFILES, Laser, emit_photon
+from .laser import LASER_PROFILES, Laser, Scan, emit_photon, profile_tables
 from .launch import (
     Data,
     Model,
@@ -30,6 +30,7 @@ from .launch import (
     surface_choices,
 )
 from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
+from .lens import CALIBRATED, PINHOLE, Lens
 from .medium import Medium, free_path
 from .microfacet import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
 from .phase import (
@@ -74,6 +75,7 @@ from .truth import truth_kernel
 __all__ = [
     "BACKSCATTER_SOURCES",
     "C0",
+    "CALIBRATED",
     "COMPONENTS",
     "COUNTERS",
     "COUNT_LAWS",
@@ -83,6 +85,7 @@ __all__ = [
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
+    "PINHOLE",
     "TABULATED",
     "Batches",
     "Camera",
@@ -91,6 +94,7 @@ __all__ = [
     "Guiding",
     "Laser",
     "Layers",
+    "Lens",
     "Lidar",
     "Limits",
     "Medium",
@@ -98,6 +102,7 @@ __all__ = [
     "PhaseFunction",
     "PhaseGuide",
     "Records",
+    "Scan",
     "SurfaceHit",
     "Surfaces",
     "Textures",
@@ -142,7 +147,9 @@ __all__ = [
     "orthonormal_basis",
     "philox4x32",
     "pixel_direction",
+    "profile_tables",
     "project",
+    "project_calibrated",
     "random_block",
     "read_ledger",
     "reflectance_at",

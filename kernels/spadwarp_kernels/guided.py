@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera
 from .direction import cotangent
 from .gate import Gate
 from .medium import Medium
@@ -46,38 +45,13 @@ class FlightSample:
 
 
 @wp.func
-def _clip(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
-    """The part of the interval of s in which value + slope s > 0."""
-    lower = interval[0]
-    upper = interval[1]
-    if slope > 0.0:
-        lower = wp.max(lower, -value / slope)
-    elif slope < 0.0:
-        upper = wp.min(upper, -value / slope)
-    elif value <= 0.0:
-        upper = -1.0
-    return wp.vec2(lower, upper)
+def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2) -> wp.vec2:
+    """The part of the interval [s0, s1] of the flight x + s u whose light arrives within the gate by way of a lens
+    point; empty where s0 >= s1.
 
-
-@wp.func
-def clip_flight(
-    camera: Camera, gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, limit: float
-) -> wp.vec2:
-    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, that the camera sees within the gate; empty where s0
-    >= s1.
-
-    The view is five half-spaces (front, four side planes through the lens centre). The arrival path s + r(s) rises
-    with s,
-    so the gate cuts out an interval: s + r = L at s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
+    The arrival path s + r(s) rises with s, so the gate cuts out an interval: s + r = L at
+    s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
     """
-    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
-    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
-    interval = wp.vec2(0.0, limit)
-    interval = _clip(x[2], u[2], interval)
-    interval = _clip(half_width * x[2] - x[0], half_width * u[2] - u[0], interval)
-    interval = _clip(half_width * x[2] + x[0], half_width * u[2] + u[0], interval)
-    interval = _clip(half_height * x[2] - x[1], half_height * u[2] - u[1], interval)
-    interval = _clip(half_height * x[2] + x[1], half_height * u[2] + u[1], interval)
     if interval[0] >= interval[1]:
         return interval
 

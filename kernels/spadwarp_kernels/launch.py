@@ -10,7 +10,7 @@ from .camera import Camera
 from .domain import Limits
 from .gate import Gate
 from .guided import Guiding
-from .laser import Laser
+from .laser import Laser, Scan
 from .layers import Layers
 from .medium import Medium
 from .shadow import near_depth_map
@@ -30,6 +30,7 @@ class Model:
         surfaces: The struct that kernels take, made from the mesh by `make_surfaces`.
         scale: Tally units per emitted photon.
         layers: Of a layered spec, from `make_layers`; empty otherwise.
+        scan: Raster of a confocal spec; empty otherwise.
     """
 
     device: wp.Device
@@ -43,6 +44,7 @@ class Model:
     surfaces: Surfaces
     scale: float
     layers: Layers = field(default_factory=Layers)
+    scan: Scan = field(default_factory=Scan)
 
     @property
     def tally_size(self) -> int:
@@ -259,6 +261,7 @@ def launch_transport(
             model.limits,
             model.guiding,
             model.surfaces,
+            model.scan,
             seed,
             first_id,
             photon_count,

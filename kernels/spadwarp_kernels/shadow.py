@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .camera import Camera
+from .camera import Camera, field
 
 # Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
 _TEXELS = wp.constant(128)
@@ -10,8 +10,8 @@ _NOTHING = wp.constant(1.0e30)
 
 
 @wp.func
-def _texel(tangent: float, half_field: float) -> float:
-    return (tangent / half_field + 1.0) * 0.5 * float(_TEXELS)
+def _texel(tangent: float, low: float, high: float) -> float:
+    return (tangent - low) / (high - low) * float(_TEXELS)
 
 
 @wp.kernel(enable_backward=False)
@@ -23,8 +23,9 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, near_depth: wp.array2d(d
     q = m.points[m.indices[3 * face + 1]]
     r = m.points[m.indices[3 * face + 2]]
     depth = wp.min(p[2], wp.min(q[2], r[2]))
-    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
-    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
+    view = camera.view
+    if view[2] == view[0]:
+        view = field(camera)
     first_column = int(0)
     first_row = int(0)
     last_column = int(_TEXELS - 1)
@@ -38,10 +39,10 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, near_depth: wp.array2d(d
         bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + stray
         # One texel more on each side makes up for rounding.
         edge = float(_TEXELS)
-        first_column = int(wp.clamp(_texel(left, half_width) - 1.0, 0.0, edge))
-        last_column = int(wp.clamp(_texel(right, half_width) + 1.0, -1.0, edge - 1.0))
-        first_row = int(wp.clamp(_texel(top, half_height) - 1.0, 0.0, edge))
-        last_row = int(wp.clamp(_texel(bottom, half_height) + 1.0, -1.0, edge - 1.0))
+        first_column = int(wp.clamp(_texel(left, view[0], view[2]) - 1.0, 0.0, edge))
+        last_column = int(wp.clamp(_texel(right, view[0], view[2]) + 1.0, -1.0, edge - 1.0))
+        first_row = int(wp.clamp(_texel(top, view[1], view[3]) - 1.0, 0.0, edge))
+        last_row = int(wp.clamp(_texel(bottom, view[1], view[3]) + 1.0, -1.0, edge - 1.0))
     else:
         depth = 0.0  # beside or behind the lens: nothing is certain
     for row in range(first_row, last_row + 1):
@@ -70,3 +71,17 @@ def may_be_hidden(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec
     row = (x[1] * scale / float(camera.height) + 1.0) * 0.5 * float(_TEXELS)
     edge = float(_TEXELS) - 1.0
     return x[2] >= near_depth[int(wp.clamp(row, 0.0, edge)), int(wp.clamp(column, 0.0, edge))]
+
+
+@wp.func
+def may_be_hidden_in(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+    """As `may_be_hidden`, for a camera with a `view`; True for points beside it, which a thin lens sees out of
+    focus."""
+    if near_depth.shape[0] == 0:
+        return True
+    column = _texel(x[0] / x[2], camera.view[0], camera.view[2])
+    row = _texel(x[1] / x[2], camera.view[1], camera.view[3])
+    edge = float(_TEXELS)
+    if not (column >= 0.0 and row >= 0.0 and column < edge and row < edge):
+        return True
+    return x[2] >= near_depth[int(row), int(column)]

@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, lens_point, project
+from .camera import Camera, lens_point
 from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
-from .domain import Limits, exit_distance, exit_face
+from .domain import Limits, exit_distance, exit_distance_turned, exit_face, exit_face_turned
 from .gate import Gate, gate_bin
-from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_flight, make_sample_flight
-from .laser import Laser, emit_photon
+from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_to_gate, make_sample_flight
+from .laser import Laser, Scan, emit_along, emit_measured
 from .layers import HOMOGENEOUS, LAYERED, Layers
+from .lens import PINHOLE, Lens
 from .medium import Medium
 from .microfacet import ggx_brdf, reflection_pdf, sample_reflection, unshadowed
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
@@ -35,7 +36,6 @@ from .philox import (
     u01_last,
     u01_low,
 )
-from .shadow import may_be_hidden
 from .surface import (
     Surfaces,
     face_reflectance,
@@ -101,6 +101,10 @@ class TransportSpec(NamedTuple):
         layered: The water is that of the layers, not that of the medium.
         pattern: The reflectance varies within faces: corners and textures.
         specular: Faces have a rough specular lobe beside the Lambertian one.
+        lens: How the camera images.
+        measured_beam: Emit from the laser's measured profile.
+        confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
+        turned: The domain has axes of its own.
     """
 
     estimator: str = "next_event"
@@ -114,6 +118,10 @@ class TransportSpec(NamedTuple):
     layered: bool = False
     pattern: bool = False
     specular: bool = False
+    lens: Lens = PINHOLE
+    measured_beam: bool = False
+    confocal: bool = False
+    turned: bool = False
 
 
 @wp.struct
@@ -178,6 +186,8 @@ class _Walk:
     collisions: int
     surface_count: int
     reason: int  # ledger entry of the history's end
+    target: int  # pixel that a scan scores it in, and what that sees
+    view: wp.vec4
     # Its next event:
     block: wp.vec4ui
     sample_block: wp.vec4ui
@@ -219,6 +229,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     layered, pattern, specular = spec.layered, spec.pattern, spec.specular
     local_albedo = layered and not paper_albedo
     water_free_path, water_extinction, water_at = LAYERED if layered else HOMOGENEOUS
+    confocal = spec.confocal
+    pinhole = spec.lens.name == PINHOLE.name
+    if confocal and pinhole:
+        raise ValueError("confocal = True needs lens = CALIBRATED")
+    project, clip_to_view, may_be_hidden, inward_of = spec.lens[1:]
+    emit = emit_measured if spec.measured_beam else emit_along
+    to_exit, face_of_exit = (exit_distance_turned, exit_face_turned) if spec.turned else (exit_distance, exit_face)
     # A handful of faces is tried on the spot; rays for a BVH wait until the warp has enough of them.
     has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
@@ -244,6 +261,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         limits: Limits,
         guiding: Guiding,
         surfaces: Surfaces,
+        scan: Scan,
         # Photons:
         seed: wp.uint64,
         first_id: wp.uint64,
@@ -260,6 +278,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         s.stage = _START
         s.photon = thread
         s.albedo = medium.albedo
+        s.view = camera.view
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp wait for a surface or a new photon
@@ -272,7 +291,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.distance = water_free_path(medium, layers, s.x, s.u, u01(s.block[0]))
                     limit = limits.max_path - s.path
                     if wp.static(bounded):
-                        limit = wp.min(limit, exit_distance(limits, s.x, s.u))
+                        limit = wp.min(limit, to_exit(limits, s.x, s.u))
                     s.reach = wp.min(s.distance, limit)
                     if wp.static(paper_albedo):
                         draw = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
@@ -282,7 +301,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.sample_block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                         s.lens = lens_point(camera, u01(s.sample_block[2]), u01(s.sample_block[3]))
                         s.dither = u01_last(s.sample_block[2])
-                        s.interval = clip_flight(camera, gate, s.x, s.u, s.path, s.lens, limit)
+                        s.interval = clip_to_view(camera, s.view, s.x, s.u, s.lens, limit)
+                        s.interval = clip_to_gate(gate, s.x, s.u, s.path, s.lens, s.interval)
                         if s.interval[0] < s.interval[1] and (wp.static(layered) or medium.extinction > 0.0):
                             s.stage = _FLIGHT_SAMPLE
                             s.reach = wp.max(s.reach, s.interval[1])
@@ -322,7 +342,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             )
                             s.along = flight.s
                             y = s.x + s.along * s.u
-                            pixel = project(camera, y)
+                            pixel = project(camera, s.view, y, s.lens)
+                            if wp.static(confocal):
+                                pixel = wp.where(pixel == s.target, pixel, -1)
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
                                 t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
@@ -360,7 +382,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if s.u[2] < 0.0 and s.collisions > 0:
                             crossing = -s.x[2] / s.u[2]
                             on_lens = s.x + crossing * s.u
-                            pixel = project(camera, s.x)
+                            pixel = project(camera, s.view, s.x, on_lens)
+                            if wp.static(confocal):
+                                pixel = wp.where(pixel == s.target, pixel, -1)
                             radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
                             inside = radius2 <= camera.aperture_radius * camera.aperture_radius
                             if pixel >= 0 and inside and crossing <= wp.min(s.distance, limit):
@@ -380,9 +404,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if s.distance > limit:
                         s.reason = MAX_PATH
                     if wp.static(bounded):
-                        out_distance = exit_distance(limits, s.x, s.u)
+                        out_distance = to_exit(limits, s.x, s.u)
                         if out_distance < s.distance and out_distance <= limit:
-                            s.reason = exit_face(limits, s.x, s.u)
+                            s.reason = face_of_exit(limits, s.x, s.u)
                         limit = wp.min(limit, out_distance)
                     if s.reason >= 0:
                         s.x = s.x + limit * s.u
@@ -401,7 +425,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(next_event or guided):
                             # Water s.collisions are scored here by next_event alone: guided has scored the flight.
                             if wp.static(next_event) or s.face >= 0:
-                                pixel = project(camera, s.x)
+                                pixel = int(0)
+                                if wp.static(pinhole):
+                                    # Whatever the lens point; the others need it.
+                                    pixel = project(camera, s.view, s.x, s.x)
                                 if pixel >= 0:
                                     if wp.static(guided):
                                         id = first_id + wp.uint64(s.photon)
@@ -412,6 +439,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         # The word that only guided needs otherwise, and bits that the flight left.
                                         s.lens = lens_point(camera, u01_high(s.block[3]), u01_low(s.block[3]))
                                         s.dither = u01_last(s.block[0])
+                                    if wp.static(not pinhole):
+                                        pixel = project(camera, s.view, s.x, s.lens)
+                                        if wp.static(confocal):
+                                            pixel = wp.where(pixel == s.target, pixel, -1)
                                     to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
@@ -435,7 +466,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         )
                                         if s.surface_count == 0:
                                             component = BACKSCATTER
-                                    if scattering > 0.0:
+                                    if scattering > 0.0 and pixel >= 0:
                                         s.along = 0.0
                                         s.pending_value = next_event_value(
                                             camera,
@@ -533,10 +564,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 id = first_id + wp.uint64(s.photon)
                                 ahead = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                                 v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
-                            inward = wp.vec3(-s.x[0], -s.x[1], 0.0)
+                            inward = inward_of(s.view, s.x)
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
                             to_view_chance = float(0.0)
-                            if project(camera, s.x) < 0 and wp.dot(inward, inward) > 0.0:
+                            centre = wp.vec3(0.0, 0.0, 0.0)
+                            if project(camera, s.view, s.x, centre) < 0 and wp.dot(inward, inward) > 0.0:
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])
@@ -619,7 +651,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             if s.stage == _START:
                 s.stage = _DONE
                 if s.photon < photon_count:
-                    start, heading = emit_photon(laser, seed, first_id + wp.uint64(s.photon))
+                    id = first_id + wp.uint64(s.photon)
+                    axis = laser.axis
+                    if wp.static(confocal):
+                        s.target = int(id % wp.uint64(scan.count))
+                        s.view = scan.view[s.target]
+                        axis = scan.axis[s.target]
+                    start, heading = emit(laser, axis, seed, id)
                     s.x = start
                     s.u = heading
                     s.weight = 1.0
