@@ -31,6 +31,8 @@ _HOMES = {
     "interruptible": "engines",
     "trace": "records",
     "PhotonRecords": "records",
+    "look_at": "pose",
+    "opencv_pose": "pose",
     "truth_maps": "model",
     "devices": "hardware",
     "doctor": "health",
@@ -99,6 +101,7 @@ if TYPE_CHECKING:
     from spadwarp.health import Diagnosis, SelfTest, doctor
     from spadwarp.model import truth_maps
     from spadwarp.phase_functions import PhaseFunction, phase_function
+    from spadwarp.pose import look_at, opencv_pose
     from spadwarp.records import PhotonRecords, trace
     from spadwarp.response import InstrumentResponse, instrument_response
     from spadwarp.result import Result, Truth

@@ -23,6 +23,8 @@ COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 # Overriding one coefficient of a complete medium keeps this other one.
 _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
 
+_INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
+
 # Setting a field in a later layer drops these fields of the earlier ones.
 _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
     "medium": {
@@ -33,8 +35,10 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "phase_function": ("g1", "g2", "alpha", "phase_table"),
     },
     "camera": {
-        "horizontal_fov_deg": ("pixel_pitch_um",),
-        "pixel_pitch_um": ("horizontal_fov_deg",),
+        "horizontal_fov_deg": ("pixel_pitch_um", *_INTRINSICS),
+        "pixel_pitch_um": ("horizontal_fov_deg", *_INTRINSICS),
+        "fx": ("horizontal_fov_deg", "pixel_pitch_um"),
+        "calibration": ("horizontal_fov_deg", "pixel_pitch_um", *_INTRINSICS, "distortion"),
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     },

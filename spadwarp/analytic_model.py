@@ -357,8 +357,12 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     from spadwarp_kernels.analytic_budget import BACKSCATTER_SOURCES, Lidar
     from spadwarp_kernels.laser import LASER_PROFILES
 
-    laser, camera, chosen = scene.laser, scene.camera, scene.analytic
+    laser, camera, chosen = scene.beam, scene.camera, scene.analytic
     problems = []
+    if laser.profile == "measured":
+        problems.append("analytic: laser.profile = 'measured' has no closed form; simulate takes any")
+    if scene.scan.mode != "none":
+        problems.append(f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it")
     paper = chosen.form == "paper"
     if paper and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90):
         problems.append(
@@ -408,7 +412,7 @@ def _phase_table(scene: Scene) -> Map:
 
 def depth_per_time(scene: Scene, view: Map, distance: Map) -> Map:
     """dz/dt along lines of sight u [m/s]: path = |r·u − p| + r, so that d path/dr = 1 + (direction of the light)·u."""
-    laser = scene.laser
+    laser = scene.beam
     if laser.profile == "collimated":
         light = np.broadcast_to(np.asarray(laser.axis), view.shape)
     else:
@@ -509,7 +513,7 @@ def _sample(
         ]
         drawn = kernels.sample_frames(
             *inputs,
-            laser=scene.laser.position,
+            laser=scene.beam.position,
             gate_paths=(scene.gate.start * speed, scene.gate.stop * speed),
             first_frame=first + start,
             frames=stop - start,

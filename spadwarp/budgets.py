@@ -221,7 +221,7 @@ def _axis_rows(
 ) -> list[BudgetRow]:
     speed = SPEED_OF_LIGHT / scene.medium.group_index
     gate = (scene.gate.start, scene.gate.stop)
-    laser = np.asarray(scene.laser.position)
+    laser = np.asarray(scene.beam.position)
     points = distances[:, None] * np.array([0.0, 0.0, 1.0])
     arrival = (np.linalg.norm(points - laser, axis=1) + distances) / speed
     if gate[0] <= arrival.min() and arrival.max() <= gate[1]:

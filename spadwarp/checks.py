@@ -99,11 +99,11 @@ class _Shape:
         self.view = view_planes(scene.camera)
         self.beam = beam_planes(scene.laser)
         self.lit = points_inside(self.triangles, np.concatenate([self.view, self.beam]))
-        paths = np.linalg.norm(self.lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(self.lit, axis=1)
+        paths = np.linalg.norm(self.lit - np.array(scene.beam.position), axis=1) + np.linalg.norm(self.lit, axis=1)
         ranges = np.linalg.norm(self.lit, axis=1)
         self.target_range = (float(ranges.min()), float(ranges.max())) if len(ranges) else None
         nearest = self.lit[ranges.argmin()].tolist() if len(ranges) else None
-        self.optical_depth = None if nearest is None else scene.medium.optical_depth((0.0, 0.0, 0.0), nearest)
+        self.optical_depth = None if nearest is None else scene.optical_depth((0.0, 0.0, 0.0), nearest)
         self.target_path = (float(paths.min()), float(paths.max())) if len(paths) else None
 
     @property
@@ -172,7 +172,7 @@ def _targets(shape: _Shape) -> Iterator[CheckMessage]:
                 " signal named here take the target as Lambertian"
             )
             yield CheckMessage("note", f"targets[{index}].specular", text, {"specular": target.specular})
-    (low, high), laser = scene.domain.bounds, scene.laser.position
+    (low, high), laser = scene.domain.bounds, scene.beam.position
     for place, point in (("the lens", (0.0, 0.0, 0.0)), ("the laser", laser)):
         if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):
             yield CheckMessage(
@@ -210,7 +210,7 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         )
         yield CheckMessage("warning", name, text, {"nearest_angle_deg": math.degrees(angles.min())})
         return
-    paths = np.linalg.norm(lit - np.array(scene.laser.position), axis=1) + np.linalg.norm(lit, axis=1)
+    paths = np.linalg.norm(lit - np.array(scene.beam.position), axis=1) + np.linalg.norm(lit, axis=1)
     nanoseconds = 1e9 * scene.medium.group_index / SPEED_OF_LIGHT
     first, last = float(paths.min()) * nanoseconds, float(paths.max()) * nanoseconds
     start, stop = scene.gate.start * 1e9, scene.gate.stop * 1e9

@@ -43,6 +43,7 @@ __all__ = [
     "Layer",
     "Medium",
     "Output",
+    "Scan",
     "Scene",
     "Target",
     "Transport",
@@ -65,6 +66,12 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _padded(value: Any) -> Any:
+    """Four coefficients of distortion lack k3, as OpenCV allows."""
+    value = _listed(value)
+    return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
+
+
 def _sized(value: Any) -> Any:
     return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else _listed(value)
 
@@ -75,6 +82,7 @@ def _three(value: Any) -> Any:
 
 Whole = Annotated[int, BeforeValidator(_whole)]
 Vector = Annotated[tuple[float, float, float], BeforeValidator(_listed)]
+Brown = Annotated[tuple[float, float, float, float, float], BeforeValidator(_padded)]
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
 Corner = Annotated[tuple[Bound, Bound, Bound], BeforeValidator(_three)]
 Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_sized), Field(min_length=1, max_length=3)]
@@ -148,7 +156,7 @@ class _Water(Section):
 class Layer(_Water):
     """Water from a plane on, up to the next layer; given as a medium is."""
 
-    start: float = Field(..., description="where it begins along `layer_axis`, the scene's z if not given [m]")
+    start: float = Field(..., description="where it begins along `layer_axis`, the world's z if not given [m]")
     anisotropy: float | None = Field(
         None, gt=-1, lt=1, description="mean cosine g of the scattering angle; the medium's if not given"
     )
@@ -211,7 +219,7 @@ class Medium(_Water):
     layers: Annotated[tuple[Layer, ...], BeforeValidator(_listed)] = Field(
         (), description="other waters further along `layer_axis`, in its order"
     )
-    layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers; any length but 0")
+    layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers, in the world; not 0")
     _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")
@@ -316,7 +324,7 @@ class Medium(_Water):
         return (self, *self.layers)
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """∫c ds on the straight way between two points of the scene [m]."""
+        """∫c ds on the straight way between two points of the world [m]."""
         length = math.dist(begin, end)
         if not self.layers or length == 0.0:
             return self.extinction * length
@@ -349,13 +357,22 @@ class Laser(Section):
 
     section: ClassVar[str] = "laser"
     preset: str | None = Field(None, description="a named laser, see `spadwarp presets laser`")
-    position: Vector = Field((0.0, 0.0, 0.0), description="place in the camera frame [m]")
-    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0")
-    profile: Literal["uniform_cone", "gaussian", "collimated"] = Field(
-        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); or parallel"
+    position: Vector = Field((0.0, 0.0, 0.0), description="place [m]")
+    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0; a scan aims it itself")
+    frame: Literal["camera", "world"] = Field(
+        "camera", description="frame of position and direction: a laser moves with the camera, or stands in the world"
+    )
+    profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = Field(
+        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"
+    )
+    profile_image: str | None = Field(
+        None, description="irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"
     )
     half_angle_deg: float = Field(
-        15.0, gt=0, le=180, description="half angle θ of the cone, 1/e² half angle of the gaussian [°]"
+        15.0,
+        gt=0,
+        le=180,
+        description="half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]",
     )
     beam_radius: float = Field(0.0, ge=0, description="radius of the collimated beam [m]; 0 is a pencil beam")
     wavelength_nm: float = Field(532.0, gt=0, description="vacuum wavelength [nm]")
@@ -367,10 +384,12 @@ class Laser(Section):
     def _has_a_beam(self) -> Self:
         if not any(self.direction):
             raise ValueError(f"direction = {list(self.direction)} has no length")
-        if self.profile == "gaussian" and self.half_angle_deg >= 90:
+        if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
             raise ValueError(
-                f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a gaussian profile"
+                f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a {self.profile} profile"
             )
+        if (self.profile == "measured") != (self.profile_image is not None):
+            raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
         return self
 
     @property
@@ -392,10 +411,11 @@ class Laser(Section):
 
 
 class Camera(Section):
-    """A pinhole view through a round aperture, with square pixels.
+    """A view through a round aperture: a pinhole's, or a thin lens's where `focus_distance` is given.
 
-    The view is given by `horizontal_fov_deg`, or by `focal_length` with `pixel_pitch_um`; the aperture by
-    `aperture_diameter`, or by `f_number` with `focal_length`.
+    The view is given by `horizontal_fov_deg`, by `focal_length` with `pixel_pitch_um`, or by OpenCV's `fx` (with `fy`,
+    `cx`, `cy`), which `calibration` reads from a file; the aperture by `aperture_diameter`, or by `f_number` with
+    `focal_length`.
     """
 
     section: ClassVar[str] = "camera"
@@ -405,38 +425,138 @@ class Camera(Section):
     horizontal_fov_deg: float | None = Field(None, gt=0, lt=180, description="full horizontal field of view [°]")
     focal_length: float | None = Field(None, gt=0, description="focal length [m]")
     pixel_pitch_um: float | None = Field(None, gt=0, description="side of a pixel [µm]")
+    fx: float | None = Field(None, gt=0, description="focal length along rows [pixels], as OpenCV writes it")
+    fy: float | None = Field(None, gt=0, description="focal length along columns [pixels]; fx if not given")
+    cx: float | None = Field(
+        None,
+        description="column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle",
+    )
+    cy: float | None = Field(None, description="row of the optical axis, likewise")
+    distortion: Brown = Field((0.0,) * 5, description="Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
+    calibration: str | None = Field(
+        None,
+        description="OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place",
+    )
     aperture_diameter: float | None = Field(None, gt=0, description="diameter of the entrance aperture [m]")
     f_number: float | None = Field(None, gt=0, description="focal length over aperture diameter")
+    focus_distance: float | None = Field(
+        None,
+        gt=0,
+        le=math.inf,
+        allow_inf_nan=True,
+        description="thin lens: depth that is imaged sharply [m], inf is infinity; not given: pinhole, all of it sharp",
+    )
+    position: Vector = Field((0.0, 0.0, 0.0), description="lens centre in the world [m]")
+    rotation_deg: Vector = Field(
+        (0.0, 0.0, 0.0), description="turns from the world's axes about x, the turned y, then z [°]"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_calibration(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping) or not isinstance(fields.get("calibration"), str):
+            return fields
+        from .calibration import load_calibration
+
+        read = load_calibration(fields["calibration"])
+        for name in ("width", "height"):
+            if fields.get(name, read.get(name)) != read.get(name, fields.get(name)):
+                raise ValueError(f"{name} = {fields[name]} is not {read[name]}, the image's of the calibration")
+        return {**read, **{name: value for name, value in fields.items() if name != "calibration"}}
 
     @model_validator(mode="after")
     def _determined(self) -> Self:
-        if (self.horizontal_fov_deg is None) == (self.pixel_pitch_um is None):
-            raise ValueError("needs either horizontal_fov_deg or pixel_pitch_um with focal_length")
+        given = [name for name in ("horizontal_fov_deg", "pixel_pitch_um", "fx") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                "needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length"
+                + (f"; given: {', '.join(given)}" if given else "")
+            )
         if (self.aperture_diameter is None) == (self.f_number is None):
             raise ValueError("needs either aperture_diameter or f_number with focal_length")
         if self.focal_length is None and (self.pixel_pitch_um is not None or self.f_number is not None):
             raise ValueError(
                 f"focal_length is missing; {'pixel_pitch_um' if self.f_number is None else 'f_number'} needs it"
             )
+        for name in ("fy", "cx", "cy"):
+            if self.fx is None and getattr(self, name) is not None:
+                raise ValueError(f"{name} = {getattr(self, name)} goes with fx only")
+        if self.focus_distance is not None and self.focus_distance <= (self.focal_length or 0.0):
+            raise ValueError(
+                f"focus_distance = {self.focus_distance} is outside ({self.focal_length}, inf], beyond the focal length"
+            )
+        if any(self.distortion):
+            from .imaging import is_invertible
+
+            if not is_invertible(self):
+                raise ValueError(
+                    f"distortion = {list(self.distortion)} folds the image: some of its {self.width} x {self.height} "
+                    "pixels show no direction, or two"
+                )
         return self
 
     @property
+    def focal_pixels(self) -> tuple[float, float]:
+        """Focal length in pixels along rows and columns, fx and fy: image distance over pixel pitch."""
+        if self.fx is not None:
+            return self.fx, self.fy or self.fx
+        tangent = self.pixel_tangent
+        return 1.0 / tangent, 1.0 / tangent
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Image coordinates (column, row) of the optical axis, (0.5, 0.5) being the first pixel's centre."""
+        return (
+            self.width / 2.0 if self.cx is None else self.cx + 0.5,
+            self.height / 2.0 if self.cy is None else self.cy + 0.5,
+        )
+
+    @property
     def pixel_tangent(self) -> float:
-        """Pixel pitch over focal length."""
+        """Pixel pitch over image distance; the geometric mean of both directions where fx and fy differ.
+
+        The image distance is the focal length or, where a thin lens is focused nearer than infinity, 1/(1/f − 1/d).
+        """
         if self.horizontal_fov_deg is not None:
             return 2.0 * math.tan(math.radians(self.horizontal_fov_deg) / 2.0) / self.width
+        if self.fx is not None:
+            return 1.0 / math.sqrt(self.fx * (self.fy or self.fx))
         assert self.pixel_pitch_um is not None and self.focal_length is not None
-        return self.pixel_pitch_um * 1e-6 / self.focal_length
+        return self.pixel_pitch_um * 1e-6 / self.focal_length * (1.0 - self.focal_length * self.inverse_focus)
+
+    @property
+    def inverse_focus(self) -> float:
+        """1 over the depth that is imaged sharply [1/m]; 0 for a pinhole, and for a lens focused at infinity."""
+        return 0.0 if self.focus_distance is None else 1.0 / self.focus_distance
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a pinhole with square pixels about the optical axis and without distortion."""
+        fx, fy = self.focal_pixels
+        middle = (self.width / 2.0, self.height / 2.0)
+        return fx == fy and self.principal_point == middle and not any(self.distortion) and self.focus_distance is None
+
+    @property
+    def view_box(self) -> tuple[float, float, float, float]:
+        """Least and largest tangents (left, top, right, bottom) of what the image shows."""
+        if any(self.distortion):
+            from .imaging import view_box
+
+            return view_box(self)
+        (fx, fy), (cx, cy) = self.focal_pixels, self.principal_point
+        return -cx / fx, -cy / fy, (self.width - cx) / fx, (self.height - cy) / fy
 
     @property
     def horizontal_fov(self) -> float:
         """Full horizontal field of view [rad]."""
-        return 2.0 * math.atan(self.pixel_tangent * self.width / 2.0)
+        left, _, right, _ = self.view_box
+        return math.atan(right) - math.atan(left)
 
     @property
     def vertical_fov(self) -> float:
         """Full vertical field of view [rad]."""
-        return 2.0 * math.atan(self.pixel_tangent * self.height / 2.0)
+        _, top, _, bottom = self.view_box
+        return math.atan(bottom) - math.atan(top)
 
     @property
     def aperture_radius(self) -> float:
@@ -450,6 +570,22 @@ class Camera(Section):
     def aperture_area(self) -> float:
         """Area of the entrance aperture [m²]."""
         return math.pi * self.aperture_radius**2
+
+
+class Scan(Section):
+    """How the beam moves over the scene."""
+
+    section: ClassVar[str] = "scan"
+    mode: Literal["none", "confocal"] = Field(
+        "none", description="confocal: the beam visits the pixels in turn and each sees its own light alone"
+    )
+    distance: float = Field(
+        math.inf,
+        gt=0,
+        le=math.inf,
+        allow_inf_nan=True,
+        description="range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel",
+    )
 
 
 class Detector(Section):
@@ -539,7 +675,9 @@ class Target(Section):
     rotation_deg: Vector = Field(
         (0.0, 0.0, 0.0), description="turns about the target's own x, then the turned y, then z [°]"
     )
-    translation: Vector = Field((0.0, 0.0, 0.0), description="shift in the camera frame [m]")
+    translation: Vector = Field(
+        (0.0, 0.0, 0.0), description="shift in the world [m], the camera's frame if it has no pose"
+    )
     reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = Field(
         0.5, description='Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file'
     )
@@ -574,7 +712,7 @@ class Target(Section):
 
 
 class Domain(Section):
-    """Where the water is. A photon that leaves it is gone; a camera or laser outside it sees nothing."""
+    """Where the water is, in the world. A photon that leaves it is gone; camera and laser must be inside."""
 
     section: ClassVar[str] = "domain"
     shape: Literal["unbounded", "slab", "box"] = Field(
@@ -618,7 +756,10 @@ class Transport(Section):
     max_collisions: Whole = Field(64, ge=1, le=2**31 - 1, description="events of one photon, surfaces included")
     max_path: float | None = Field(None, gt=0, description="longest geometric path [m]; the gate's end if not given")
     lateral_limit: float = Field(
-        math.inf, gt=0, allow_inf_nan=True, description="photons end where |x| or |y| reaches this [m]; inf is no limit"
+        math.inf,
+        gt=0,
+        allow_inf_nan=True,
+        description="photons end where |x| or |y| in the camera frame reaches this [m]; inf is no limit",
     )
     axis_threshold: float = Field(
         0.9998, gt=0, le=1, description="|u_z| from which the near-axis rule acts; 1 turns it off (exact)"
@@ -667,6 +808,7 @@ class Scene(BaseModel):
     medium: Medium
     laser: Laser = Laser()
     camera: Camera
+    scan: Scan = Scan()
     detector: Detector = Detector()
     gate: Gate
     targets: Annotated[tuple[Target, ...], BeforeValidator(_listed)] = ()
@@ -696,6 +838,31 @@ class Scene(BaseModel):
     def source(self) -> Path | None:
         """The file that the scene came from."""
         return self._source
+
+    @property
+    def scan_positions(self) -> int:
+        """Places that the beam visits: photon i leaves at place i modulo this."""
+        return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
+
+    @property
+    def beam(self) -> Laser:
+        """The laser with position and direction in the camera frame."""
+        laser, camera = self.laser, self.camera
+        if laser.frame == "camera" or not any((*camera.position, *camera.rotation_deg)):
+            return laser
+        from .pose import rotation_matrix, to_camera
+
+        place, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
+        moved = {"position": tuple(map(float, place)), "direction": tuple(map(float, axis)), "frame": "camera"}
+        return laser.model_copy(update=moved)
+
+    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
+        """∫c ds on the straight way between two points of the camera frame [m]."""
+        if self.medium.layers and any((*self.camera.position, *self.camera.rotation_deg)):
+            from .pose import to_world
+
+            begin, end = to_world(self.camera, [begin, end]).tolist()
+        return self.medium.optical_depth(begin, end)
 
     @property
     def path_limit(self) -> float:
@@ -779,7 +946,7 @@ def _build(
 
 
 def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables with relative paths of meshes, responses and phase functions made absolute."""
+    """The tables with relative paths of files made absolute."""
 
     def absolute(fields: Any, name: str, ending: str = "") -> Any:
         value = fields.get(name) if isinstance(fields, Mapping) else None
@@ -793,8 +960,12 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
     elif isinstance(targets, (list, tuple)):
         changed["targets"] = [absolute(target, "mesh") for target in targets]
-    if "medium" in tables:
-        changed["medium"] = absolute(tables["medium"], "phase_table", ".csv")
-    if "detector" in tables:
-        changed["detector"] = absolute(tables["detector"], "irf", ".csv")
+    for section, name, ending in (
+        ("medium", "phase_table", ".csv"),
+        ("detector", "irf", ".csv"),
+        ("camera", "calibration", ""),
+        ("laser", "profile_image", ""),
+    ):
+        if section in tables:
+            changed[section] = absolute(tables[section], name, ending)
     return changed

@@ -120,7 +120,7 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
             np.save(file, result.histogram)
         return path
     if ending == ".exr":
-        scale = result.unit / result.photons
+        scale = result.tally_value
         channels: dict[str, Any] = {"Z": result.depth(), "intensity": result.intensity}
         for name, part in zip(COMPONENTS, result.tallies, strict=True):
             channels[name] = part.sum(axis=-1, dtype=np.float64) * scale

@@ -58,7 +58,7 @@ class Exposure:
         assert self.scene is not None and self.depth is not None and self.counts is not None
         view = pixel_directions(self.scene.camera)
         distance = self.depth.astype(np.float64) / view[..., 2]
-        path = np.linalg.norm(distance[..., None] * view - np.asarray(self.scene.laser.position), axis=-1) + distance
+        path = np.linalg.norm(distance[..., None] * view - np.asarray(self.scene.beam.position), axis=-1) + distance
         time = path * (self.scene.medium.group_index / SPEED_OF_LIGHT) - self.gate_start
         if self.period is not None:
             time = np.mod(time, self.period)

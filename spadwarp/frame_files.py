@@ -173,7 +173,7 @@ def depth_from_time(time: NDArray[np.float64], *, scene: Scene) -> NDArray[np.fl
 
     view = pixel_directions(scene.camera)
     path = time * (SPEED_OF_LIGHT / scene.medium.group_index)
-    return range_from_path(path, view, scene.laser.position) * view[..., 2]
+    return range_from_path(path, view, scene.beam.position) * view[..., 2]
 
 
 def _depth_per_time(result: Result) -> NDArray[np.float64]:
@@ -213,7 +213,7 @@ def _begin(file: Any, result: Result, some: Detection, frames: int, methods: Seq
             "bin_width": some.bin_width,
             "period": np.inf if some.period is None else some.period,
             "group_index": scene.medium.group_index,
-            "laser_position": scene.laser.position,
+            "laser_position": scene.beam.position,
             "pixel_tangent": scene.camera.pixel_tangent,
             "irf_sigma": some.irf.sigma,
             "irf_tail": some.irf.tail,

@@ -77,7 +77,7 @@ def expected_counts(
 
     scene = result.scene
     tallies = result.tallies[:2, row, column].sum(axis=0)
-    light = tallies * (result.unit / result.photons * scene.laser.photons_per_pulse * scene.detector.pde)
+    light = tallies * (result.tally_value[row, column] * scene.laser.photons_per_pulse * scene.detector.pde)
     matrix = response_matrix(
         detection.irf,
         source_start=scene.gate.start,

@@ -11,8 +11,11 @@ import numpy as np
 from spadwarp.config import SPEED_OF_LIGHT, Scene
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.hardware import physical_memory, pick_device
+from spadwarp.imaging import pixel_views, view_box
 from spadwarp.phase_functions import phase_function
-from spadwarp.result import COMPONENTS, Truth
+from spadwarp.pose import rotation_matrix, to_world
+from spadwarp.profiles import load_profile
+from spadwarp.result import COMPONENTS, Truth, pixel_directions, scan_axes
 
 if TYPE_CHECKING:
     import warp as wp
@@ -38,7 +41,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     beam
     spans; times 16 for what scatters more than once.
     """
-    camera, laser, gate, medium = scene.camera, scene.laser, scene.gate, scene.medium
+    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
     speed = SPEED_OF_LIGHT / medium.group_index
     pixels = camera.width * camera.height
     half_field = 0.5 * camera.width * camera.pixel_tangent
@@ -81,16 +84,16 @@ def build_model(
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
     Raises:
-        ConfigError: The histogram has more bins than an index can count, the laser stands outside the domain, or the
-            phase function's table is not one.
-        FileError: That table cannot be read.
+        ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
+            the phase function's table is not one.
+        FileError: That table or the beam's profile cannot be read.
         DeviceError: The device has too little memory.
     """
     import warp as wp
 
     import spadwarp_kernels as sk
 
-    _check_domain(scene)
+    _check_domain(scene, camera)
     medium = sk.Medium()
     medium.extinction = scene.medium.extinction
     medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
@@ -99,20 +102,7 @@ def build_model(
     if scene.medium.has_phase_table:
         medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
 
-    laser = sk.Laser()
-    laser.position = wp.vec3(*scene.laser.position)
-    laser.axis = wp.vec3(*scene.laser.axis)
-    laser.profile = sk.LASER_PROFILES.index(scene.laser.profile)
-    if scene.laser.profile == "gaussian":
-        laser.spread = math.tan(scene.laser.half_angle) ** 2
-    else:
-        laser.spread = 2.0 * math.sin(0.5 * scene.laser.half_angle) ** 2
-    laser.radius = scene.laser.beam_radius
-
-    lens = sk.Camera()
-    lens.width, lens.height = scene.camera.width, scene.camera.height
-    lens.pixel_tangent = scene.camera.pixel_tangent
-    lens.aperture_radius, lens.aperture_area = scene.camera.aperture_radius, scene.camera.aperture_area
+    laser, lens = _laser(scene, device), _camera(scene)
 
     speed = SPEED_OF_LIGHT / scene.medium.group_index
     gate = sk.Gate()
@@ -121,9 +111,14 @@ def build_model(
     gate.bins = scene.gate.bins
 
     limits = sk.Limits()
-    lower, upper = scene.domain.bounds
-    limits.lower = wp.vec3(*(max(value, -_UNLIMITED) for value in lower))
-    limits.upper = wp.vec3(*(min(value, _UNLIMITED) for value in upper))
+    lower, upper = np.array(scene.domain.bounds)
+    if _is_turned(scene):
+        limits.rotation = wp.mat33(*rotation_matrix(scene.camera.rotation_deg).ravel())
+        limits.origin = wp.vec3(*scene.camera.position)
+    else:
+        lower, upper = lower - scene.camera.position, upper - scene.camera.position
+    limits.lower = wp.vec3(*np.maximum(lower, -_UNLIMITED))
+    limits.upper = wp.vec3(*np.minimum(upper, _UNLIMITED))
     limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
     limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
     # What arrives by a longer path than histories may have lies outside the gate for every estimator.
@@ -133,10 +128,10 @@ def build_model(
 
     # Measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long. Each event divides the weight of
     # light that was left alone by 1 - probability, so that thick water, where events are many, wants less.
-    there = [p + 0.5 * limits.max_path * u for p, u in zip(scene.laser.position, scene.laser.axis, strict=True)]
+    there = [p + 0.5 * limits.max_path * u for p, u in zip(scene.beam.position, scene.beam.axis, strict=True)]
     depth = scene.medium.extinction * limits.max_path
     if scene.medium.layers:
-        depth = 2.0 * scene.medium.optical_depth(scene.laser.position, there)
+        depth = 2.0 * scene.optical_depth(scene.beam.position, there)
     thickness = max(depth, 1e-6)
     guiding = sk.Guiding()
     guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))
@@ -160,11 +155,12 @@ def build_model(
             camera=lens if camera else None,
             **_appearance(mesh, device),
         )
-    model = sk.Model(
-        device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, tally_scale(scene, mesh)
-    )
+    scale = tally_scale(scene, mesh)
+    model = sk.Model(device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, scale)
     if scene.medium.layers:
         model = dataclasses.replace(model, layers=_layers(scene, device))
+    if scene.scan.mode != "none":
+        model = dataclasses.replace(model, scan=_scan(scene, device))
     if camera:
         _check_size(scene, model, copies)
     return model
@@ -193,14 +189,15 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
     """The medium and its layers as the kernels take them."""
     import spadwarp_kernels as sk
 
-    medium = scene.medium
-    scale = math.hypot(*medium.layer_axis)
+    medium, camera = scene.medium, scene.camera
+    axis = np.array(medium.layer_axis) / math.hypot(*medium.layer_axis)
+    shift = float(axis @ camera.position)
     return sk.make_layers(
-        [-_UNLIMITED, *(layer.start for layer in medium.layers)],
+        [-_UNLIMITED, *(layer.start - shift for layer in medium.layers)],
         [water.extinction for water in medium.waters],
         [PAPER_ALBEDO if water.albedo == "paper" else water.albedo for water in medium.waters],
         [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
-        axis=[component / scale for component in medium.layer_axis],
+        axis=(axis @ rotation_matrix(camera.rotation_deg)).tolist(),
         device=device,
     )
 
@@ -220,6 +217,10 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         pattern=mesh is not None and mesh.pattern is not None,
         specular=mesh is not None and mesh.specular is not None,
         layered=bool(scene.medium.layers),
+        lens=sk.PINHOLE if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED,
+        measured_beam=scene.laser.profile == "measured",
+        confocal=scene.scan.mode == "confocal",
+        turned=_is_turned(scene),
     )
     return spec._replace(**choices)
 
@@ -242,12 +243,15 @@ def trace_truth(scene: Scene, model: Model) -> Truth:
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
+    directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
+    if not scene.camera.is_plain:
+        directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
     wp.launch(
         sk.truth_kernel,
         dim=shape,
-        inputs=[model.camera, model.surfaces],
+        inputs=[model.camera, model.surfaces, directions],
         outputs=[depth, distance, normal, reflectance],
         device=model.device,
     )
@@ -258,11 +262,79 @@ def _source(scene: Scene) -> str | None:
     return None if scene.source is None else str(scene.source)
 
 
-def _check_domain(scene: Scene) -> None:
-    for axis, place, low, high in zip("xyz", scene.laser.position, *scene.domain.bounds, strict=True):
-        if not low <= place <= high:
-            problem = f"laser.position: {axis} = {place} is outside [{low}, {high}], the domain"
-            raise ConfigError(problem, source=_source(scene))
+def _laser(scene: Scene, device: wp.Device) -> Any:
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    beam = scene.beam
+    laser = sk.Laser()
+    laser.position = wp.vec3(*beam.position)
+    laser.axis = wp.vec3(*beam.axis)
+    if beam.profile == "measured":
+        image = load_profile(beam)
+        rows, columns = sk.profile_tables(image)
+        laser.rows = wp.array(rows, dtype=float, device=device)
+        laser.columns = wp.array(columns, dtype=float, device=device)
+        tangent = math.tan(beam.half_angle)
+        laser.extent = wp.vec2(tangent, tangent * image.shape[0] / image.shape[1])
+        return laser
+    laser.profile = sk.LASER_PROFILES.index(beam.profile)
+    if beam.profile == "gaussian":
+        laser.spread = math.tan(beam.half_angle) ** 2
+    else:
+        laser.spread = 2.0 * math.sin(0.5 * beam.half_angle) ** 2
+    laser.radius = beam.beam_radius
+    return laser
+
+
+def _camera(scene: Scene) -> Any:
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    camera = scene.camera
+    k1, k2, p1, p2, k3 = camera.distortion
+    lens = sk.Camera()
+    lens.width, lens.height = camera.width, camera.height
+    lens.pixel_tangent = camera.pixel_tangent
+    lens.aperture_radius, lens.aperture_area = camera.aperture_radius, camera.aperture_area
+    lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
+    lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
+    lens.view = wp.vec4(*view_box(camera))
+    lens.thin = 0.0 if camera.focus_distance is None else 1.0
+    lens.inverse_focus = camera.inverse_focus
+    return lens
+
+
+def _scan(scene: Scene, device: wp.Device) -> Any:
+    """A raster over the pixels: the beam goes through the middle of each."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
+    scan = sk.Scan()
+    scan.count = len(axes)
+    scan.axis = wp.array(axes.astype(np.float32), dtype=wp.vec3, device=device)
+    scan.view = wp.array(views.astype(np.float32), dtype=wp.vec4, device=device)
+    return scan
+
+
+def _is_turned(scene: Scene) -> bool:
+    """Whether the domain has faces that are not parallel to the camera's axes."""
+    return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
+
+
+def _check_domain(scene: Scene, camera: bool) -> None:
+    places = {"laser.position": to_world(scene.camera, scene.beam.position)}
+    if camera:
+        places["camera.position"] = np.array(scene.camera.position)
+    for name, point in places.items():
+        for axis, place, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
+            if not low <= place <= high:
+                problem = f"{name}: {axis} = {place} is outside [{low}, {high}], the domain"
+                raise ConfigError(problem, source=_source(scene))
 
 
 def _check_size(scene: Scene, model: Model, copies: float) -> None:

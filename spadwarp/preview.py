@@ -149,7 +149,7 @@ def _histogram_figure(result: Result) -> Figure:
 def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     """Components of one pixel over time of flight, and over the range along its line of sight."""
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
-    parts = result.tallies[:, row, column] * (result.unit / result.photons * per_pulse)
+    parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
     time = 1e9 * result.bin_edges
     top = parts.max()
     bottom = np.clip(0.5 * parts[parts > 0].min(), 1e-7 * top, 0.01 * top)
@@ -163,7 +163,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     axis.grid(which="major", color="0.92", linewidth=0.6)
     axis.set_axisbelow(True)
 
-    speed, laser = 1e-9 * result.water_speed, np.asarray(result.scene.laser.position)
+    speed, laser = 1e-9 * result.water_speed, np.asarray(result.scene.beam.position)
     direction = pixel_directions(result.scene.camera)[row, column]
 
     def to_range(at: ArrayLike) -> NDArray[np.float64]:

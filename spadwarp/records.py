@@ -15,6 +15,7 @@ from spadwarp.files import hdf5_file
 from spadwarp.hardware import pick_device
 from spadwarp.model import build_model, transport_spec
 from spadwarp.passes import CPU_PASS, CUDA_PASS, Lane, check_range
+from spadwarp.pose import rotation_matrix, to_world
 
 if TYPE_CHECKING:
     from spadwarp.config import Scene
@@ -74,7 +75,8 @@ def trace(
 ) -> PhotonRecords:
     """Walks photons without a camera and returns the terminal state of each.
 
-    Path is limited by `transport.max_path` alone; the gate plays no part. A photon takes 44 bytes.
+    Positions and directions are those of the world. Path is limited by `transport.max_path` alone; the gate plays no
+    part. A photon takes 44 bytes.
 
     Args and raises: as `simulate`.
     """
@@ -101,6 +103,10 @@ def trace(
         if progress is not None:
             progress("trace", stop, photons)
     ledger, _ = sk.read_ledger(lane.data)
+    if any((*scene.camera.position, *scene.camera.rotation_deg)):
+        for part in parts:
+            part["position"] = to_world(scene.camera, part["position"]).astype(np.float32)
+            part["direction"] = (part["direction"] @ rotation_matrix(scene.camera.rotation_deg).T).astype(np.float32)
     return PhotonRecords(
         id=np.arange(photons, dtype=np.uint64),
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},

@@ -90,7 +90,7 @@ def depth_of(
     height, width = values.shape[-3:-1]
     directions, laser = None, (0.0, 0.0, 0.0)
     if scene is not None:
-        directions, laser = pixel_directions(scene.camera), scene.laser.position
+        directions, laser = pixel_directions(scene.camera), scene.beam.position
     elif horizontal_fov_deg is not None:
         if not 0 < horizontal_fov_deg < 180:
             raise ValueError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")

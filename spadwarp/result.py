@@ -55,7 +55,7 @@ class Result:
 
     Attributes:
         scene: The scene that was simulated.
-        tallies: int64 `[3, H, W, T]` in the order of `COMPONENTS`; value = tally · unit / photons.
+        tallies: int64 `[3, H, W, T]` in the order of `COMPONENTS`; value = tally · unit / photons, see `tally_value`.
         unit: Fraction of one emitted photon per tally unit, a power of two.
         photons: Emitted photons, > 0.
         seed: 64-bit seed of the run.
@@ -141,13 +141,21 @@ class Result:
         """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
         return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detector.pde)
 
+    @cached_property
+    def tally_value(self) -> NDArray[np.float64]:
+        """Expected fraction of emitted photons per tally unit, float64 `[H, W]`: unit / photons.
+
+        In a scan, of the photons that were emitted while the beam was at the pixel's own position.
+        """
+        return self.unit / photons_per_position(self.scene, self.photon_ranges)
+
     @property
     def intensity(self) -> NDArray[np.float64]:
         """Expected fraction of emitted photons that arrive in each pixel within the gate: float64 `[H, W]`."""
-        return self.tallies.sum(axis=(0, 3), dtype=np.float64) * (self.unit / self.photons)
+        return self.tallies.sum(axis=(0, 3), dtype=np.float64) * self.tally_value
 
     def _fraction(self, tallies: NDArray[np.int64]) -> NDArray[np.float64]:
-        return tallies * np.float64(self.unit / self.photons)
+        return tallies * self.tally_value[..., None]
 
     # Errors
 
@@ -164,7 +172,7 @@ class Result:
         total = self.tallies.sum(axis=0).astype(np.float64)
         squares = self.squares[1] * 2.0**64 + self.squares[0]
         variance = np.maximum(squares - total**2 / count, 0.0) / (count - 1)
-        return np.sqrt(count * variance) * (self.unit / self.photons)
+        return np.sqrt(count * variance) * self.tally_value[..., None]
 
     @property
     def relative_error(self) -> float:
@@ -219,14 +227,14 @@ class Result:
         gate = self.scene.gate
         time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
         directions = pixel_directions(self.scene.camera)
-        distance = range_from_path(time * self.water_speed, directions, self.scene.laser.position)
+        distance = range_from_path(time * self.water_speed, directions, self.scene.beam.position)
         return distance * directions[..., 2] if quantity == "depth" else distance
 
     def true_path(self) -> NDArray[np.float64]:
         """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
         distance = self.truth.range.astype(np.float64)
         points = distance[..., None] * pixel_directions(self.scene.camera)
-        return np.linalg.norm(points - np.asarray(self.scene.laser.position), axis=-1) + distance
+        return np.linalg.norm(points - np.asarray(self.scene.beam.position), axis=-1) + distance
 
     # Accounts
 
@@ -294,12 +302,39 @@ class Result:
         return save_result(self, path)
 
 
+def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
+    at least."""
+    shape = (scene.camera.height, scene.camera.width)
+    if scene.scan_positions == 1:
+        return np.full(shape, float(sum(stop - start for start, stop in photon_ranges)))
+    pixels = shape[0] * shape[1]
+    position = np.arange(pixels)
+    count = np.zeros(pixels)
+    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
+        count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
+    return np.maximum(count, 1.0).reshape(shape)
+
+
 def pixel_directions(camera: Camera) -> NDArray[np.float64]:
     """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
-    x = (np.arange(camera.width) + 0.5 - 0.5 * camera.width) * camera.pixel_tangent
-    y = (np.arange(camera.height) + 0.5 - 0.5 * camera.height) * camera.pixel_tangent
-    rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
+    from spadwarp.imaging import image_tangents
+
+    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
+    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def scan_axes(scene: Scene) -> NDArray[np.float64]:
+    """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
+
+    From the laser to the point of the line of sight at `scan.distance`; parallel to it where that is infinite.
+    """
+    view = pixel_directions(scene.camera)
+    if math.isinf(scene.scan.distance):
+        return view
+    axes = scene.scan.distance * view - np.asarray(scene.beam.position)
+    return axes / np.linalg.norm(axes, axis=-1, keepdims=True)
 
 
 def range_from_path(path: ArrayLike, directions: ArrayLike, laser_position: ArrayLike) -> NDArray[np.float64]:

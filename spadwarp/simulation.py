@@ -123,7 +123,9 @@ def simulate(
     elif uncertainty or relative_error is not None:
         # With a stopping rule more of them, so that it can act early.
         least = 32 if relative_error is None else 1024
-        batch_size = _batch_size(photons, least if shard is None else max(least, shard[1]))
+        # Whole rounds of a scan, so that every position has as many photons in each.
+        positions = scene.scan_positions
+        batch_size = positions * _batch_size(photons // positions, least if shard is None else max(least, shard[1]))
     if batch_size:
         photons = -(-photons // batch_size) * batch_size
         if first_photon % batch_size:

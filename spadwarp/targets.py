@@ -1,4 +1,4 @@
-"""Targets: mesh files and built-in shapes, placed in the camera frame."""
+"""Targets: mesh files and built-in shapes, placed in the world and seen from the camera."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from spadwarp.appearance import Images, Pattern, read_coloured_mesh
 from spadwarp.errors import MeshError
+from spadwarp.pose import rotation_matrix, to_camera
 
 if TYPE_CHECKING:
     import trimesh
@@ -78,7 +79,7 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
         pattern = _pattern(mesh, images, target, field) if varied else None
         parts.append(
             TriangleMesh(
-                vertices=np.asarray(mesh.vertices, dtype=np.float32),
+                vertices=to_camera(scene.camera, mesh.vertices).astype(np.float32),
                 faces=faces.astype(np.int32),
                 reflectance=_number(target, len(faces)) if pattern is None else _means(pattern),
                 target=np.full(len(faces), index, dtype=np.int32),
@@ -154,7 +155,7 @@ def _join(patterns: Sequence[Pattern]) -> Pattern | None:
 
 
 def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
-    """One target as a mesh in the camera frame [m].
+    """One target as a mesh in the world [m].
 
     In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) turns it
     about its own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's
@@ -244,12 +245,8 @@ def _placement(
     scale: NDArray[np.float64], rotation_deg: Sequence[float], translation: Sequence[float]
 ) -> NDArray[np.float64]:
     """4 × 4 matrix that scales, rotates (intrinsic x, y, z) and translates column vectors."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
     matrix = np.eye(4)
-    matrix[:3, :3] = (about_x @ about_y @ about_z) * scale
+    matrix[:3, :3] = rotation_matrix(rotation_deg) * scale
     matrix[:3, 3] = translation
     return matrix
 

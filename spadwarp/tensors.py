@@ -51,7 +51,8 @@ class TorchResult:
 
     Attributes:
         scene, unit, photons: As in `Result`.
-        tallies: int64 `[3, H, W, T]`, value = tally · unit / photons.
+        tallies: int64 `[3, H, W, T]`, value = tally · `tally_value`.
+        tally_value: Fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`.
         truth: float32 maps on the device of the tallies.
     """
 
@@ -59,6 +60,7 @@ class TorchResult:
     tallies: torch.Tensor
     unit: float
     photons: int
+    tally_value: torch.Tensor
     truth: TorchTruth
 
     @cached_property
@@ -83,7 +85,7 @@ class TorchResult:
         return self.histogram.sum(dim=-1)
 
     def _fraction(self, tallies: torch.Tensor) -> torch.Tensor:
-        return tallies.double() * (self.unit / self.photons)
+        return tallies.double() * self.tally_value.unsqueeze(-1)
 
 
 @overload
@@ -122,6 +124,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         tallies=tallies.view(shape),
         unit=source.unit,
         photons=source.photons,
+        tally_value=_shared(source.tally_value).to(tallies.device),
         truth=TorchTruth(**maps),
     )
 

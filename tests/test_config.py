@@ -293,8 +293,8 @@ def test_every_problem_has_its_line_with_the_file(tmp_path):
         load_scene(path, ["laser.profile=gauss"])
     assert str(caught.value).splitlines() == [
         f"{path}: medium.anisotropy = 1.2 is outside (-1, 1)",
-        f"{path}: laser.profile = 'gauss' (an override) is not one of 'uniform_cone', 'gaussian', 'collimated'; "
-        "did you mean 'gaussian'?",
+        f"{path}: laser.profile = 'gauss' (an override) is not one of 'uniform_cone', 'gaussian', 'collimated', "
+        "'measured'; did you mean 'gaussian'?",
         f"{path}: camera.height is missing (rows)",
         f"{path}: gate.bin_width_ps is missing (width of a bin [ps])",
         f"{path}: gate.bins = 0 is outside [1, 1000000]",

@@ -234,7 +234,7 @@ def sea_floor(camera):
     wp.launch(
         sk.truth_kernel,
         dim=camera.shape,
-        inputs=[lens, sk.make_surfaces(mesh)],
+        inputs=[lens, sk.make_surfaces(mesh), wp.empty((0, 0), dtype=wp.vec3, device=camera.device)],
         outputs=[depth, distance, normal, reflectance],
         device=camera.device,
     )

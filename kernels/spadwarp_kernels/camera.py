@@ -82,8 +82,9 @@ def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def project_calibrated(camera: Camera, view: wp.vec4, x: wp.vec3, o: wp.vec3) -> int:
-    """Row-major index of the pixel that images x by way of the lens point o, or -1 outside the view or the image."""
+def project_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images x by way of the lens point o, or -1 outside the view or the image, and
+    for any pixel but the target where that is not negative."""
     if x[2] <= 0.0:
         return -1
     t = image_tangents(camera, x, o)
@@ -95,7 +96,8 @@ def project_calibrated(camera: Camera, view: wp.vec4, x: wp.vec3, o: wp.vec3) ->
     row = wp.floor(place[1])
     if column < 0.0 or row < 0.0 or column >= float(camera.width) or row >= float(camera.height):
         return -1
-    return int(row) * camera.width + int(column)
+    pixel = int(row) * camera.width + int(column)
+    return wp.where(target >= 0 and pixel != target, -1, pixel)
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """Ways of imaging, as the transport kernels take them: a plain pinhole, and what a calibrated camera does.
 
 In what follows `view` holds the tangents (left, top, right, bottom) of what the photon at hand may be seen in: the view
-of the camera or, in a scan, of one pixel. o is a point of the lens.
+of the camera, or in a scan that of one pixel, `target` (else -1). o is a point of the lens.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ class Lens(NamedTuple):
 
     Attributes:
         name: "pinhole" or "calibrated".
-        project: Warp function (camera, view, x, o) -> the pixel that images x by way of the lens point o, or -1.
+        project: Warp function (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
         clip: Warp function (camera, view, x, u, o, limit) -> the part [s0, s1] of the flight x + s u, 0 <= s <= limit,
             that holds all of it that the view shows by way of o; empty where s0 >= s1.
         may_be_hidden: Warp function (camera, near depth map, x) -> whether a point that is seen may have something
@@ -33,7 +33,7 @@ class Lens(NamedTuple):
 
 
 @wp.func
-def _project_pinhole(camera: Camera, view: wp.vec4, x: wp.vec3, o: wp.vec3) -> int:
+def _project_pinhole(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
     return project(camera, x)
 
 

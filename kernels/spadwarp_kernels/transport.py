@@ -186,7 +186,7 @@ class _Walk:
     collisions: int
     surface_count: int
     reason: int  # ledger entry of the history's end
-    target: int  # pixel that a scan scores it in, and what that sees
+    target: int  # pixel that a scan scores it in, else -1, and what it may be seen in
     view: wp.vec4
     # Its next event:
     block: wp.vec4ui
@@ -279,6 +279,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         s.photon = thread
         s.albedo = medium.albedo
         s.view = camera.view
+        s.target = -1
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp wait for a surface or a new photon
@@ -342,9 +343,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             )
                             s.along = flight.s
                             y = s.x + s.along * s.u
-                            pixel = project(camera, s.view, y, s.lens)
-                            if wp.static(confocal):
-                                pixel = wp.where(pixel == s.target, pixel, -1)
+                            pixel = project(camera, s.view, s.target, y, s.lens)
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
                                 t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
@@ -382,9 +381,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if s.u[2] < 0.0 and s.collisions > 0:
                             crossing = -s.x[2] / s.u[2]
                             on_lens = s.x + crossing * s.u
-                            pixel = project(camera, s.view, s.x, on_lens)
-                            if wp.static(confocal):
-                                pixel = wp.where(pixel == s.target, pixel, -1)
+                            pixel = project(camera, s.view, s.target, s.x, on_lens)
                             radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
                             inside = radius2 <= camera.aperture_radius * camera.aperture_radius
                             if pixel >= 0 and inside and crossing <= wp.min(s.distance, limit):
@@ -428,7 +425,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 pixel = int(0)
                                 if wp.static(pinhole):
                                     # Whatever the lens point; the others need it.
-                                    pixel = project(camera, s.view, s.x, s.x)
+                                    pixel = project(camera, s.view, s.target, s.x, s.x)
                                 if pixel >= 0:
                                     if wp.static(guided):
                                         id = first_id + wp.uint64(s.photon)
@@ -440,9 +437,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         s.lens = lens_point(camera, u01_high(s.block[3]), u01_low(s.block[3]))
                                         s.dither = u01_last(s.block[0])
                                     if wp.static(not pinhole):
-                                        pixel = project(camera, s.view, s.x, s.lens)
-                                        if wp.static(confocal):
-                                            pixel = wp.where(pixel == s.target, pixel, -1)
+                                        pixel = project(camera, s.view, s.target, s.x, s.lens)
                                     to_lens = s.lens - s.x
                                     r = wp.length(to_lens)
                                     to_lens = to_lens / r
@@ -568,7 +563,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
                             to_view_chance = float(0.0)
                             centre = wp.vec3(0.0, 0.0, 0.0)
-                            if project(camera, s.view, s.x, centre) < 0 and wp.dot(inward, inward) > 0.0:
+                            if project(camera, s.view, s.target, s.x, centre) < 0 and wp.dot(inward, inward) > 0.0:
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])

@@ -10,6 +10,7 @@ from .surface import Surfaces, intersect_mesh_aimed, reflectance_at
 def truth_kernel(
     camera: Camera,
     surfaces: Surfaces,
+    directions: wp.array2d(dtype=wp.vec3),
     # Out, [height, width]:
     depth: wp.array2d(dtype=float),
     range: wp.array2d(dtype=float),
@@ -17,9 +18,15 @@ def truth_kernel(
     reflectance: wp.array2d(dtype=float),
 ):
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
-    width)."""
+    width).
+
+    Rays go along `directions` (unit vectors through the pixel centres); where there are none, the camera is a pinhole
+    with square pixels about its axis.
+    """
     row, column = wp.tid()
     u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
+    if directions.shape[0] > 0:
+        u = directions[row, column]
     hit = intersect_mesh_aimed(surfaces.mesh, wp.vec3(0.0), u, 1.0e30)
     if hit.face >= 0:
         depth[row, column] = hit.distance * u[2]

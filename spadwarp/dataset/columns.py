@@ -94,7 +94,7 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "translation": target.translation,
         "rotation_deg": target.rotation_deg,
         "scale": target.scale,
-        "laser_position": scene.laser.position,
+        "laser_position": scene.beam.position,
         "distance": draw.distance,
         "attenuation_lengths": draw.attenuation_lengths,
         "absorption": medium.absorption,

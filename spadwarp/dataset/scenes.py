@@ -103,9 +103,9 @@ def water_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -
     """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
     axis = np.array([0.0, 0.0, 1.0])
     speed = SPEED_OF_LIGHT / scene.medium.group_index
-    ends = range_from_path(np.array([scene.gate.start, scene.gate.stop]) * speed, axis, scene.laser.position)
+    ends = range_from_path(np.array([scene.gate.start, scene.gate.stop]) * speed, axis, scene.beam.position)
     edges = np.linspace(ends[0], ends[1], PROFILE_BINS + 1)
-    below = np.interp(edges, range_from_path(paths, axis, scene.laser.position), cumulative)
+    below = np.interp(edges, range_from_path(paths, axis, scene.beam.position), cumulative)
     return (np.diff(below) / np.diff(edges)).astype(np.float32), edges.astype(np.float32)
 
 
@@ -194,7 +194,7 @@ def _draw_frames(
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
 
     coding: Any = FrameCoding()
-    coding.laser = wp.vec3(*scene.laser.position)
+    coding.laser = wp.vec3(*scene.beam.position)
     coding.nearest, coding.farthest = scene.gate.start * speed, scene.gate.stop * speed
     coding.width, coding.pixels = shape[1], truth.depth.size
     coding.seed = wp.uint64(plan.split_seeds[plan.split_of(draw.index)])

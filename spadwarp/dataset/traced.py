@@ -62,7 +62,7 @@ def _frames(plan: Plan, scene: Scene, result: Result, taken: Detection, *, devic
     view = pixel_directions(scene.camera)
     speed = SPEED_OF_LIGHT / scene.medium.group_index
     start, stop = taken.gate_start, taken.gate_start + taken.expected.shape[-1] * taken.bin_width
-    depth = range_from_path(np.clip(time, start, stop) * speed, view, scene.laser.position) * view[..., 2]
+    depth = range_from_path(np.clip(time, start, stop) * speed, view, scene.beam.position) * view[..., 2]
     code = np.rint((depth - plan.depth_offset) / plan.depth_step)
     codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
     counts = taken.counts.sum(axis=-1, dtype=np.int64)

@@ -20,7 +20,8 @@ from spadwarp_kernels import (
     u01,
     u01_fine,
 )
-from spadwarp_kernels.guided import HENYEY_GREENSTEIN_GUIDE, clip_flight, make_sample_flight
+from spadwarp_kernels.camera import clip_to_planes, field
+from spadwarp_kernels.guided import HENYEY_GREENSTEIN_GUIDE, clip_to_gate, make_sample_flight
 from statistics_of_samples import DEVICES, chi2_p
 
 COUNT = 10_000_000
@@ -108,7 +109,8 @@ def _clips(
     out: wp.array(dtype=wp.vec2),
 ):
     i = wp.tid()
-    out[i] = clip_flight(camera, gate, x[i], u[i], path, wp.vec3(0.001, -0.002, 0.0), 9.0)
+    seen = clip_to_planes(field(camera), x[i], u[i], 9.0)
+    out[i] = clip_to_gate(gate, x[i], u[i], path, wp.vec3(0.001, -0.002, 0.0), seen)
 
 
 def _mixture(law, s, x, u, s0, s1, c):
