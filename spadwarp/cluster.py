@@ -147,7 +147,8 @@ class ClusterTracer:
 
     def _size(self, member: Member, left: int) -> int:
         """Photons of the next block: some seconds, smaller towards the end so that all end together."""
-        fair = left // (2 * len(self._crew.members))
+        workers = len(self._crew.members)
+        fair = left // (2 * workers) if workers > 1 else left
         size = max(self._first, min(int(self._speed.get(member, 0.0) * _BLOCK_SECONDS), fair))
         return max(1, size // self._unit) * self._unit
 

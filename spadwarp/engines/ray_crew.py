@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.hardware import core_count, pick_device, processor_name
+from spadwarp.hardware import core_count, physical_memory, pick_device, processor_name
 
 from . import Ray, Worker
 
@@ -259,7 +259,9 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     address = engine.address or os.environ.get("RAY_ADDRESS")
     options: dict[str, Any] = {"address": address}
     if address is None:
-        room = max(256 * _MIB, 3 * value_bytes * (engine.workers or 1))
+        # Room for a value of each worker, and for what is being written; a third of the memory is Ray's own default.
+        room = max(256 * _MIB, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
+        room = min(room, (physical_memory() or 3 * room) // 3)
         options = {
             "address": "local",
             "num_cpus": max(core_count(), engine.workers or 1),
