@@ -37,15 +37,17 @@ def test_python_blocks_run(readme, roots, told, tmp_path):
     assert told in process.stdout
 
 
-def test_shell_commands_name_what_there_is():
-    """The options and the scenes that the README shows are those of the command line."""
+PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_shell_commands_name_what_there_is(page):
+    """The options and the scenes that a page shows are those of the command line."""
     from typer.testing import CliRunner
 
     from spadwarp.cli import app
 
-    text = "\n".join(
-        re.findall(r"^```(?:sh|bash)\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
-    )
+    text = "\n".join(re.findall(r"^```(?:sh|bash)\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE))
     for path in re.findall(r"configs/\S+\.toml", text):
         assert (ROOT / path).is_file(), path
     for command, arguments in re.findall(r"spadwarp ([a-z]+)([^\n#]*(?:\\\n[^\n#]*)*)", text):
