@@ -123,7 +123,7 @@ def _table(fields: Mapping[str, FieldInfo]) -> str:
 def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> str:
     lines = [f"## {name}", "", inspect.cleandoc(model.__doc__ or ""), ""]
     if repeated:
-        lines += ["Written as `[[targets]]`, once for each.", ""]
+        lines += [f"Written as `[[{name}]]`, once for each.", ""]
     lines.append(_table(model.model_fields))
     presets = [one for one in spadwarp.presets().values() if one.section == name]
     if presets:
@@ -135,6 +135,10 @@ def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> st
                 lines += ["", f"- {source}:"]
             values = ", ".join(f"{key} {_short(value)}" for key, value in one.values.items())
             lines.append(f"    - `{one.name}`: {values}")
+    for field, info in model.model_fields.items():
+        inner = _model(info)
+        if inner is not None and inner is not Distribution:
+            lines += ["", _section(f"{name}.{field}", inner, repeated=True)]
     return "\n".join(lines) + "\n"
 
 
@@ -164,6 +168,7 @@ def _one_kind(annotation: Any) -> str:
     if get_origin(annotation) is tuple:
         parts = get_args(annotation)
         what = "texts" if parts[0] is str else "numbers"
+        what = "tables" if inspect.isclass(parts[0]) and issubclass(parts[0], BaseModel) else what
         return f"list of {what}" if parts[-1] is Ellipsis else f"{len(parts)} {what}"
     if get_origin(annotation) is dict:
         return "table"
