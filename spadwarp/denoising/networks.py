@@ -3,7 +3,7 @@
 All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at its end; 1 where nothing was reported),
 1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
 profile, see `spadwarp.denoising.noise.log_density`). They return denoised depth over the gate, `[batch, 1, height,
-width]`; PyramidNet also, as a second channel, the logit of "this pixel sees a target".
+width]`; PyramidNet also the logits of "this pixel sees a target" and of "its depth is the target's".
 """
 
 from __future__ import annotations
@@ -82,22 +82,26 @@ def _blocks(channels: int, count: int) -> nn.Sequential:
 
 
 class PyramidNet(nn.Module):
-    """Weighted means of neighbours that report the target, with weights and a fallback from a pyramid of features.
+    """Weighted means of depths that come from the target, with weights from a pyramid of features.
 
-    A pixel's depth is a convex combination of the 5×5 depths about it and of one value from the network. Depths of
-    signal pixels are thereby used as they are, to the millimetre, and the network decides which of them to trust; where
-    it trusts none, its own value stands. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017). What it knows beyond
-    depth: which pixels reported, how probable backscatter is at the reported depth, and three order statistics of each
-    3×3 neighbourhood, which shut out the nearer, scattered photons.
+    A pixel's depth is a convex combination of the 5×5 depths about it, of the mean depths of 3×3 blocks of 4 and of 16
+    pixels about it, and of one value of the network's own. The weight of a depth is the product of what the place it
+    came from says (the probability that it is the target's) and of what the place it goes to says (whether the two
+    belong together). Depths of signal photons are thereby used as they are, to the millimetre; where there are none,
+    the network's own value stands. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017); means weighted by certainty:
+    Knutsson & Westin, CVPR 1993.
 
-    The pyramid works on 2×2 blocks (one quarter of the pixels), then on 4, 8 and 16 pixels.
+    What it knows beyond depth: which pixels reported, how probable backscatter is at the reported depth, and three
+    order statistics of each 3×3 neighbourhood, which shut out the nearer, scattered photons. The pyramid works on 2×2
+    blocks (a quarter of the pixels), then on 4, 8 and 16 pixels.
     """
 
     radius = 2
     ranks = (2, 4, 6)  # of nine sorted depths
+    blocks = (4, 16)  # sides of the coarse candidates
     stride = 16  # sizes are padded to multiples of it
 
-    def __init__(self, *, widths: tuple[int, int, int, int] = (32, 64, 96, 128)) -> None:
+    def __init__(self, *, widths: tuple[int, int, int, int] = (40, 64, 80, 96)) -> None:
         super().__init__()
         one, two, three, four = widths
         self.enter = nn.Conv2d(4 * (3 + len(self.ranks)), one, 3, padding=1)
@@ -107,13 +111,23 @@ class PyramidNet(nn.Module):
         self.up = nn.ModuleList(
             nn.Conv2d(deep, 4 * wide, 1) for wide, deep in ((one, two), (two, three), (three, four))
         )
-        self.before = nn.ModuleList(_blocks(wide, count) for wide, count in zip(widths, (1, 2, 2, 2), strict=True))
-        self.after = nn.ModuleList(_blocks(wide, count) for wide, count in zip(widths, (1, 2, 2), strict=False))
-        self.taps = (2 * self.radius + 1) ** 2
-        # For each of the 4 pixels of a block: weights of the neighbours and of the own value, the own value, the logit.
-        self.leave = nn.Conv2d(one, 4 * (self.taps + 3), 1)
+        self.before = nn.ModuleList(_blocks(wide, count) for wide, count in zip(widths, (1, 1, 1, 2), strict=True))
+        self.after = nn.ModuleList(_blocks(wide, count) for wide, count in zip(widths, (2, 1, 1), strict=False))
+        near = (2 * self.radius + 1) ** 2
+        self.candidates = near + 9 * len(self.blocks)
+        # For each of the 4 pixels of a block: weights of the candidates and of the own value, the own value, the
+        # logits of "this pixel sees a target" and of "this depth is the target's".
+        self.leave = nn.Conv2d(one, 4 * (self.candidates + 4), 1)
+        with torch.no_grad():  # begins near the identity
+            assert self.leave.bias is not None
+            bias = torch.zeros(self.candidates + 4)
+            bias[near // 2], bias[near : self.candidates], bias[self.candidates] = 3.0, -2.0, -2.0
+            bias[self.candidates + 2 :] = 2.0
+            self.leave.weight.mul_(0.3)
+            self.leave.bias.copy_(bias.repeat_interleave(4))
 
     def forward(self, frame: Tensor) -> Tensor:
+        """Three channels: depth, and the logits of "sees a target" and of "the reported depth is the target's"."""
         height, width = frame.shape[-2:]
         bottom, right = -height % self.stride, -width % self.stride
         if bottom or right:
@@ -129,13 +143,20 @@ class PyramidNet(nn.Module):
         for level in (2, 1, 0):
             x = self.after[level](skipped[level] + F.pixel_shuffle(self.up[level](x), 2))
         head = F.pixel_shuffle(self.leave(F.relu(x)), 2).float()
-        taps = self.taps
-        neighbours = _neighbourhood(depth.float(), self.radius)
-        unreported = 1.0 - _neighbourhood(reported.float(), self.radius)
-        weights = torch.cat([head[:, :taps] - 1e4 * unreported, head[:, taps : taps + 1]], dim=1).softmax(dim=1)
-        own = 0.5 + head[:, taps + 1 : taps + 2]
-        smoothed = (weights[:, :taps] * neighbours).sum(dim=1, keepdim=True) + weights[:, taps:] * own
-        return torch.cat([smoothed, head[:, taps + 2 :]], dim=1)[..., :height, :width]
+        weights, (own, seen, true) = head[:, : self.candidates + 1], head[:, self.candidates + 1 :].split(1, dim=1)
+
+        depth, reported = depth.float(), reported.float()
+        trust = F.logsigmoid(true) + 1e4 * (reported - 1.0)
+        values, trusts = [_neighbourhood(depth, self.radius)], [_neighbourhood(trust, self.radius)]
+        certainty = torch.sigmoid(true) * reported
+        for side in self.blocks:
+            share = F.avg_pool2d(certainty, side)
+            mean = F.avg_pool2d(certainty * depth, side) / (share + 1e-6)
+            for image, into in ((mean, values), (torch.log(share + 1e-6), trusts)):
+                into.append(F.interpolate(_neighbourhood(image, 1), scale_factor=side))
+        shares = torch.cat([weights[:, :-1] + torch.cat(trusts, dim=1), weights[:, -1:]], dim=1).softmax(dim=1)
+        found = (shares * torch.cat([*values, 0.5 + own], dim=1)).sum(dim=1, keepdim=True)
+        return torch.cat([found, seen, true], dim=1)[..., :height, :width]
 
 
 def _ranks(depth: Tensor, ranks: tuple[int, ...]) -> list[Tensor]:

@@ -202,21 +202,20 @@ def _counting(
     rate += signal[..., None] * torch.special.ndtr(phase).diff(dim=-1)
     counts = torch.poisson(rate, generator=generator)
 
-    offsets = torch.arange(-_TAPS, _TAPS + 1, device=device)
-    response = torch.exp(-0.5 * (offsets / width).square())
-    response /= response.sum(dim=1, keepdim=True)
-    gain = torch.log1p(photons[:, None, None] * response[:, :, None] / level[:, None, :])  # [B, taps, bins]
-    score = torch.zeros_like(counts)
-    for tap, offset in enumerate(offsets.tolist()):
-        score += torch.roll(counts * gain[:, tap, None, None, :], -offset, dims=-1)
+    # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), all k at once as a product of matrices.
+    apart = torch.arange(bins, device=device)
+    distance = (apart[:, None] - apart).abs()
+    response = torch.exp(-0.5 * (distance / width[:, :, None]).square()) * (distance <= _TAPS)
+    response = response / response[:, bins // 2].sum(dim=1)[:, None, None]
+    gain = torch.log1p(photons[:, None, None] * response / level[:, :, None])  # [B, j, k]
+    score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
     best = score.argmax(dim=-1, keepdim=True)
 
     # Centroid of the counts within 2σ about the best bin.
-    weight = sum_ = torch.zeros_like(clean)
-    for offset in range(-4, 5):
-        near = (best + offset).clamp(0, bins - 1)
-        n = counts.gather(-1, near)[..., 0] * (abs(offset) <= 2 * width[:, None]).float()
-        weight, sum_ = weight + n, sum_ + n * (near[..., 0] + 0.5)
-    found = counts.sum(dim=-1) > 0
-    depth = torch.where(weight > 0, sum_ / weight.clamp_min(1e-9), best[..., 0] + 0.5)
-    return depth / bins, found
+    offsets = torch.arange(-4, 5, device=device)
+    near = (best + offsets).clamp(0, bins - 1)
+    weight = counts.gather(-1, near) * (offsets.abs() <= 2 * width)[:, None, None]
+    total = weight.sum(dim=-1)
+    centroid = (weight * (near + 0.5)).sum(dim=-1) / total.clamp_min(1e-9)
+    depth = torch.where(total > 0, centroid, best[..., 0] + 0.5)
+    return depth / bins, counts.sum(dim=-1) > 0

@@ -63,7 +63,7 @@ class Noise(_Table):
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
     gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], even in the logarithm")
     behind: Share = Field(0.4, description="samples with backscatter from behind the target too: multiple scattering")
-    counting: Share = Field(0.25, description="samples whose depth was estimated from histograms of few photons")
+    counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
     photons: Positive = Field((0.7, 150.0), description="signal counts a pixel of these, even in the logarithm")
     sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, even in the logarithm")
     dead: Share = Field(0.1, description="highest part of the pixels that report nothing for no reason")
@@ -80,8 +80,8 @@ class Optimiser(_Table):
     warm_up: int = Field(500, ge=0, description="updates in which the learning rate rises")
     weight_decay: float = Field(1e-4, ge=0)
     averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
-    loss: Literal["mse", "rmse"] = Field(
-        "mse", description='mean over pixels of squares; "rmse": root of it for each crop, so that easy crops count too'
+    loss: Literal["psnr", "mse"] = Field(
+        "psnr", description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much'
     )
     precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
     report_every: int = Field(500, ge=1, description="updates between two lines of the log and two checkpoints")

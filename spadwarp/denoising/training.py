@@ -6,6 +6,7 @@ its last checkpoint when the command is repeated.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -32,6 +33,8 @@ LEVELS = (0.042, 0.183, 0.264, 0.337, 0.394, 0.480)
 """Shares of backscatter pixels at which the paper, and validation here, measures."""
 
 _CHECKPOINT = "checkpoint.pt"
+_FLOOR = 3e-6  # mean square over the gate below which a crop is good enough: 55 dB
+_TRUE = 0.015  # part of the gate within which a reported depth is the target's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +84,12 @@ def fit(
         raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {crew.size} GPUs")
     folder.mkdir(parents=True, exist_ok=True)
     training, validation = training.to(crew.device), validation.to(crew.device)
+    torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = crew.is_cuda
     torch.manual_seed(recipe.seed)
     network: Any = build_network(recipe.model).to(crew.device)
     network = network.to(memory_format=torch.channels_last)
     learner = nn.parallel.DistributedDataParallel(network, **crew.placed) if crew.size > 1 else network
-    average = torch.optim.swa_utils.AveragedModel(
-        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(settings.averaging), use_buffers=True
-    )
+    average = copy.deepcopy(network).requires_grad_(False)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=crew.is_cuda
     )
@@ -113,11 +115,11 @@ def fit(
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
-        average.update_parameters(network)
+        _follow(average, network, settings.averaging if step > settings.warm_up else 0.0)
         step += 1
         loss_sum += loss.detach()
         if step % settings.report_every == 0 or step == settings.steps:
-            psnr = validation_psnr(average.module, validation, recipe)
+            psnr = validation_psnr(average, validation, recipe)
             now = time.monotonic()
             line = {
                 "step": step,
@@ -135,7 +137,7 @@ def fit(
                 progress("steps", step, settings.steps)
 
     if not psnr:
-        psnr = validation_psnr(average.module, validation, recipe)
+        psnr = validation_psnr(average, validation, recipe)
     mean, seconds = sum(psnr.values()) / len(psnr), time.monotonic() - began
     weights = folder / f"{recipe.model}.safetensors"
     if crew.rank == 0:
@@ -147,24 +149,26 @@ def fit(
             "hours": f"{seconds / 3600:.3f}",
             "machine": f"{crew.size} x {torch.cuda.get_device_name()}" if crew.is_cuda else "CPU",
         }
-        save_weights(average.module, weights, about)
+        save_weights(average, weights, about)
     crew.close()
     return Trained(weights=weights, log=folder / "log.jsonl", psnr=mean, seconds=seconds)
 
 
 def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
-    """Error of depth where a target is seen, and of the network's word on where that is; a scalar.
+    """Error of depth where a target is seen, and of what else the network says; a scalar.
 
-    Where nothing is hit the depth to learn is 1, the end of the gate, at a tenth of the weight.
+    Where nothing is hit the depth to learn is 1, the end of the gate, at a fiftieth of the weight.
     """
-    depth, logit = output[:, :1], output[:, 1:2]
-    weight = 0.1 + 0.9 * batch.hit
-    square = (weight * (depth - batch.clean).square()).flatten(1).mean(dim=1)
-    error = square.mean() if kind == "mse" else torch.sqrt(square + 1e-7).mean()
-    if not logit.shape[1]:
-        return error
-    seen = F.binary_cross_entropy_with_logits(logit, batch.hit)
-    return error + 0.02 * seen
+    depth, logits = output[:, :1], output[:, 1:]
+    weight = 0.02 + 0.98 * batch.hit
+    square = (weight * (depth - batch.clean).square()).flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
+    error = square.mean() if kind == "mse" else 0.1 * torch.log(square + _FLOOR).mean()
+    if logits.shape[1]:
+        reported = batch.frame[:, :1]
+        true = batch.hit * ((reported - batch.clean).abs() < _TRUE)
+        error = error + 0.02 * F.binary_cross_entropy_with_logits(logits[:, :1], batch.hit)
+        error = error + 0.02 * F.binary_cross_entropy_with_logits(logits[:, 1:2], true)
+    return error
 
 
 @torch.no_grad()
@@ -206,6 +210,17 @@ def save_weights(network: nn.Module, path: str | Path, about: dict[str, str]) ->
 
 
 # Parts
+
+
+@torch.no_grad()
+def _follow(average: nn.Module, network: nn.Module, decay: float) -> None:
+    """Moves the running mean of the weights, and of what batch normalisation has counted."""
+    pairs = list(zip(average.state_dict().values(), network.state_dict().values(), strict=True))
+    floats = [(kept, new) for kept, new in pairs if kept.is_floating_point()]
+    torch._foreach_lerp_([kept for kept, _ in floats], [new for _, new in floats], 1.0 - decay)
+    for kept, new in pairs:
+        if not kept.is_floating_point():
+            kept.copy_(new)
 
 
 def _learning_rate(step: int, recipe: TrainingRecipe) -> float:
