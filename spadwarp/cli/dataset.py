@@ -45,6 +45,9 @@ def make(
         typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the recipe; may be repeated."),
     ] = None,
     device: Devices = None,
+    processes: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Processes of each GPU at most; fewer for few shards or cores.")
+    ] = 4,
     engine_name: EngineName = "local",
     ray_address: RayAddress = None,
     workers: Workers = None,
@@ -66,7 +69,9 @@ def make(
         recipe = recipe.with_overrides(overrides)
     engine = read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
-        found = spadwarp.make_dataset(recipe, out, device=device, engine=engine, shard=_part(shard), progress=report)
+        found = spadwarp.make_dataset(
+            recipe, out, device=device, processes=processes, engine=engine, shard=_part(shard), progress=report
+        )
     summary = {
         "folder": found.folder,
         "frames": found.frames,

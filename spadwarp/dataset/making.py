@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from spadwarp.engines import Ray, Worker, interruptible, run_jobs
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.files import atomic_path
-from spadwarp.hardware import core_count
+from spadwarp.hardware import core_count, pick_devices
 
 from .card import card
 from .columns import FORMAT_VERSION
@@ -57,6 +57,7 @@ def make_dataset(
     out: str | os.PathLike[str],
     *,
     device: str | None = None,
+    processes: int = 1,
     engine: Ray | None = None,
     shard: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
@@ -66,8 +67,9 @@ def make_dataset(
     Args:
         recipe: From `load_recipe`, or its path.
         out: The dataset's folder; new, or that of the same recipe.
-        device: "cpu", "cuda:0", "cuda:all", ...; by default the first GPU, else the CPU. A device that is named twice
-            ("cuda:0,cuda:0") has two processes at work.
+        device: "cpu", "cuda:0", "cuda:all", ...; by default the first GPU, else the CPU.
+        processes: Of each GPU at most; meshes, files and numbers in between are work for cores. With more than one, and
+            with several devices, Python starts anew: a script needs its `if __name__ == "__main__":`.
         engine: `spadwarp.engines.Ray` for its workers, which have to see the folder; None for this host.
         shard: (k, n): only every n-th shard, from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
         progress: Called with ("frames", done, all that will be made); any other first word is a remark for whoever
@@ -80,6 +82,8 @@ def make_dataset(
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
     part, parts = shard
+    if processes < 1:
+        raise ConfigError(f"processes = {processes} is outside [1, inf)")
     if not 1 <= part <= parts:
         raise ConfigError(f"shard = {part}/{parts}: {part} is outside [1, {parts}]")
     folder = Path(out).absolute()
@@ -97,6 +101,8 @@ def make_dataset(
         if progress is not None:
             progress(text, 0, 0)
 
+    if engine is None:
+        device = _shared_out(device, processes, len(todo))
     jobs = [_Job(plan.recipe, folder, one.index) for one in todo]
     with interruptible() as stopped:
         for _, frames in run_jobs(_make_shard, jobs, engine=engine, device=device, stopped=stopped, note=note):
@@ -179,6 +185,15 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
     _write_json(record, written)
     return shard.scenes * plan.frames_per_scene
+
+
+def _shared_out(device: str | None, processes: int, shards: int) -> str:
+    """The devices, each GPU as often as it shall have processes."""
+    names = [one.alias for one in pick_devices(device)]
+    if "cpu" in names or len(set(names)) < len(names):
+        return ",".join(names)
+    each = min(processes, core_count() // len(names), shards // (2 * len(names)))
+    return ",".join(names * max(each, 1))
 
 
 def _record_path(folder: Path, shard: Shard) -> Path:

@@ -213,7 +213,7 @@ class _Shard:
                 out[name] = bits[:, columns].astype(np.float32)[None]
             elif name == "intensity":
                 scale = self.columns["intensity_step"][row]
-                out[name] = (self.stored["intensity"][(row, *window)] * scale).astype(np.float32)[None]
+                out[name] = np.multiply(self.stored["intensity"][(row, *window)], scale, dtype=np.float32)[None]
             elif name == "prior":
                 out[name] = self._prior(scene, self._noisy(row, window))[None]
             elif name in ("counts", "expected"):
@@ -248,7 +248,7 @@ class _Shard:
         depth = codes.astype(np.float32)
         depth *= self.step
         depth += self.offset
-        depth[codes == 0] = np.nan
+        np.copyto(depth, np.nan, where=codes == 0)
         return depth
 
     def _prior(self, scene: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -275,7 +275,7 @@ def _mapped(path: Path, stored: Any) -> Any:
     offset = stored.id.get_offset()
     if offset is None:
         return stored
-    return np.memmap(path, dtype=stored.dtype, mode="r", offset=offset, shape=stored.shape)
+    return np.memmap(path, dtype=stored.dtype, mode="r", offset=offset, shape=stored.shape).view(np.ndarray)
 
 
 def _frames_in(path: Path, per_scene: int) -> int:
