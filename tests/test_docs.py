@@ -4,17 +4,20 @@ import ast
 import importlib.util
 import re
 import runpy
+import shlex
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import spadwarp
+from spadwarp.cli import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8") and page.name != "tutorial.md"]
 FIGURES = sorted((ROOT / "docs" / "figures").glob("*.py"))
 
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -79,11 +82,45 @@ def test_python_in_the_text_runs(page, checkout, tmp_path):
     runpy.run_path(str(program))
 
 
+# The same commands at a small size.
+SMALLER = {
+    r"--photons \S+": "--photons 5e3",
+    r"--pulses 20000": "--pulses 500",
+    r"(dataset make \S+small\.toml)": r"\1 --set scenes_per_target=1 --set scenes_per_shard=1 --set frames.per_scene=2",
+    r"(train \S+)": r"\1 --steps 2",
+    r"(evaluate \S+)": r"\1 --frames 1",
+}
+
+
+def test_tutorial_runs(checkout):
+    """From the first command to the last, block by block; pip aside."""
+    names = {}
+    for language, code in _FENCE.findall((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")):
+        if language == "toml":
+            Path(re.match(r"# (\S+)", code)[1]).write_text(code)
+        elif language == "python":
+            exec(compile(code, "tutorial.md", "exec"), names)
+        else:
+            for line in code.splitlines():
+                if not line.startswith("pip "):
+                    run(line)
+
+
+def run(line):
+    """A command, in this process."""
+    for pattern, smaller in SMALLER.items():
+        line = re.sub(pattern, smaller, line)
+    program, *arguments = shlex.split(line)
+    assert program == "spadwarp"
+    outcome = CliRunner().invoke(app, arguments)
+    assert outcome.exit_code == 0, f"{line}\n{outcome.output}"
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "docs" / "reference" / "scene.md"], ids=by_name)
 def test_scenes_in_the_text_are_valid(page, checkout):
     """A block of TOML is a scene, or sections that lie over one."""
     for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
-        if language == "toml":
+        if language == "toml" and page.name != "tutorial.md":
             tables = tomllib.loads(code)
             spadwarp.load_scene("configs/scenes/plane_5m.toml", {} if {"camera", "gate"} <= set(tables) else tables)
             if {"camera", "gate"} <= set(tables):
