@@ -32,6 +32,7 @@ PLAIN = {
     "sigma_scale": (1.0, 1.0),
     "own_gate": 1.0,
     "own_profile": 1.0,
+    "slanted_gate": 0.0,
     "counting": 0.0,
     "dead": 0.0,
     "unknown_water": 0.0,

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .frames import LOG_DENSITY_LIMIT, MARGIN
 from .recipe import Noise
 
-__all__ = ["BINS", "LOG_DENSITY_LIMIT", "Batch", "CleanScenes", "draw_batch", "log_density"]
+__all__ = ["BINS", "Batch", "CleanScenes", "draw_batch", "log_density"]
 
 BINS = 64  # of a backscatter profile over the gate
-LOG_DENSITY_LIMIT = 4.0
 _COUNT_BINS = 192  # of the histograms behind frames with few photons
 _TAPS = 5  # a response reaches this many bins to each side
 
@@ -106,7 +106,11 @@ def draw_batch(
     reported = clean + sigma * torch.randn(clean.shape, generator=generator, device=device)
     share = torch.where(coin(0.0 if always_replaced else 0.1), 0.0, between(noise.backscatter))[:, None, None]
     stray = uniform(size, crop, crop) < share
-    reported = torch.where(stray, _strays(profile, reach, uniform(size, crop, crop)), reported)
+    strays = _strays(profile, reach, uniform(size, crop, crop))
+    # A gate opens at one range, which is nearer in depth towards the corners of the view.
+    nearer = torch.where(coin(noise.slanted_gate), 0.15 * uniform(size), 0.0)[:, None, None]
+    strays = strays - nearer * (1.0 - strays)
+    reported = torch.where(stray, strays, reported)
     present = hit | (stray & coin(0.5)[:, None, None])
 
     counted = round(noise.counting * size)
@@ -117,7 +121,7 @@ def draw_batch(
             photons, photons / background, generator,
         )  # fmt: skip
     dead = torch.where(coin(0.7), 0.0, noise.dead * uniform(size))[:, None, None]
-    present &= (uniform(size, crop, crop) >= dead) & (reported > -0.1) & (reported < 1.1)
+    present &= (uniform(size, crop, crop) >= dead) & (reported > -MARGIN) & (reported < 1.0 + MARGIN)
 
     reported = torch.where(present, reported, 1.0)
     known = torch.where(coin(noise.unknown_water)[:, None], 1.0, profile)

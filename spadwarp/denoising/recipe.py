@@ -63,6 +63,7 @@ class Noise(_Table):
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
     gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], even in the logarithm")
     behind: Share = Field(0.4, description="samples with backscatter from behind the target too: multiple scattering")
+    slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
     counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
     photons: Positive = Field((0.7, 150.0), description="signal counts a pixel of these, even in the logarithm")
     sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, even in the logarithm")

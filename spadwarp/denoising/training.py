@@ -181,6 +181,7 @@ def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRec
         generator = torch.Generator(device).manual_seed(round(1e4 * level))
         noise = Noise(
             backscatter=(level, level), sigma_scale=(1.0, 1.0), own_gate=1.0, own_profile=1.0, counting=0.0, dead=0.0,
+            slanted_gate=0.0,
             behind=0.0, unknown_water=0.0,
         )  # fmt: skip
         batch = draw_batch(
