@@ -203,7 +203,7 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
 
     size = target.size or (1.0,)  # one number for all axes, two for x and y, or three
     stretch = np.array([*size, 1.0] if len(size) == 2 else np.broadcast_to(size, 3))
-    mesh.apply_transform(_placement(stretch * target.scale, target.rotation_deg, target.translation))
+    mesh.apply_transform(placement(stretch * target.scale, target.rotation_deg, target.translation))
     if len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh has no faces")
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
@@ -241,7 +241,7 @@ def _make_builtin(name: str, field: str) -> trimesh.Trimesh:
     return make_shape(name)
 
 
-def _placement(
+def placement(
     scale: NDArray[np.float64], rotation_deg: Sequence[float], translation: Sequence[float]
 ) -> NDArray[np.float64]:
     """4 × 4 matrix that scales, rotates (intrinsic x, y, z) and translates column vectors."""

@@ -57,7 +57,7 @@ def count_quantile(z: float, pulses: float, alpha: float) -> float:
     """The count of Binomial(pulses, 1 − exp(−alpha)) at the normal quantile z.
 
     Below a mean of 8 by inversion; above it by the Cornish–Fisher expansion to the skewness, whose error in the
-    distribution function is below 0.3 % there.
+    distribution function is below 0.2 % there.
     """
     p = 1.0 - wp.exp(-alpha)
     if alpha < 1.0e-3:

@@ -42,7 +42,7 @@ _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
     "group_index": ("1", "light travels at 299792458 m/s over this"),
     "gate_near": ("m", "range at which the gate opens"),
     "gate_far": ("m", "range at which the gate closes"),
-    "reflectance": ("1", "of the target"),
+    "reflectance": ("1", "of the target; NaN where each pixel has its own"),
     "pulses": ("1", "laser pulses of a frame"),
     "photons": ("1", "photons that were traced; 0: analytic"),
     "signal": ("1", "expected detections of the return per pulse, median over the target's pixels"),
@@ -80,7 +80,11 @@ def scene_columns(plan: Plan) -> dict[str, tuple[tuple[int, ...], Any, str, str]
 def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
     """A scene's values of `scene_columns`."""
     scene, draw = one.scene, one.draw
-    target, medium = scene.targets[0], scene.medium
+    medium, none = scene.medium, (np.nan,) * 3
+    target = scene.targets[0] if scene.targets else None
+    config = scene.to_toml()
+    if (mesh := plan.targets[draw.target].mesh) is not None:
+        config = config.replace(str(mesh), mesh.name)  # where it lies on this machine is nobody's business
     per_second = 0.5 * SPEED_OF_LIGHT / medium.group_index
     return {
         "depth": one.truth.depth,
@@ -91,9 +95,9 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "profile_edges": one.profile[1],
         "target": draw.target,
         "target_name": plan.targets[draw.target].name,
-        "translation": target.translation,
-        "rotation_deg": target.rotation_deg,
-        "scale": target.scale,
+        "translation": none if target is None else target.translation,
+        "rotation_deg": none if target is None else target.rotation_deg,
+        "scale": none if target is None else target.scale,
         "laser_position": scene.beam.position,
         "distance": draw.distance,
         "attenuation_lengths": draw.attenuation_lengths,
@@ -104,7 +108,7 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "group_index": medium.group_index,
         "gate_near": per_second * scene.gate.start,
         "gate_far": per_second * scene.gate.stop,
-        "reflectance": target.reflectance,
+        "reflectance": np.nan if target is None else target.reflectance,
         "pulses": scene.analytic.pulses,
         "photons": draw.photons or 0,
         "signal": one.signal,
@@ -114,5 +118,5 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
         "pde": scene.detector.pde,
         "dark_count_rate": scene.detector.dark_count_rate,
-        "config": scene.to_toml().encode(),
+        "config": config.encode(),
     }

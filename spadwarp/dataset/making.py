@@ -131,19 +131,14 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
     recipe = place / "recipe.toml"
     if not recipe.is_file():
         raise FileError(f"{place}: no dataset there (no recipe.toml)")
-    plan = Plan(load_recipe(recipe))
-    wrong = [
-        f"{one.frames_file}: missing" if text == "missing" else text
-        for one, text in zip(plan.shards, _check(plan, place, plan.shards).values(), strict=True)
-        if text
-    ]
     if (place / "manifest.json").is_file():
         files = read_manifest(place)["files"]
-        known = {name for one in plan.shards for name in plan.files_of(one)}
-        wrong += [text for name in sorted(set(files) - known) if (text := _compare(place, name, files[name]))]
-    else:
-        wrong.append("manifest.json: missing")
-    return wrong
+        with ThreadPoolExecutor(core_count()) as pool:
+            return [text for text in pool.map(lambda name: _compare(place, name, files[name]), files) if text]
+    plan = Plan(load_recipe(recipe))
+    states = zip(plan.shards, _check(plan, place, plan.shards).values(), strict=True)
+    wrong = [f"{one.frames_file}: missing" if text == "missing" else text for one, text in states if text]
+    return [*wrong, "manifest.json: missing"]
 
 
 def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:

@@ -11,29 +11,18 @@ import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from spadwarp.config import SPEED_OF_LIGHT, Scene
-from spadwarp.errors import ConfigError, MeshError
 
+from .origins import find_targets
 from .recipe import SPLITS, Distribution, Recipe
 
-__all__ = ["Plan", "SceneDraw", "Shard", "TargetChoice"]
+__all__ = ["Plan", "SceneDraw", "Shard"]
 
-_MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb")
 _SHORTEST_RANGE = 0.05  # [m], where a gate opens at the nearest
-
-
-@dataclass(frozen=True)
-class TargetChoice:
-    """A target of the dataset: its name, where it comes from, and the split that it belongs to."""
-
-    name: str
-    split: str
-    mesh: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -101,13 +90,13 @@ class Plan:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
-        self.targets = _targets(recipe)
+        self.targets = find_targets(recipe)
         self.split_seeds = {split: int(_seeds([recipe.seed, _word(split)], 1)[0]) for split in SPLITS}
         self.frames_per_scene = recipe.frames.per_scene
         self.scene_count = len(self.targets) * recipe.scenes_per_target
         self.sample_count = self.scene_count * self.frames_per_scene
         self.shards = tuple(self._shards())
-        template = recipe.template()
+        self._template = template = recipe.template()
         self.shape = (template.camera.height, template.camera.width)
         self._tables = template.to_dict()
         self.depth_offset, self.depth_step = self._depth_code(template)
@@ -131,7 +120,11 @@ class Plan:
             return distribution.draw(self.generator(split, what, index))
 
         pose = recipe.pose
-        distance = draw("pose.distance", pose.distance)
+        if target.export is None:
+            distance = draw("pose.distance", pose.distance)
+        else:
+            depth = target.truth(self._template.camera, recipe.targets.export_preset).depth
+            distance = float(np.nanmedian(depth))
         changes = {name: draw(f"vary.{name}", one) for name, one in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         if recipe.water.attenuation_lengths is not None:
@@ -148,9 +141,13 @@ class Plan:
             "reflectance": draw("pose.reflectance", pose.reflectance),
             "scale": draw("pose.size", pose.size),
         }
-        targets = [{**_origin(target, recipe.targets.mesh_size, placed), **placed}]
+        targets = []
+        if target.export is None:
+            fill = None if pose.fill is None else draw("pose.fill", pose.fill)
+            size = recipe.targets.mesh_size
+            targets = [target.placed(placed, longest=size, fill=fill, camera=scene.camera)]
         wall = recipe.backdrop
-        if self.generator(split, "backdrop.probability", index).random() < wall.probability:
+        if targets and self.generator(split, "backdrop.probability", index).random() < wall.probability:
             behind = draw("backdrop.behind", wall.behind)
             wide = 4.0 * (distance + behind) * scene.camera.pixel_tangent * max(scene.camera.width, scene.camera.height)
             tilt = [draw("backdrop.tilt.x", wall.tilt_deg), draw("backdrop.tilt.y", wall.tilt_deg), 0.0]
@@ -222,64 +219,17 @@ class Plan:
         """Offset and step [m] with which 65 535 codes span every gate that can be drawn, the step a round number."""
         recipe = self.recipe
         tangent = 0.5 * template.camera.pixel_tangent * math.hypot(template.camera.width, template.camera.height)
-        near = max(recipe.pose.distance.limits[0] - recipe.gate.before.limits[1], _SHORTEST_RANGE)
-        far = recipe.pose.distance.limits[1] + recipe.gate.behind.limits[1]
+        ranges = [] if all(one.export for one in self.targets) else list(recipe.pose.distance.limits)
+        for one in self.targets:
+            if one.export is not None:
+                ranges.append(float(np.nanmedian(one.truth(template.camera, recipe.targets.export_preset).depth)))
+        near = max(min(ranges) - recipe.gate.before.limits[1], _SHORTEST_RANGE)
+        far = max(ranges) + recipe.gate.behind.limits[1]
         near /= math.hypot(1.0, tangent)
         span = (far - near) / 65534.0
         decade = 10.0 ** math.floor(math.log10(span))
         step = next(decade * one for one in (1.0, 2.0, 5.0, 10.0) if decade * one >= span)
         return math.floor(near / step - 1.0) * step, step
-
-
-def _targets(recipe: Recipe) -> tuple[TargetChoice, ...]:
-    from spadwarp.targets import BUILTINS, builtin_names
-
-    source = None if recipe.source is None else str(recipe.source)
-    known, chosen = builtin_names(), recipe.targets
-    geometric = set(BUILTINS) - {"staircase"}
-    names = [name for name in known if name not in geometric] if chosen.builtin == "all" else list(chosen.builtin)
-    problems = [
-        f"targets.builtin: {name!r} is not one of {', '.join(map(repr, known))}" for name in names if name not in known
-    ]
-    origins: dict[str, Path | None] = dict.fromkeys(names)
-    for entry in chosen.meshes:
-        place = Path(entry).expanduser()
-        if recipe.source is not None:
-            place = recipe.source.absolute().parent / place
-        found = (
-            sorted(one for one in place.iterdir() if one.suffix.lower() in _MESH_ENDINGS) if place.is_dir() else [place]
-        )
-        if not found or not all(one.is_file() for one in found):
-            raise MeshError(f"targets.meshes: {place}: no mesh file there")
-        for one in found:
-            if one.stem in origins:
-                problems.append(f"targets.meshes: {one}: a target {one.stem!r} is there already")
-            origins[one.stem] = one
-    splits = dict.fromkeys(origins, "train")
-    for split in ("validation", "test"):
-        for name in getattr(chosen, split):
-            if name not in splits:
-                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
-            elif splits[name] != "train":
-                problems.append(f"targets.{split}: {name!r} is in {splits[name]} already")
-            else:
-                splits[name] = split
-    if not origins:
-        problems.append("targets names none")
-    if problems:
-        raise ConfigError(problems, source=source)
-    return tuple(TargetChoice(name, splits[name], mesh) for name, mesh in origins.items())
-
-
-def _origin(target: TargetChoice, longest: float | None, placed: dict[str, Any]) -> dict[str, Any]:
-    """The field that names the mesh; a mesh file's scale becomes part of `placed`."""
-    if target.mesh is None:
-        return {"builtin": target.name}
-    if longest is not None:
-        import trimesh
-
-        placed["scale"] *= longest / float(max(trimesh.load_mesh(target.mesh, process=False).extents))
-    return {"mesh": str(target.mesh)}
 
 
 def _word(text: str) -> int:

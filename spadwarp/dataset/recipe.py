@@ -128,11 +128,15 @@ def _constant(value: float) -> Distribution:
 class Targets(_Table):
     """What is looked at, and which targets are kept for validation and test; all others are for training."""
 
-    builtin: Names | Literal["all"] = Field("all", description='names from `spadwarp targets`, or "all" objects')
+    builtin: Names | Literal["all"] = Field(
+        "all", description='names from `spadwarp targets`; "all" objects, or none if meshes or exports are given'
+    )
     meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
         3.6, gt=0, description="longest side that meshes are scaled to [m]; none if not given"
     )
+    exports: Names = Field((), description="*_RGBD.EXR of a game engine, or folders of them, rendered with the camera")
+    export_preset: Literal["unreal", "blender"] = Field("unreal", description="program that wrote the exports")
     validation: Names = Field((), description="targets of the validation split")
     test: Names = Field((), description="targets of the test split")
 
@@ -146,6 +150,7 @@ class Pose(_Table):
     pitch_deg: Angle = Field(_constant(0.0), description="turn about the horizontal across the view [°]")
     roll_deg: Angle = Field(_constant(0.0), description="turn about the optical axis [°]")
     size: Positive = Field(_constant(1.0), description="scale of the target")
+    fill: Positive | None = Field(None, description="part of the view that it fills when not turned, in place of size")
     reflectance: Share = Field(_constant(0.5), description="Lambertian reflectance of the target")
 
 
@@ -256,7 +261,7 @@ class Recipe(_Table):
         """
         name = None if source is None else str(source)
         try:
-            recipe = cls.model_validate(dict(tables))
+            recipe = cls.model_validate(_with_paths(tables, source))
         except ValidationError as error:
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
@@ -312,6 +317,18 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
     return Recipe.from_dict(tables, source=path)
+
+
+def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
+    """The tables with the paths of targets made absolute."""
+    targets = tables.get("targets")
+    if source is None or not isinstance(targets, Mapping):
+        return dict(tables)
+    folder, changed = Path(source).absolute().parent, dict(targets)
+    for name in ("meshes", "exports"):
+        if isinstance(given := targets.get(name), (list, tuple)):
+            changed[name] = [str(folder / Path(one).expanduser()) if isinstance(one, str) else one for one in given]
+    return {**tables, "targets": changed}
 
 
 def _plain(value: Any) -> Any:

@@ -116,16 +116,19 @@ def exposed(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64], *, m
     """
     assert draw.signal_photons is not None
     if not detections.size:
-        target = draw.scene.targets[0]
-        what = f"target {target.builtin or target.mesh} at {draw.distance:.4g} m"
-        raise ConfigError(f"scene {draw.index}: no return within the gate; {what}")
+        where = f"its target lies at {draw.distance:.4g} m"
+        raise ConfigError(f"scene {draw.index}: no return within the gate; {where}")
     pulses = min(max(1, round(draw.signal_photons / float(np.median(detections)))), most)
     return scene.with_overrides({"analytic.pulses": pulses})
 
 
 def _render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
     scene = draw.scene
-    truth = truth_maps(scene, device=device)
+    origin = plan.targets[draw.target]
+    if origin.export is None:
+        truth = truth_maps(scene, device=device)
+    else:
+        truth = origin.truth(scene.camera, plan.recipe.targets.export_preset)
     view = pixel_directions(scene.camera)
     by_rates = math.isnan(draw.fractions[0])
 
