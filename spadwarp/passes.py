@@ -166,7 +166,7 @@ class Tracer:
         threads = core_count() if threads is None else threads
         check_range("threads", threads, 1, 4096)
         self._pass_size = size
-        copies = 2 + 2 / len(COMPONENTS) if plan.batch_size else 1
+        copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
         began = time.perf_counter()
         models = []
         for device in devices:
@@ -244,91 +244,42 @@ class Tracer:
         waiting = Queue(ranges)
         done: list[Range] = []
         while waiting.left and not stopped.is_set():
-            self._leg(waiting, done, stopped, report, due)
-            if due() and not stopped.is_set():
+            _Leg(self.lanes, waiting, done, stopped, self._pass_size, self.plan.batch_size).run(report, due)
+            if waiting.left and due() and not stopped.is_set():
                 keep(joined(done))
         return joined(done)
 
-    def _leg(
+
+class _Leg:
+    """Passes until there are none left or it is time to rest; then every lane is at rest, and `done` has the ids."""
+
+    def __init__(
         self,
+        lanes: Sequence[Lane],
         waiting: Queue,
         done: list[Range],
         stopped: threading.Event,
-        report: Callable[[int], None],
-        due: Callable[[], bool],
+        pass_size: int,
+        batch_size: int,
     ) -> None:
-        """Passes until there are none left, or it is time to rest; then every lane is at rest."""
-        lock = threading.Condition()
-        resting, failed = threading.Event(), threading.Event()
-        events: queue.SimpleQueue[BaseException | int | None] = queue.SimpleQueue()
-        workers = [lane for lane in self.lanes for _ in range(lane.threads)]
-        smallest = max(1, self._pass_size // 16)
+        self._lanes, self._waiting, self._done, self._stopped = lanes, waiting, done, stopped
+        self._pass_size, self._batch_size = pass_size, batch_size
+        self._workers = [lane for lane in lanes for _ in range(lane.threads)]
+        self._lock = threading.Condition()  # of the ids, and of the lanes' batches
+        self._resting, self._failed = threading.Event(), threading.Event()
+        # From the workers: photons done, and at the end None or what went wrong.
+        self._events: queue.SimpleQueue[BaseException | int | None] = queue.SimpleQueue()
 
-        def next_pass(lane: Lane) -> Range | None:
-            if not self.plan.batch_size:
-                if resting.is_set() or stopped.is_set() or failed.is_set():
-                    return None
-                # Smaller towards the end, so that all end at about the same time.
-                fair = waiting.left // (2 * len(workers)) if len(workers) > 1 else self._pass_size
-                return waiting.take(min(self._pass_size, max(smallest, fair)))
-            while not (stopped.is_set() or failed.is_set()):
-                if lane.batch is None:
-                    batch = None if resting.is_set() else waiting.take(self.plan.batch_size)
-                    if batch is None:
-                        return None
-                    lane.begin_batch(batch)
-                assert lane.batch is not None
-                first = lane.next_id
-                if first < lane.batch[1]:
-                    lane.next_id = min(first + self._pass_size, lane.batch[1])
-                    return first, lane.next_id
-                lock.wait()  # for the lane's other threads, to whom the rest of its batch belongs
-            return None
-
-        def finish(lane: Lane, span: Range) -> None:
-            if not self.plan.batch_size:
-                with lock:
-                    done.append(span)
-                return
-            assert lane.batch is not None
-            with lock:
-                lane.finished += span[1] - span[0]
-                whole = lane.finished == lane.batch[1] - lane.batch[0]
-            if whole:
-                lane.close_batch()
-            with lock:
-                if whole:
-                    done.append(lane.batch)
-                    lane.batch = None
-                lock.notify_all()
-
-        def work(lane: Lane) -> None:
-            try:
-                while True:
-                    with lock:
-                        span = next_pass(lane)
-                    if span is None:
-                        break
-                    lane.launch(*span)
-                    finish(lane, span)
-                    events.put(span[1] - span[0])
-                events.put(None)
-            except BaseException as error:
-                failed.set()
-                events.put(error)
-            finally:
-                with lock:
-                    lock.notify_all()
-
-        walked = count(done)
-        for lane in workers:
-            threading.Thread(target=work, args=(lane,), daemon=True).start()
-        left, failure = len(workers), None
+    def run(self, report: Callable[[int], None], due: Callable[[], bool]) -> None:
+        walked, left = count(self._done), len(self._workers)
+        failure: BaseException | None = None
+        for lane in self._workers:
+            threading.Thread(target=self._work, args=(lane,), daemon=True).start()
         try:
             while left:
                 # Woken now and then: a signal that arrives while a lock is awaited is heard only afterwards.
                 try:
-                    event = events.get(timeout=0.1)
+                    event = self._events.get(timeout=0.1)
                 except queue.Empty:
                     event = 0
                 if isinstance(event, int):
@@ -338,14 +289,75 @@ class Tracer:
                     left -= 1
                     failure = failure or event
                 if due():
-                    resting.set()
+                    self._resting.set()
         except BaseException:
-            failed.set()
+            self._failed.set()
             raise
-        for lane in self.lanes:
-            lane.drop_batch()
         if failure is not None:
             raise failure
+        for lane in self._lanes:
+            lane.drop_batch()
+
+    def _work(self, lane: Lane) -> None:
+        """A thread: one pass after the other."""
+        try:
+            while True:
+                with self._lock:
+                    span = self._next_pass(lane) if self._batch_size == 0 else self._next_of_batch(lane)
+                if span is None:
+                    break
+                lane.launch(*span)
+                if self._batch_size:
+                    self._finish(lane, span)
+                else:
+                    with self._lock:
+                        self._done.append(span)
+                self._events.put(span[1] - span[0])
+            self._events.put(None)
+        except BaseException as error:
+            self._failed.set()
+            self._events.put(error)
+        finally:
+            with self._lock:
+                self._lock.notify_all()
+
+    def _next_pass(self, lane: Lane) -> Range | None:
+        if self._resting.is_set() or self._stopped.is_set() or self._failed.is_set():
+            return None
+        workers = len(self._workers)
+        # Smaller towards the end, so that all end at about the same time.
+        fair = self._waiting.left // (2 * workers) if workers > 1 else self._pass_size
+        return self._waiting.take(min(self._pass_size, max(fair, self._pass_size // 16, 1)))
+
+    def _next_of_batch(self, lane: Lane) -> Range | None:
+        """A pass of the lane's batch, which is finished before the lane rests."""
+        while not (self._stopped.is_set() or self._failed.is_set()):
+            if lane.batch is None:
+                batch = None if self._resting.is_set() else self._waiting.take(self._batch_size)
+                if batch is None:
+                    return None
+                lane.begin_batch(batch)
+            assert lane.batch is not None
+            first = lane.next_id
+            if first < lane.batch[1]:
+                lane.next_id = min(first + self._pass_size, lane.batch[1])
+                return first, lane.next_id
+            self._lock.wait()  # for the lane's other threads, who walk the rest of its batch
+        return None
+
+    def _finish(self, lane: Lane, span: Range) -> None:
+        """The last pass of a batch closes it."""
+        assert lane.batch is not None
+        with self._lock:
+            lane.finished += span[1] - span[0]
+            whole = lane.finished == lane.batch[1] - lane.batch[0]
+        if whole:
+            lane.close_batch()
+        with self._lock:
+            if whole:
+                self._done.append(lane.batch)
+                lane.batch = None
+            self._lock.notify_all()
 
 
 @contextmanager

@@ -132,6 +132,14 @@ def test_a_run_can_be_gone_on_with_over_ray(cluster, whole):  # noqa: F811
     assert gaps.photons < PHOTONS / 2  # untouched
 
 
+def test_the_stopping_rule_is_the_same_over_ray(cluster):
+    options = {"photons": 2**20, "seed": 1, "relative_error": 0.1}
+    same(
+        spadwarp.simulate(scene(), **options, engine=Ray(workers=1)),
+        spadwarp.simulate(scene(), **options, device="cpu"),
+    )
+
+
 def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):  # noqa: F811
     def interrupt(stage, done, total):
         if stage == "trace" and done >= 50_000 and not fired:

@@ -135,7 +135,8 @@ def _told(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str,
         "Counted": {name: count(number) for name, number in counters.items() if name not in outside},
         "Made": {
             "from": summary["scene"] or "Python",
-            "on": f"{made['device']} ({made['device_name']}), {made['date']}",
+            "on": f"{made['device']} ({made['device_name']}), {made['date']}"
+            + (f", the first of {len(made['parts'])} parts" if "parts" in made else ""),
             "with": ", ".join(f"{name} {made[name]}" for name in ("spadwarp", "warp", "numpy", "python")),
             "in": ", ".join(f"{name} {seconds:.3g} s" for name, seconds in timing.items()),
         },

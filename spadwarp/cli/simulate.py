@@ -162,10 +162,13 @@ def simulate(
     for message in spadwarp.check(scene):
         if message.level == "warning":
             complain(str(message))
+    kept = out / _CHECKPOINT
+    if kept.exists() and earlier is None and not overwrite:
+        problem = f"{out} has a run that was not finished; --resume {out} goes on with it, --overwrite begins anew"
+        raise typer.BadParameter(problem, param_hint="--out")
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     needed = bytes_needed(scene, records=records, batches=batches, checkpoint=checkpoint > 0)
     prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
-    kept = out / _CHECKPOINT
     if earlier is None:
         _forget(kept)
     if json_path is not None:
