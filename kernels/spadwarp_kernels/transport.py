@@ -347,12 +347,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
                                 t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
+                                there = water_at(medium, layers, y)
                                 if wp.static(local_albedo):
-                                    s.albedo = water_at(medium, layers, y).albedo
+                                    s.albedo = there.albedo
                                 weight_there = (
                                     s.weight
                                     * s.albedo
-                                    * water_at(medium, layers, y).extinction
+                                    * there.extinction
                                     * wp.exp(-water_extinction(medium, layers, s.x, s.u, s.along) * s.along)
                                 )
                                 s.pending_value = (
@@ -360,7 +361,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         camera,
                                         water_extinction(medium, layers, y, to_lens, flight.r),
                                         weight_there,
-                                        phase_pdf(t, water_at(medium, layers, y)),
+                                        phase_pdf(t, there),
                                         to_lens,
                                         flight.r,
                                     )
@@ -567,7 +568,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])
-                            t = phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x))
+                            here = water_at(medium, layers, s.x)
+                            t = phase_sample(u01_fine(s.block[1]), here)
                             axis = snapped
                             if choice < to_lens_chance:
                                 axis = v
@@ -582,7 +584,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
                             else:
                                 s.u = rotate_direction(axis, t, u01(s.block[2]))
-                            density = phase_pdf(one_minus_cosine(snapped, s.u), water_at(medium, layers, s.x))
+                            density = phase_pdf(one_minus_cosine(snapped, s.u), here)
                             if on_surface:
                                 density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
                                 if wp.static(specular):
