@@ -55,6 +55,8 @@ _HOMES = {
     "budget": "budgets",
     "sweep": "budgets",
     "export": "exports",
+    "view": "viewer",
+    "video": "film",
     "to_torch": "tensors",
     "TorchResult": "tensors",
     "validate": "validation",
@@ -97,6 +99,7 @@ if TYPE_CHECKING:
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.exports import export
     from spadwarp.files import load_result
+    from spadwarp.film import video
     from spadwarp.hardware import devices
     from spadwarp.health import Diagnosis, SelfTest, doctor
     from spadwarp.model import truth_maps
@@ -110,6 +113,7 @@ if TYPE_CHECKING:
     from spadwarp.tensors import TorchResult, to_torch
     from spadwarp.truth_exr import load_truth_exr
     from spadwarp.validation import validate
+    from spadwarp.viewer import view
     from spadwarp.water import (
         WaterOptics,
         group_index,

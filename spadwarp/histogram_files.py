@@ -102,23 +102,16 @@ def _read_own(path: Path) -> Histograms:
         bin_width=scene.gate.bin_width,
         gate_start=scene.gate.start,
         background=result.component("backscatter").astype(np.float32),
-        response=_scene_response(scene),
+        response=scene_response(scene),
         scene=scene,
     )
 
 
 def _read_frames(path: Path) -> Histograms:
-    import tomllib
-
     import h5py
 
-    from spadwarp.config import Scene
-
     with h5py.File(path, "r") as file:
-        about = file.attrs
-        irf = InstrumentResponse(sigma=float(about["irf_sigma"]), tail=float(about["irf_tail"]))
-        if "irf" in file:
-            irf = InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
+        about, irf = file.attrs, frames_response(file)
         return Histograms(
             values=file["counts"][...],
             bin_width=float(about["bin_width"]),
@@ -126,11 +119,28 @@ def _read_frames(path: Path) -> Histograms:
             background=file["background"][...] * np.float32(about["pulses"]),
             irf=irf,
             response=irf,
-            scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=about["source"] or None),
+            scene=frames_scene(file),
         )
 
 
-def _scene_response(scene: Scene) -> InstrumentResponse:
+def frames_scene(file: Any) -> Scene:
+    """The scene in an open file of frames."""
+    import tomllib
+
+    from spadwarp.config import Scene
+
+    return Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs["source"] or None)
+
+
+def frames_response(file: Any) -> InstrumentResponse:
+    """The instrument response in an open file of frames."""
+    if "irf" in file:
+        return InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
+    return InstrumentResponse(sigma=float(file.attrs["irf_sigma"]), tail=float(file.attrs["irf_tail"]))
+
+
+def scene_response(scene: Scene) -> InstrumentResponse:
+    """The instrument response of a scene's laser and detector."""
     return instrument_response(
         pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
         jitter_fwhm=scene.detector.jitter_fwhm_ps * 1e-12,

@@ -3,7 +3,7 @@
 Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
 """
 
-from . import bench, dataset, denoise, doctor, exports, inspect, plan, reduce, runs, simulate
+from . import bench, dataset, denoise, doctor, exports, inspect, look, plan, reduce, runs, simulate
 from ._app import app, main
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "doctor",
     "exports",
     "inspect",
+    "look",
     "main",
     "plan",
     "reduce",
