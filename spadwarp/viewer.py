@@ -226,7 +226,7 @@ def _data(page: _Page) -> dict[str, Any]:
     from spadwarp.config import SPEED_OF_LIGHT
 
     scene = page.scene
-    directions, laser = pixel_directions(scene.camera), np.asarray(scene.laser.position, dtype=np.float64)
+    directions, laser = pixel_directions(scene.camera), np.asarray(scene.beam.position, dtype=np.float64)
     speed = SPEED_OF_LIGHT / scene.medium.group_index
     distance = page.truth / directions[..., 2]
     arrival = (np.linalg.norm(distance[..., None] * directions - laser, axis=-1) + distance) / speed
