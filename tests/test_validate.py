@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from reference import fournier_forand
 from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
@@ -123,6 +124,22 @@ def test_lambertian_references():
         assert fraction == pytest.approx(image[rows, columns].sum(), rel=1e-7)
 
 
+def test_fournier_forand_references():
+    """The mean of 1 − cosθ is the integral of what lies above it."""
+    law = {"particle_index": 1.10, "junge_slope": 3.5835}
+    edges = np.concatenate([[1e-15], np.geomspace(1e-9, 2.0, 400)])
+    node, weight = np.polynomial.legendre.leggauss(8)
+    t = 0.5 * (edges[1:] + edges[:-1])[:, None] + 0.5 * np.diff(edges)[:, None] * node
+    mean_cosine = 1 - 0.5 * (np.diff(edges) * ((1 - fournier_forand.cumulative(t, **law)) @ weight)).sum()
+    narrow = 2 * math.sin(math.radians(references.FOURNIER_FORAND_ANGLE) / 2) ** 2
+    fractions = [1 - fournier_forand.cumulative(1.0, **law), fournier_forand.cumulative(narrow, **law)]
+    after = after_collisions(5, extinction=1.0, anisotropy=mean_cosine)
+    expected = [*fractions, mean_cosine, after.cos_theta, after.z, after.r2]
+    np.testing.assert_allclose(references.FOURNIER_FORAND, expected, atol=6e-9)
+    lidar = Lidar(phase_function=lambda cosine: fournier_forand.density(1 - cosine, **law))
+    np.testing.assert_allclose(references.FOURNIER_FORAND_SINGLE_SCATTER, single_scatter_total(lidar), rtol=5e-5)
+
+
 # The cases
 
 
@@ -144,6 +161,11 @@ def test_deviations_are_standard_normal(results):
     """Too small an error would make them wide, too large a one narrow."""
     z = np.array([r.z for r in results if r.standard_error > 0])
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
+
+
+def test_a_table_of_henyey_greenstein_passes_as_well():
+    cases = ["slab", "near-axis", "single-scatter"]
+    assert all(r.passed for r in validate(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
 
 
 def test_ledger_and_closed_walls():

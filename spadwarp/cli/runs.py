@@ -79,6 +79,9 @@ def validate(
     ] = 1_000_000,
     seed: Seed = None,
     device: Device = None,
+    tabulated: Annotated[
+        bool, typer.Option("--tabulated", help="Take Henyey–Greenstein from tables of angle and value.")
+    ] = False,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw a picture of each case.")] = None,
     list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and leave.")] = False,
     quiet: Quiet = False,
@@ -107,6 +110,7 @@ def validate(
         photons=photons,
         seed=seed or 0,
         device=device,
+        tabulated=tabulated,
         progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
     )
     failed = [result for result in results if not result.passed]

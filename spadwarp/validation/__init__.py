@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,13 +18,14 @@ from pathlib import Path
 from spadwarp.errors import ConfigError
 
 from .lidar import CASES as LIDAR_CASES
+from .phase import CASES as PHASE_CASES
 from .runs import Case, Run
 from .statistics import holm, two_sided_p
 from .water import CASES as WATER_CASES
 
 __all__ = ["CASES", "FAMILY_LEVEL", "CaseResult", "plot_results", "validate", "write_json"]
 
-CASES: dict[str, Case] = {case.name: case for case in (*WATER_CASES, *LIDAR_CASES)}
+CASES: dict[str, Case] = {case.name: case for case in (*WATER_CASES, *PHASE_CASES, *LIDAR_CASES)}
 """The reference cases by name."""
 
 FAMILY_LEVEL = 1e-3
@@ -61,6 +63,7 @@ def validate(
     photons: int = 1_000_000,
     seed: int = 0,
     device: str | None = None,
+    tabulated: bool = False,
     progress: Callable[[Case], None] | None = None,
 ) -> list[CaseResult]:
     """Run reference cases and hold them to their references.
@@ -70,6 +73,7 @@ def validate(
         photons: For each scene of a case, at least 1000. A million takes seconds a case on a GPU, ten million show
         more. seed: Of the random numbers, in [0, 2^40].
         device: As for `simulate`.
+        tabulated: Whether every Henyey–Greenstein phase function is first tabulated and then read from the file.
         progress: Called with each case before it is run.
 
     Returns:
@@ -85,12 +89,13 @@ def validate(
     for field, value, low, high in (("photons", photons, 1000, 10**12), ("seed", seed, 0, 2**40)):
         if not low <= value <= high:
             raise ConfigError(f"{field} = {value} is outside [{low}, {high}]")
-    run = Run(photons=photons, seed=seed, device=device)
     measured = []
-    for name in names:
-        if progress is not None:
-            progress(CASES[name])
-        measured += [(name, quantity) for quantity in CASES[name].measure(run)]
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(photons=photons, seed=seed, device=device, tables=Path(folder) if tabulated else None)
+        for name in names:
+            if progress is not None:
+                progress(CASES[name])
+            measured += [(name, quantity) for quantity in CASES[name].measure(run)]
     return [
         CaseResult(
             name=name,

@@ -12,7 +12,7 @@ from . import references as known
 from .runs import Case, Run, point_source, scene
 from .statistics import Estimate, Quantity, ScoreMeans, batch_means
 
-__all__ = ["CASES"]
+__all__ = ["CASES", "scattered_once"]
 
 _WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924}
 _CAMERA = {
@@ -23,9 +23,14 @@ _CAMERA = {
 }
 
 
-def _single_scatter(run: Run) -> list[Quantity]:
+def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
+    """The scene of `references.SINGLE_SCATTER` in any water."""
     laser = {"position": [-0.1, 0.0, 0.0], "profile": "uniform_cone", "half_angle_deg": 2.5}
-    tables = scene(_WATER, laser, camera=_CAMERA, path_edges=(2.0, 7.0, 5), max_collisions=1, estimator="guided")
+    return scene(medium, laser, camera=_CAMERA, path_edges=(2.0, 7.0, 5), max_collisions=1, estimator="guided")
+
+
+def _single_scatter(run: Run) -> list[Quantity]:
+    tables = scattered_once(_WATER)
     sums = [
         [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in known.SINGLE_SCATTER.values()]
         for result in run.results(tables)

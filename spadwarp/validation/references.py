@@ -19,6 +19,9 @@ __all__ = [
     "EXIT_COSINES",
     "EXIT_COSINE_EDGES",
     "FLUENCE",
+    "FOURNIER_FORAND",
+    "FOURNIER_FORAND_ANGLE",
+    "FOURNIER_FORAND_SINGLE_SCATTER",
     "LAMBERTIAN",
     "NEAR_AXIS",
     "SINGLE_SCATTER",
@@ -136,3 +139,11 @@ LAMBERTIAN: dict[str, tuple[slice, slice, float]] = {
     "upper left corner, 8 × 8 pixels": (slice(0, 8), slice(0, 8), 6.0534246e-10),
     "lower right corner, 8 × 8 pixels": (slice(24, 32), slice(24, 32), 6.0889339e-10),
 }
+
+# Fournier–Forand of n 1.10, µ 3.5835: parts scattered by more than 90° and by less than this angle [°], from its closed
+# integral; ⟨cosθ⟩ after 1 and 5 collisions, ⟨z⟩ [m] and ⟨r²⟩ [m²] at the fifth, 1/c = 1 m, exact for that ⟨cosθ⟩.
+FOURNIER_FORAND_ANGLE = 0.1
+FOURNIER_FORAND = (0.01831268, 0.06828709, 0.92996306, 0.69555021, 4.34698866, 27.34160312)
+
+# The same as SINGLE_SCATTER's whole field: quadrature.
+FOURNIER_FORAND_SINGLE_SCATTER = (5.995214e-9, 3.578479e-9, 1.784040e-9, 8.877888e-10, 4.693142e-10)

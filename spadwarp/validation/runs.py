@@ -6,9 +6,13 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spadwarp.config import SPEED_OF_LIGHT, Scene
+from spadwarp.phase_functions import phase_function
 
 from .statistics import Quantity
 
@@ -27,17 +31,21 @@ _EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 -
 
 @dataclass(frozen=True)
 class Run:
-    """How the cases are run: photons for each scene, seed, device (None: the default one)."""
+    """How the cases are run: photons for each scene, seed, device (None: the default one).
+
+    With a folder for `tables` every Henyey–Greenstein function goes through a file of angles and values.
+    """
 
     photons: int
     seed: int
     device: str | None = None
+    tables: Path | None = None
 
     def records(self, tables: Mapping[str, Any], *, key: str | None = None) -> Iterator[Any]:
         """`PhotonRecords` of blocks of photons; random numbers of its own for each scene, or for each `key`."""
         from spadwarp.records import trace
 
-        traced = Scene.from_dict(tables)
+        traced = self._scene(tables)
         for block, start in enumerate(range(0, self.photons, BLOCK)):
             count = min(BLOCK, self.photons - start)
             yield trace(traced, photons=count, seed=self._seed(key or repr(tables), block), device=self.device)
@@ -46,10 +54,24 @@ class Run:
         """`Result`s of `BATCHES` independent runs; each scene has random numbers of its own."""
         from spadwarp.simulation import simulate
 
-        simulated = Scene.from_dict(tables)
+        simulated = self._scene(tables)
         photons = max(1, self.photons // BATCHES)
         for batch in range(BATCHES):
             yield simulate(simulated, photons=photons, seed=self._seed(repr(tables), batch), device=self.device)
+
+    def _scene(self, tables: Mapping[str, Any]) -> Scene:
+        medium = tables["medium"]
+        if self.tables is None or "phase_function" in medium:
+            return Scene.from_dict(tables)
+        path = self.tables / f"g{medium.get('anisotropy', 0.924)}.csv"
+        if not path.exists():
+            # Dense at both ends, wherever the peak lies; 1e-5 between the points.
+            near = np.concatenate([[0.0], np.geomspace(1e-3, 90.0, 2000)])
+            angles = np.concatenate([near, 180.0 - near[-2::-1]])
+            law = phase_function(Scene.from_dict(tables).medium)
+            np.savetxt(path, np.column_stack([angles, law.density(np.radians(angles))]), fmt="%.9g", delimiter=",")
+        changed = {**medium, "phase_function": "tabulated", "phase_table": str(path)}
+        return Scene.from_dict({**tables, "medium": changed})
 
     def _seed(self, key: str, block: int) -> int:
         digest = hashlib.blake2b(f"{self.seed} {block} {key}".encode(), digest_size=8).digest()

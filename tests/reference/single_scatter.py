@@ -11,6 +11,7 @@ size changes the sums by (radius/range)²).
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +35,7 @@ class Lidar:
     # (z where it begins, extinction, albedo, anisotropy) of further waters; laser and camera are then at z = 0. The
     # quadrature converges with narrow bins only.
     layers: tuple[tuple[float, float, float, float], ...] = ()
+    phase_function: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # of cosΘ [1/sr]; None: HG
 
     @property
     def solid_angle(self) -> float:
@@ -48,7 +50,8 @@ class Lidar:
         for (start, extinction, albedo, g), end in zip(waters, ends, strict=True):
             depth += extinction * (np.clip(z, None, end) - max(start, 0.0)).clip(0.0)
             here = (z >= start) & (z < end)
-            value += here * albedo * extinction * henyey_greenstein(cos_scatter, g)
+            p = henyey_greenstein(cos_scatter, g) if self.phase_function is None else self.phase_function(cos_scatter)
+            value += here * albedo * extinction * p
         return value * np.exp(-depth / z * path)
 
     @property
