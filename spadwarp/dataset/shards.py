@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import DeviceError
-from spadwarp.files import atomic_path
+from spadwarp.files import hdf5_file
 from spadwarp.hardware import core_count, pick_device
 
 from .columns import FORMAT_VERSION, FRAME_COLUMNS, scene_columns, scene_row
@@ -39,17 +39,18 @@ def write_shard(
     for name in names:
         _remove_leftovers(folder / name)
     with ExitStack() as stack:
-        files = [_new_file(stack, plan, shard, name) for name in names]
+        files = [stack.enter_context(hdf5_file(folder / name, libver=_LIBRARY)) for name in names]
+        for name, file in zip(names, files, strict=True):
+            file.attrs.update(_attributes(plan, shard, name))
         _fill(plan, shard, files, device=device, threads=threads)
-        images = [_image(file) for file in files]
-    return {name: _write(folder / name, image) for name, image in zip(names, images, strict=True)}
+    return {name: checksum(folder / name) for name in names}
 
 
 def write_scene_index(plan: Plan, folder: Path) -> None:
     """`scenes.h5`: the scenes of all shards as one, by reference; rows of shards that are not there are NaN or 0."""
     from h5py import h5d, h5p, h5s, h5t
 
-    with _in_memory("scenes.h5") as file:
+    with hdf5_file(folder / "scenes.h5", libver=_LIBRARY) as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
         for name, (shape, kind, unit, text) in scene_columns(plan).items():
             # h5py's own virtual datasets hold the time of day.
@@ -67,7 +68,6 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
                 how.set_fill_value(np.array([np.nan], dtype))
             h5d.create(file.id, name.encode(), h5t.py_create(dtype, logical=True), h5s.create_simple(whole), how)
             file[name].attrs.update({"unit": unit, "description": text})
-        _write(folder / "scenes.h5", _image(file))
 
 
 def checksum(path: Path) -> dict[str, Any]:
@@ -84,45 +84,22 @@ def _remove_leftovers(path: Path) -> None:
             one.unlink()
 
 
-def _in_memory(name: str) -> Any:
-    """A new HDF5 file in memory: HDF5 ends the process where a disk becomes full under it."""
-    import h5py
-
-    return h5py.File(name, "w", driver="core", backing_store=False, block_size=1 << 22, libver=_LIBRARY)
-
-
-def _image(file: Any) -> bytes:
-    file.flush()
-    return file.id.get_file_image()
-
-
-def _write(path: Path, image: bytes) -> dict[str, Any]:
-    """Writes a file whole or not at all; returns its size and checksum."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(image)
-    return {"bytes": len(image), "sha256": hashlib.sha256(image).hexdigest()}
-
-
-def _new_file(stack: ExitStack, plan: Plan, shard: Shard, name: str) -> Any:
+def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
     from spadwarp import __version__
 
-    file = stack.enter_context(_in_memory(name))
-    file.attrs.update(
-        {
-            "format": f"spadwarp {Path(name).name.partition('-')[0]}",
-            "format_version": FORMAT_VERSION,
-            "version": __version__,
-            "name": plan.recipe.name,
-            "recipe_seed": str(plan.recipe.seed),
-            "split": shard.split,
-            "split_seed": str(plan.split_seeds[shard.split]),
-            "target": plan.targets[shard.target].name,
-            "shard": shard.index,
-            "shards": len(plan.shards),
-            "read_me": "Images [frame, height, width]; +x right, +y down, +z away from the camera; depth is z.",
-        }
-    )
-    return file
+    return {
+        "format": f"spadwarp {Path(name).name.partition('-')[0]}",
+        "format_version": FORMAT_VERSION,
+        "version": __version__,
+        "name": plan.recipe.name,
+        "recipe_seed": str(plan.recipe.seed),
+        "split": shard.split,
+        "split_seed": str(plan.split_seeds[shard.split]),
+        "target": plan.targets[shard.target].name,
+        "shard": shard.index,
+        "shards": len(plan.shards),
+        "read_me": "Images [frame, height, width]; +x right, +y down, +z away from the camera; depth is z.",
+    }
 
 
 def _fill(plan: Plan, shard: Shard, files: list[Any], *, device: str | None, threads: int | None) -> None:
