@@ -79,10 +79,12 @@ def one_minus_cosine(u: wp.vec3, v: wp.vec3) -> float:
 
 
 @wp.func
+def sample_cosine_law(xi: float) -> float:
+    """t = 1 - cos(theta) of the angle to the normal, drawn from cos(theta)/pi [1/sr], for uniform xi in [0, 1)."""
+    return xi / (1.0 + wp.sqrt(1.0 - xi))
+
+
+@wp.func
 def sample_lambert(normal: wp.vec3, xi1: float, xi2: float) -> wp.vec3:
     """A unit vector about the unit normal with density cos(theta)/pi, for uniform xi1, xi2 in [0, 1)."""
-    r = wp.sqrt(xi1)
-    turn = cos_sin_turn(xi2)
-    b1, b2 = orthonormal_basis(normal)
-    v = wp.sqrt(wp.max(1.0 - xi1, 0.0)) * normal + (r * turn[0]) * b1 + (r * turn[1]) * b2
-    return wp.normalize(v)
+    return rotate_direction(normal, sample_cosine_law(xi1), xi2)

@@ -69,6 +69,29 @@ def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
 
 
 @wp.func
+def _outside_sides(limits: Limits, x: wp.vec3) -> bool:
+    return wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
+
+
+@wp.func
+def _outside_faces(limits: Limits, x: wp.vec3) -> bool:
+    low = x[0] < limits.lower[0] or x[1] < limits.lower[1] or x[2] < limits.lower[2]
+    return low or x[0] > limits.upper[0] or x[1] > limits.upper[1] or x[2] > limits.upper[2]
+
+
+@wp.func
+def is_outside(limits: Limits, x: wp.vec3) -> bool:
+    """Whether x lies outside the domain or beyond the lateral limit."""
+    return _outside_sides(limits, x) or _outside_faces(limits, x)
+
+
+@wp.func
+def is_outside_turned(limits: Limits, x: wp.vec3) -> bool:
+    """As `is_outside`, for a domain with axes of its own."""
+    return _outside_sides(limits, x) or _outside_faces(limits, limits.rotation * x + limits.origin)
+
+
+@wp.func
 def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
     return wp.min(_to_sides(limits, x, u), _to_faces(limits, x, u))

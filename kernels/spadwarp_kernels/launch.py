@@ -14,9 +14,10 @@ from .laser import Laser, Scan
 from .layers import Layers
 from .medium import Medium
 from .shadow import near_depth_map
-from .surface import Surfaces, Textures
+from .surface import Surfaces, Textures, face_planes
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
-from .transport import COMPONENTS, Records, TransportSpec, make_transport_kernel
+from .transport import COMPONENTS, FEW_FACES, Records, TransportSpec, make_transport_kernel
+from .warp_lanes import BLOCK_SIZE
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,7 @@ def make_surfaces(
     surfaces.specular = by_face("specular", specular, float)
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float)
     surfaces.textures = no_textures(device) if textures is None else textures
+    surfaces.planes = wp.zeros(0, dtype=wp.vec4, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
         return surfaces
@@ -176,6 +178,8 @@ def make_surfaces(
     lower, upper = points.min(axis=0), points.max(axis=0)
     padding = 1e-6 * abs(points).max() + 1e-6
     surfaces.mesh = mesh.id
+    if face_count <= FEW_FACES:
+        surfaces.planes = face_planes(mesh)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
@@ -225,13 +229,10 @@ def make_textures(
 CUDA_THREADS = 1 << 19
 
 
-_BLOCK = 128
-
-
 def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
     device = wp.get_device(device)
-    make_transport_kernel(spec, device.is_cuda).module.load(device, _BLOCK if device.is_cuda else 1)
+    make_transport_kernel(spec, device.is_cuda).module.load(device, BLOCK_SIZE if device.is_cuda else 1)
 
 
 def launch_transport(
@@ -248,7 +249,9 @@ def launch_transport(
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    threads = min(-(-photon_count // _BLOCK) * _BLOCK, CUDA_THREADS) if model.device.is_cuda else 1
+    if spec.few_faces and model.surfaces.planes.size == 0:
+        raise ValueError(f"spec.few_faces = True is for meshes of 1 to {FEW_FACES} faces")
+    threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
         dim=threads,
@@ -270,7 +273,7 @@ def launch_transport(
         ],
         outputs=[data.tally, data.ledger, data.records],
         device=model.device,
-        block_dim=_BLOCK,
+        block_dim=BLOCK_SIZE,
     )
 
 

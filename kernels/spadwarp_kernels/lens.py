@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, clip_to_planes, field, project, project_calibrated
+from .camera import Camera, clip_to_planes, field, in_view, project, project_calibrated
 from .shadow import may_be_hidden, may_be_hidden_in
 
 
@@ -22,6 +22,7 @@ class Lens(NamedTuple):
             that holds all of it that the view shows by way of o; empty where s0 >= s1.
         may_be_hidden: Warp function (camera, near depth map, x) -> whether a point that is seen may have something
             before it.
+        sees: Warp function (camera, view, target, x) -> whether x lies in the view, up to rounding.
         inward: Warp function (view, x) -> vector across the optical axis from x towards the middle of the view.
     """
 
@@ -29,6 +30,7 @@ class Lens(NamedTuple):
     project: wp.Function
     clip: wp.Function
     may_be_hidden: wp.Function
+    sees: wp.Function
     inward: wp.Function
 
 
@@ -40,6 +42,11 @@ def _project_pinhole(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: 
 @wp.func
 def _clip_pinhole(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
     return clip_to_planes(field(camera), x, u, limit)
+
+
+@wp.func
+def _sees_pinhole(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
+    return in_view(camera, x)
 
 
 @wp.func
@@ -59,13 +66,20 @@ def _clip_calibrated(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: w
 
 
 @wp.func
+def _sees_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
+    return project_calibrated(camera, view, target, x, wp.vec3(0.0, 0.0, 0.0)) >= 0
+
+
+@wp.func
 def _inward_calibrated(view: wp.vec4, x: wp.vec3) -> wp.vec3:
     depth = 0.5 * wp.max(x[2], 0.0)
     return wp.vec3(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1], 0.0)
 
 
-PINHOLE = Lens("pinhole", _project_pinhole, _clip_pinhole, may_be_hidden, _inward_pinhole)
+PINHOLE = Lens("pinhole", _project_pinhole, _clip_pinhole, may_be_hidden, _sees_pinhole, _inward_pinhole)
 """Square pixels about the optical axis, everything sharp: the first five attributes of `Camera`."""
 
-CALIBRATED = Lens("calibrated", project_calibrated, _clip_calibrated, may_be_hidden_in, _inward_calibrated)
+CALIBRATED = Lens(
+    "calibrated", project_calibrated, _clip_calibrated, may_be_hidden_in, _sees_calibrated, _inward_calibrated
+)
 """Focal lengths and principal point in pixels, Brown's distortion, pinhole or thin lens: all of `Camera`."""

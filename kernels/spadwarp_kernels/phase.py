@@ -21,8 +21,8 @@ _INV_4PI = wp.constant(0.07957747154594767)
 def henyey_greenstein_pdf(t: float, g: float) -> float:
     """Henyey-Greenstein density [1/sr] at t = 1 - cos(theta) in [0, 2], for g in (-1, 1); mean cosine g (Henyey &
     Greenstein 1941)."""
-    s = (1.0 - g) * (1.0 - g) + 2.0 * g * t
-    return _INV_4PI * (1.0 - g * g) / (s * wp.sqrt(s))
+    root = 1.0 / wp.sqrt((1.0 - g) * (1.0 - g) + 2.0 * g * t)
+    return _INV_4PI * (1.0 - g * g) * (root * root * root)
 
 
 @wp.func
@@ -33,8 +33,8 @@ def sample_henyey_greenstein(xi: float, g: float) -> float:
     Equal in distribution to cos(theta) = [1 + g^2 - ((1 - g^2)/(1 - g + 2 g xi))^2]/(2 g), without its cancellation
     at the peak and without its singularity at g = 0.
     """
-    e = 1.0 + g - 2.0 * g * xi
-    return wp.min((1.0 - g) * xi * ((1.0 - g * g) / e + (1.0 - g)) / e, 2.0)
+    inverse = 1.0 / (1.0 + g - 2.0 * g * xi)
+    return wp.min((1.0 - g) * xi * inverse * ((1.0 - g * g) * inverse + (1.0 - g)), 2.0)
 
 
 class PhaseFunction(NamedTuple):

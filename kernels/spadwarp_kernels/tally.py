@@ -91,7 +91,7 @@ def to_fixed_point(value: float, scale: float, dither: float) -> wp.int64:
     """
     units = value * scale
     if units <= _DEPOSIT_LIMIT:
-        return wp.int64(wp.floor(units + dither))
+        return wp.int64(units + dither)
     if units > _DEPOSIT_LIMIT:
         return wp.int64(-1)
     return wp.int64(-2)

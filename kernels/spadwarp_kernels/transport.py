@@ -5,6 +5,7 @@ One kernel, specialised by a hashable `TransportSpec`. A thread walks photon aft
     FLIGHT -> [FLIGHT_SAMPLE ->] EVENT -> SCATTER -> FLIGHT -> ... -> END
 
 and leaves the inner loop only when it has a ray to trace, so that the BVH is walked by all threads of a warp at once.
+A warp emits 32 photons at a time and stocks them; a thread whose photon has ended takes the next.
 """
 
 import functools
@@ -13,8 +14,16 @@ from typing import NamedTuple
 import warp as wp
 
 from .camera import Camera, lens_point
-from .direction import one_minus_cosine, rotate_direction, sample_lambert, snap_direction
-from .domain import Limits, exit_distance, exit_distance_turned, exit_face, exit_face_turned
+from .direction import one_minus_cosine, rotate_direction, sample_cosine_law, snap_direction
+from .domain import (
+    Limits,
+    exit_distance,
+    exit_distance_turned,
+    exit_face,
+    exit_face_turned,
+    is_outside,
+    is_outside_turned,
+)
 from .gate import Gate, gate_bin
 from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_to_gate, make_sample_flight
 from .laser import Laser, Scan, emit_along, emit_measured
@@ -25,7 +34,6 @@ from .microfacet import ggx_brdf, reflection_pdf, sample_reflection, unshadowed
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import (
     STREAM_FLIGHT_SAMPLE,
-    STREAM_LENS,
     STREAM_ROULETTE,
     STREAM_SURFACE,
     STREAM_TRANSPORT,
@@ -63,7 +71,7 @@ from .tally import (
     deposit,
     to_ledger,
 )
-from .warp_lanes import count_lanes
+from .warp_lanes import count_lanes, count_lanes_before, exchange
 
 ESTIMATORS = ("none", "analog", "next_event", "guided")
 
@@ -75,15 +83,18 @@ _FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _START, _END, _DONE = (wp.constant(i)
 _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
-# A warp leaves the water when this many of its 32 lanes wait, without and with a mesh: fewer leave lanes idle in what
-# they wait for, more in the water.
-WAITING_LANES = (6, 20)
+# A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
+# in the water.
+RAY_LANES = 20
+
+# It takes new photons when this many lanes have ended.
+START_LANES = 3
 
 # Meshes of at most this many faces need no BVH.
 FEW_FACES = 12
 
-# Registers a thread, without and with a mesh: fewer spill, more leave too few warps to hide latency.
-MAX_REGISTERS = (80, 96)
+# Registers a thread, without and with a BVH: fewer spill, more leave too few warps to hide latency.
+MAX_REGISTERS = {"none": (56, 80), "analog": (64, 96), "next_event": (64, 96), "guided": (96, 96)}
 
 
 class TransportSpec(NamedTuple):
@@ -175,6 +186,9 @@ class _Walk:
     """
 
     stage: int
+    # The warp's stock of new photons:
+    first: int  # of them
+    taken: int
     # The photon:
     photon: int
     x: wp.vec3
@@ -199,7 +213,7 @@ class _Walk:
     ray: int
     reach: float
     interval: wp.vec2  # of the flight that the camera sees
-    along: float  # point of the flight that is scored; 0 is x
+    origin: wp.vec3  # the point that is scored
     lens: wp.vec3
     dither: float
     pending_index: int
@@ -208,6 +222,8 @@ class _Walk:
     absorbed_water: wp.int64
     absorbed_surface: wp.int64
     directed: wp.int64
+    water_collisions: int
+    surface_events: int
     surface_queries: int
     shadow_queries: int
     contributions: int
@@ -233,9 +249,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     pinhole = spec.lens.name == PINHOLE.name
     if confocal and pinhole:
         raise ValueError("confocal = True needs lens = CALIBRATED")
-    project, clip_to_view, may_be_hidden, inward_of = spec.lens[1:]
+    project, clip_to_view, may_be_hidden, sees, inward_of = spec.lens[1:]
     emit = emit_measured if spec.measured_beam else emit_along
-    to_exit, face_of_exit = (exit_distance_turned, exit_face_turned) if spec.turned else (exit_distance, exit_face)
+    to_exit, face_of_exit, outside = (
+        (exit_distance_turned, exit_face_turned, is_outside_turned)
+        if spec.turned
+        else (exit_distance, exit_face, is_outside)
+    )
     # A handful of faces is tried on the spot; rays for a BVH wait until the warp has enough of them.
     has_bvh = has_mesh and not few_faces
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
@@ -243,13 +263,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     aimed = spec.phase.guide is not None
     sample_flight, lobe_pdf, lobe_sample = make_sample_flight(guide), guide.lobe_pdf, guide.lobe_sample
-    waiting_lanes = WAITING_LANES[has_bvh]
+    ray_lanes = RAY_LANES if has_bvh else 32
+    scores = next_event or guided
 
     @wp.kernel(
         module="unique",
         module_options={"fast_math": cuda},
         enable_backward=False,
-        cuda_max_registers=MAX_REGISTERS[has_bvh],
+        cuda_max_registers=MAX_REGISTERS[spec.estimator][has_bvh],
     )
     def transport(
         # Model:
@@ -276,23 +297,24 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         thread = wp.tid()
         s = _Walk()
         s.stage = _START
-        s.photon = thread
         s.albedo = medium.albedo
         s.view = camera.view
         s.target = -1
+        # On the CPU one thread walks all photons.
+        lane = thread % wp.static(32 if cuda else 1)
+        s.first = thread - lane - wp.where(wp.static(cuda), thread_count, 1)
+        s.taken = 32
 
         while count_lanes(s.stage == _DONE) < 32:
-            # ---- Water: until enough lanes of the warp wait for a surface or a new photon
+            # ---- Water: until enough lanes of the warp wait for a ray
             waiting = int(0)
-            while waiting < wp.static(waiting_lanes):
+            while waiting < wp.static(ray_lanes):
                 if s.stage == _FLIGHT:
                     id = first_id + wp.uint64(s.photon)
                     s.block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
                     s.face = -1
                     s.distance = water_free_path(medium, layers, s.x, s.u, u01(s.block[0]))
                     limit = limits.max_path - s.path
-                    if wp.static(bounded):
-                        limit = wp.min(limit, to_exit(limits, s.x, s.u))
                     s.reach = wp.min(s.distance, limit)
                     if wp.static(paper_albedo):
                         draw = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
@@ -301,25 +323,26 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if wp.static(guided):
                         s.sample_block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                         s.lens = lens_point(camera, u01(s.sample_block[2]), u01(s.sample_block[3]))
-                        s.dither = u01_last(s.sample_block[2])
+                        if wp.static(bounded):
+                            limit = wp.min(limit, to_exit(limits, s.x, s.u))
                         s.interval = clip_to_view(camera, s.view, s.x, s.u, s.lens, limit)
                         s.interval = clip_to_gate(gate, s.x, s.u, s.path, s.lens, s.interval)
                         if s.interval[0] < s.interval[1] and (wp.static(layered) or medium.extinction > 0.0):
                             s.stage = _FLIGHT_SAMPLE
                             s.reach = wp.max(s.reach, s.interval[1])
                     if wp.static(has_mesh):
-                        if segment_meets_box(s.x, s.u, s.reach, surfaces.lower, surfaces.upper):
-                            if wp.static(has_bvh):
+                        if wp.static(has_bvh):
+                            if segment_meets_box(s.x, s.u, s.reach, surfaces.lower, surfaces.upper):
                                 s.ray = _SURFACE_RAY
-                            else:
-                                hit = intersect_faces(surfaces.mesh, s.x, s.u, s.reach)
-                                s.surface_queries += 1
-                                if hit.face >= 0:
-                                    s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
-                                    if hit.distance < s.distance:
-                                        s.distance = hit.distance
-                                        s.face = hit.face
-                                        s.normal = hit.normal
+                        else:
+                            hit = intersect_faces(surfaces.planes, s.x, s.u, s.reach)
+                            s.surface_queries += 1
+                            if hit.face >= 0:
+                                s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
+                                if hit.distance < s.distance:
+                                    s.distance = hit.distance
+                                    s.face = hit.face
+                                    s.normal = hit.normal
 
                 if wp.static(guided):
                     if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
@@ -341,8 +364,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 u01(s.sample_block[0]),
                                 u01_fine(s.sample_block[1]),
                             )
-                            s.along = flight.s
-                            y = s.x + s.along * s.u
+                            y = s.x + flight.s * s.u
+                            s.origin = y
                             pixel = project(camera, s.view, s.target, y, s.lens)
                             if pixel >= 0 and flight.density > 0.0:
                                 to_lens = (s.lens - y) / flight.r
@@ -354,7 +377,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.weight
                                     * s.albedo
                                     * there.extinction
-                                    * wp.exp(-water_extinction(medium, layers, s.x, s.u, s.along) * s.along)
+                                    * wp.exp(-water_extinction(medium, layers, s.x, s.u, flight.s) * flight.s)
                                 )
                                 s.pending_value = (
                                     next_event_value(
@@ -369,12 +392,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 )
                                 component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
                                 s.pending_index = tally_index(
-                                    camera, gate, pixel, s.path + s.along + flight.r, component
+                                    camera, gate, pixel, s.path + flight.s + flight.r, component
                                 )
+                                s.dither = u01_last(s.sample_block[2])
                                 s.contributions += 1
                                 s.ray = _SHADOW_RAY
-
-                if s.stage == _EVENT and s.ray == _NO_RAY:
+                # What guided has sampled may wait for its shadow ray: without a surface nothing more is scored here.
+                if s.stage == _EVENT and (
+                    s.ray == _NO_RAY or (wp.static(guided) and s.ray == _SHADOW_RAY and s.face < 0)
+                ):
                     s.reason = -1
                     limit = limits.max_path - s.path
                     if wp.static(analog):
@@ -401,42 +427,35 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 )
                     if s.distance > limit:
                         s.reason = MAX_PATH
+                        s.distance = limit
                     if wp.static(bounded):
-                        out_distance = to_exit(limits, s.x, s.u)
-                        if out_distance < s.distance and out_distance <= limit:
+                        if outside(limits, s.x + s.distance * s.u):
                             s.reason = face_of_exit(limits, s.x, s.u)
-                        limit = wp.min(limit, out_distance)
-                    if s.reason >= 0:
-                        s.x = s.x + limit * s.u
-                        s.path += limit
-                        s.stage = _END
-                    else:
-                        s.x = s.x + s.distance * s.u
-                        s.path += s.distance
-                        s.collisions += 1
+                            s.distance = wp.min(s.distance, to_exit(limits, s.x, s.u))
+                    s.x = s.x + s.distance * s.u
+                    s.path += s.distance
+                    s.stage = _END
+                    if s.reason < 0:
                         s.stage = _SCATTER
+                        s.collisions += 1
                         if wp.static(local_albedo):
                             s.albedo = water_at(medium, layers, s.x).albedo
                         if wp.static(has_mesh):
                             if s.face >= 0:
                                 s.x = offset_from_surface(s.x, s.normal, s.distance)
-                        if wp.static(next_event or guided):
-                            # Water s.collisions are scored here by next_event alone: guided has scored the flight.
+                        if wp.static(scores):
+                            # Water collisions are scored here by next_event alone: guided has scored the flight.
                             if wp.static(next_event) or s.face >= 0:
                                 pixel = int(0)
                                 if wp.static(pinhole):
                                     # Whatever the lens point; the others need it.
                                     pixel = project(camera, s.view, s.target, s.x, s.x)
                                 if pixel >= 0:
-                                    if wp.static(guided):
-                                        id = first_id + wp.uint64(s.photon)
-                                        draw = random_block(seed, id, wp.uint32(s.collisions), STREAM_LENS)
-                                        s.lens = lens_point(camera, u01(draw[0]), u01(draw[1]))
-                                        s.dither = u01_last(draw[0])
-                                    else:
-                                        # The word that only guided needs otherwise, and bits that the flight left.
+                                    # Bits that the flight left.
+                                    s.dither = u01_last(s.block[0])
+                                    # guided keeps the flight's point of the lens; else the word that it alone needs.
+                                    if wp.static(next_event):
                                         s.lens = lens_point(camera, u01_high(s.block[3]), u01_low(s.block[3]))
-                                        s.dither = u01_last(s.block[0])
                                     if wp.static(not pinhole):
                                         pixel = project(camera, s.view, s.target, s.x, s.lens)
                                     to_lens = s.lens - s.x
@@ -463,7 +482,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         if s.surface_count == 0:
                                             component = BACKSCATTER
                                     if scattering > 0.0 and pixel >= 0:
-                                        s.along = 0.0
+                                        if wp.static(guided):
+                                            s.origin = s.x
                                         s.pending_value = next_event_value(
                                             camera,
                                             water_extinction(medium, layers, s.x, to_lens, r),
@@ -476,9 +496,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                         s.contributions += 1
                                         s.ray = _SHADOW_RAY
 
-                if wp.static(next_event or guided):
+                if wp.static(scores):
                     if s.ray == _SHADOW_RAY:
-                        origin = s.x + s.along * s.u
+                        origin = s.x
+                        if wp.static(guided):
+                            origin = s.origin
                         seen = True
                         if wp.static(has_mesh):
                             if may_be_hidden(camera, surfaces.near_depth, origin):
@@ -490,7 +512,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.shadow_queries += 1
                                 to = s.lens - origin
                                 length = wp.length(to)
-                                seen = intersect_faces(surfaces.mesh, origin, to / length, length).face < 0
+                                seen = intersect_faces(surfaces.planes, origin, to / length, length).face < 0
                                 if not seen:
                                     s.ray = _NO_RAY
                         if seen:
@@ -509,15 +531,17 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(specular):
                                 survival += surfaces.specular[s.face]
                                 lobe = surfaces.specular[s.face] / wp.max(survival, 1.0e-30)
+                            # The ledger is written up where weight changes hands; water takes what is missing there.
+                            before = to_ledger(s.weight)
+                            s.absorbed_water += s.ledger_weight - before
+                            s.ledger_weight = to_ledger(s.weight * survival)
+                            s.absorbed_surface += before - s.ledger_weight
+                            s.surface_count += 1
                     s.weight *= survival
-                    s.analog_weight *= survival
-                    after = to_ledger(s.weight)
-                    if s.face >= 0:
-                        s.absorbed_surface += s.ledger_weight - after
-                        s.surface_count += 1
+                    if wp.static(guided):
+                        s.analog_weight *= survival
                     else:
-                        s.absorbed_water += s.ledger_weight - after
-                    s.ledger_weight = after
+                        s.analog_weight = s.weight
 
                     s.reason = -1
                     if s.analog_weight < limits.weight_cutoff or s.analog_weight <= 0.0:
@@ -528,11 +552,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.reason = ROULETTE
                             if chance < 0.1 and s.analog_weight > 0.0:
                                 s.reason = -1
+                                before = to_ledger(s.weight)
+                                s.absorbed_water += s.ledger_weight - before
                                 s.weight *= 10.0
                                 s.analog_weight *= 10.0
-                                after = to_ledger(s.weight)
-                                add_to_ledger(ledger, thread, ROULETTE, s.ledger_weight - after)
-                                s.ledger_weight = after
+                                s.ledger_weight = to_ledger(s.weight)
+                                add_to_ledger(ledger, thread, ROULETTE, before - s.ledger_weight)
                     if s.reason < 0 and s.collisions >= limits.max_collisions:
                         s.reason = MAX_COLLISIONS
 
@@ -563,27 +588,26 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             inward = inward_of(s.view, s.x)
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
                             to_view_chance = float(0.0)
-                            centre = wp.vec3(0.0, 0.0, 0.0)
-                            if project(camera, s.view, s.target, s.x, centre) < 0 and wp.dot(inward, inward) > 0.0:
+                            if wp.dot(inward, inward) > 0.0 and not sees(camera, s.view, s.target, s.x):
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])
                             here = water_at(medium, layers, s.x)
-                            t = phase_sample(u01_fine(s.block[1]), here)
                             axis = snapped
+                            t = phase_sample(u01_fine(s.block[1]), here)
+                            if on_surface:
+                                axis = s.normal
+                                t = sample_cosine_law(u01(s.block[1]))
                             if choice < to_lens_chance:
                                 axis = v
                                 t = lobe_sample(u01_fine(s.block[1]), medium, guiding)
                             elif choice < to_lens_chance + to_view_chance:
                                 axis = inward
                                 t = sample_henyey_greenstein(u01_fine(s.block[1]), guiding.return_anisotropy)
-                            if on_surface and choice >= to_lens_chance + to_view_chance:
-                                if wp.static(specular):
+                            s.u = rotate_direction(axis, t, u01(s.block[2]))
+                            if wp.static(specular):
+                                if on_surface and choice >= to_lens_chance + to_view_chance:
                                     s.u = reflected
-                                else:
-                                    s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
-                            else:
-                                s.u = rotate_direction(axis, t, u01(s.block[2]))
                             density = phase_pdf(one_minus_cosine(snapped, s.u), here)
                             if on_surface:
                                 density = wp.max(wp.dot(s.u, s.normal), 0.0) * 0.3183098861837907
@@ -595,75 +619,103 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 mixture += to_view_chance * henyey_greenstein_pdf(
                                     one_minus_cosine(inward, s.u), guiding.return_anisotropy
                                 )
+                            before = to_ledger(s.weight)
+                            s.absorbed_water += s.ledger_weight - before
                             s.weight *= density / wp.max(mixture, 1.0e-30)
-                            after = to_ledger(s.weight)
-                            s.directed += s.ledger_weight - after
-                            s.ledger_weight = after
+                            s.ledger_weight = to_ledger(s.weight)
+                            s.directed += before - s.ledger_weight
                             if s.weight <= 0.0:
                                 s.reason = DIRECTED
                                 s.stage = _END
                         else:
+                            axis = snapped
+                            t = phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x))
                             if on_surface:
-                                if wp.static(specular):
+                                axis = s.normal
+                                t = sample_cosine_law(u01(s.block[1]))
+                            s.u = rotate_direction(axis, t, u01(s.block[2]))
+                            if wp.static(specular):
+                                if on_surface:
                                     s.u = reflected
-                                else:
-                                    s.u = sample_lambert(s.normal, u01(s.block[1]), u01(s.block[2]))
-                            else:
-                                s.u = rotate_direction(
-                                    snapped,
-                                    phase_sample(u01_fine(s.block[1]), water_at(medium, layers, s.x)),
-                                    u01(s.block[2]),
-                                )
 
                         if wp.static(specular):
                             if on_surface:
                                 # What one facet takes of another's light stays in the surface.
                                 leaving = unshadowed(incoming, s.u, s.normal, surfaces.roughness[s.face], lobe)
+                                before = to_ledger(s.weight)
+                                s.absorbed_water += s.ledger_weight - before
                                 s.weight *= leaving
                                 s.analog_weight *= leaving
-                                after = to_ledger(s.weight)
-                                s.absorbed_surface += s.ledger_weight - after
-                                s.ledger_weight = after
+                                s.ledger_weight = to_ledger(s.weight)
+                                s.absorbed_surface += before - s.ledger_weight
                                 if s.weight <= 0.0 and s.stage == _FLIGHT:
                                     s.reason = WEIGHT_CUTOFF
                                     s.stage = _END
 
-                waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)
+                # ---- The next photon for those that have ended
+                if count_lanes(s.stage >= _START) >= START_LANES:
+                    if s.stage == _END and s.ray == _NO_RAY:
+                        after = to_ledger(s.weight)
+                        s.absorbed_water += s.ledger_weight - after
+                        add_to_ledger(ledger, thread, s.reason, after)
+                        s.water_collisions += s.collisions - s.surface_count
+                        s.surface_events += s.surface_count
+                        if wp.static(records):
+                            out.position[s.photon] = s.x
+                            out.direction[s.photon] = s.u
+                            out.weight[s.photon] = s.weight
+                            out.path[s.photon] = s.path
+                            out.collisions[s.photon] = s.collisions
+                            out.reason[s.photon] = s.reason
+                        s.stage = _START
+                    wanting = s.stage == _START
+                    place = count_lanes_before(wanting)
+                    if wp.static(cuda):
+                        # All lanes emit a photon each, which those that have ended take one by one.
+                        if s.taken >= 32:
+                            s.first += thread_count
+                            s.taken = 0
+                            id = first_id + wp.uint64(s.first + lane)
+                            axis = laser.axis
+                            if wp.static(confocal):
+                                axis = scan.axis[int(id % wp.uint64(scan.count))]
+                            start, heading = emit(laser, axis, seed, id)
+                            exchange(True, lane, wp.spatial_vector(start, heading))
+                        place += s.taken
+                        s.taken += count_lanes(wanting)
+                    elif wanting:
+                        s.first += 1
+                    if wanting and place < 32:
+                        s.photon = s.first + place
+                        s.stage = _DONE
+                        if s.photon < photon_count:
+                            id = first_id + wp.uint64(s.photon)
+                            if wp.static(confocal):
+                                s.target = int(id % wp.uint64(scan.count))
+                                s.view = scan.view[s.target]
+                            if wp.static(cuda):
+                                fresh = exchange(False, place, wp.spatial_vector())
+                                s.x = wp.spatial_top(fresh)
+                                s.u = wp.spatial_bottom(fresh)
+                            else:
+                                axis = laser.axis
+                                if wp.static(confocal):
+                                    axis = scan.axis[s.target]
+                                start, heading = emit(laser, axis, seed, id)
+                                s.x = start
+                                s.u = heading
+                            s.weight = 1.0
+                            s.analog_weight = 1.0
+                            s.ledger_weight = to_ledger(1.0)
+                            s.path = 0.0
+                            s.collisions = 0
+                            s.surface_count = 0
+                            s.stage = _FLIGHT
 
-            # ---- The next photon for those that need one
-            if s.stage == _END:
-                add_to_ledger(ledger, thread, s.reason, s.ledger_weight)
-                add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.collisions - s.surface_count))
-                if wp.static(has_mesh):
-                    add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(s.surface_count))
-                if wp.static(records):
-                    out.position[s.photon] = s.x
-                    out.direction[s.photon] = s.u
-                    out.weight[s.photon] = s.weight
-                    out.path[s.photon] = s.path
-                    out.collisions[s.photon] = s.collisions
-                    out.reason[s.photon] = s.reason
-                s.photon += thread_count
-                s.stage = _START
-            if s.stage == _START:
-                s.stage = _DONE
-                if s.photon < photon_count:
-                    id = first_id + wp.uint64(s.photon)
-                    axis = laser.axis
-                    if wp.static(confocal):
-                        s.target = int(id % wp.uint64(scan.count))
-                        s.view = scan.view[s.target]
-                        axis = scan.axis[s.target]
-                    start, heading = emit(laser, axis, seed, id)
-                    s.x = start
-                    s.u = heading
-                    s.weight = 1.0
-                    s.analog_weight = 1.0
-                    s.ledger_weight = to_ledger(1.0)
-                    s.path = 0.0
-                    s.collisions = 0
-                    s.surface_count = 0
-                    s.stage = _FLIGHT
+                if wp.static(has_bvh):
+                    waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)
+                else:
+                    waiting = count_lanes(s.stage == _DONE)
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_bvh):
@@ -671,9 +723,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     origin = s.x
                     to = s.u
                     length = s.reach
-                    if wp.static(next_event or guided):
+                    if wp.static(scores):
                         if s.ray == _SHADOW_RAY:
-                            origin = s.x + s.along * s.u
+                            if wp.static(guided):
+                                origin = s.origin
                             to = s.lens - origin
                             length = wp.length(to)
                             to = to / length
@@ -695,6 +748,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         add_to_ledger(ledger, thread, ABSORBED_WATER, s.absorbed_water)
         add_to_ledger(ledger, thread, ABSORBED_SURFACE, s.absorbed_surface)
         add_to_ledger(ledger, thread, DIRECTED, s.directed)
+        add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.water_collisions))
+        add_to_ledger(ledger, thread, SURFACE_EVENTS, wp.int64(s.surface_events))
         add_to_ledger(ledger, thread, SURFACE_QUERIES, wp.int64(s.surface_queries))
         add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(s.shadow_queries))
         add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(s.contributions))

@@ -1,6 +1,9 @@
-"""The lanes of a CUDA warp; on the CPU a warp has one lane."""
+"""The lanes of a CUDA warp, and what they hand to each other; on the CPU a warp has one lane."""
 
 import warp as wp
+
+# Threads of a block of the transport kernel on CUDA.
+BLOCK_SIZE = 128
 
 
 @wp.func_native("""
@@ -13,4 +16,38 @@ import warp as wp
 def count_lanes(condition: bool) -> int:
     """Number of lanes, out of 32, in which the condition holds; every lane of the warp must take part, and all meet
     here."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(__ballot_sync(0xffffffffu, condition) & ((1u << (threadIdx.x & 31u)) - 1u));
+#else
+    return 0;
+#endif
+""")
+def count_lanes_before(condition: bool) -> int:
+    """Number of lanes of the warp before this one in which the condition holds; every lane must take part."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ float stock[6 * {BLOCK_SIZE}];
+    float* mine = stock + 6u * (threadIdx.x & ~31u);
+    if (put) {{
+        __syncwarp();
+        for (int i = 0; i < 6; ++i) mine[32 * i + entry] = value[i];
+        __syncwarp();
+        return value;
+    }}
+    wp::spatial_vector taken;
+    for (int i = 0; i < 6; ++i) taken[i] = mine[32 * i + entry];
+    return taken;
+#else
+    return value;
+#endif
+""")
+def exchange(put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
+    """The warp's shelf of 32 vectors: every lane puts one, and later any lane takes any; CUDA alone."""
     ...
