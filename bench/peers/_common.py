@@ -8,11 +8,14 @@ from collections.abc import Callable
 from types import ModuleType
 
 
-def options(about: str, *, photons: int) -> argparse.Namespace:
+def options(about: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None) -> argparse.Namespace:
+    """What every script takes, and integers of its own: name -> (default, help)."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--device", help='ours: "cpu", "cuda:0", ...; by default the first GPU, else the CPU')
     parser.add_argument("--photons", type=lambda text: int(float(text)), default=photons, help="of one run, each")
     parser.add_argument("--repeats", type=int, default=3, help="runs, the fastest of which counts")
+    for name, (default, text) in (more or {}).items():
+        parser.add_argument(f"--{name}", type=int, default=default, help=text)
     return parser.parse_args()
 
 
