@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .profiles import profile_axes, profile_extent
+
 if TYPE_CHECKING:
     from .config import Camera, Laser
 
@@ -20,16 +22,23 @@ _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of 
 
 
 def view_planes(camera: Camera) -> Points:
-    """The camera's pyramid, its tip at the lens centre."""
-    tx, ty = camera.pixel_tangent * camera.width / 2.0, camera.pixel_tangent * camera.height / 2.0
-    return np.array([[1, 0, tx, 0], [-1, 0, tx, 0], [0, 1, ty, 0], [0, -1, ty, 0], [0, 0, 1, 0]], dtype=np.float64)
+    """A pyramid that holds what the image shows, its tip at the lens centre."""
+    left, top, right, bottom = camera.view_box
+    sides = [[1, 0, -left, 0], [-1, 0, right, 0], [0, 1, -top, 0], [0, -1, bottom, 0], [0, 0, 1, 0]]
+    return np.array(sides, dtype=np.float64)
 
 
 def beam_planes(laser: Laser) -> Points:
-    """24 planes around the beam, a pyramid or a prism that just holds it; none if it is wider than a half-space."""
+    """24 planes around the beam, a pyramid or a prism that just holds it, 5 around a measured one; none if it is wider
+    than a half-space."""
     axis, origin = np.array(laser.axis), np.array(laser.position)
     if laser.profile != "collimated" and laser.half_angle_deg >= 90.0:
         return np.zeros((0, 4))
+    if laser.profile == "measured":
+        wide, tall = profile_extent(laser)
+        right, down = profile_axes(laser.axis)
+        normals = np.array([wide * axis - right, wide * axis + right, tall * axis - down, tall * axis + down, axis])
+        return np.column_stack([normals, -normals @ origin])
     helper = np.eye(3)[np.argmin(np.abs(axis))]
     b1 = np.cross(axis, helper) / np.linalg.norm(np.cross(axis, helper))
     phi = np.arange(24) * (2.0 * math.pi / 24)

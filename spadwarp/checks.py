@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from ._frustum import beam_planes, points_inside, view_planes
 from .catalog import WATER_INDICES
 from .config import SPEED_OF_LIGHT, Laser, Layer, Medium, Scene
+from .imaging import image_points
+from .pose import to_world
+from .profiles import profile_extent
 from .water import group_index, molecular_density, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
@@ -49,7 +52,7 @@ def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
     `mesh` is the scene's mesh if the caller has it; else it is built. Occlusion is not looked at. Raises `MeshError`.
     """
     shape = _Shape(scene, mesh)
-    messages = [*_targets(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
+    messages = [*_targets(shape), *_scan(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
     return sorted(messages, key=lambda message: message.level != "warning")
 
 
@@ -97,7 +100,8 @@ class _Shape:
         self.reflectance = np.zeros(0) if mesh is None else mesh.reflectance
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         self.view = view_planes(scene.camera)
-        self.beam = beam_planes(scene.laser)
+        # A scan brings its beam to all that is in view.
+        self.beam = beam_planes(scene.beam) if scene.scan_positions == 1 else np.zeros((0, 4))
         self.lit = points_inside(self.triangles, np.concatenate([self.view, self.beam]))
         paths = np.linalg.norm(self.lit - np.array(scene.beam.position), axis=1) + np.linalg.norm(self.lit, axis=1)
         ranges = np.linalg.norm(self.lit, axis=1)
@@ -134,6 +138,9 @@ class _Shape:
             area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
         elif laser.profile == "gaussian":
             area = 0.5 * math.pi * (math.tan(laser.half_angle) * distance) ** 2
+        elif laser.profile == "measured":
+            wide, tall = profile_extent(laser)
+            area = 4.0 * wide * tall * distance**2  # if it were even
         else:
             area = math.pi * laser.beam_radius**2
         return min(1.0, footprint / area) if area > 0.0 else 1.0
@@ -144,7 +151,7 @@ class _Shape:
             return None
         distance = self.target_range[0]
         arriving = math.exp(-self.optical_depth)
-        return self.scene.transport.photons * arriving * self._pixel_share(distance)
+        return self.scene.transport.photons / self.scene.scan_positions * arriving * self._pixel_share(distance)
 
     @property
     def signal_per_pulse(self) -> float | None:
@@ -172,8 +179,8 @@ def _targets(shape: _Shape) -> Iterator[CheckMessage]:
                 " signal named here take the target as Lambertian"
             )
             yield CheckMessage("note", f"targets[{index}].specular", text, {"specular": target.specular})
-    (low, high), laser = scene.domain.bounds, scene.beam.position
-    for place, point in (("the lens", (0.0, 0.0, 0.0)), ("the laser", laser)):
+    (low, high), laser = scene.domain.bounds, to_world(scene.camera, scene.beam.position)
+    for place, point in (("the lens", scene.camera.position), ("the laser", laser)):
         if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):
             yield CheckMessage(
                 "warning",
@@ -188,11 +195,13 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
     corners = triangles.reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     where = f"spans x {_span(low[0], high[0])}, y {_span(low[1], high[1])}, z {_span(low[2], high[2])} m"
+    if _is_posed(scene):
+        where += " in the camera frame"
     seen = points_inside(triangles, shape.view)
     if not len(seen):
-        half = scene.camera.pixel_tangent / 2.0
         depth = max(float(high[2]), 0.0)
-        wide, tall = half * scene.camera.width * depth, half * scene.camera.height * depth
+        left, top, right, bottom = (depth * tangent for tangent in scene.camera.view_box)
+        wide, tall = max(-left, right), max(-top, bottom)
         text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
         yield CheckMessage("warning", name, text, {"half_width": wide, "half_height": tall, "depth": depth})
         return
@@ -203,7 +212,7 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         return
     lit = points_inside(triangles, np.concatenate([shape.view, shape.beam]))
     if not len(lit):
-        angles = _angles(seen, scene.laser)
+        angles = _angles(seen, scene.beam)
         text = (
             f"the beam misses what the camera sees of it: {where}, that is {math.degrees(angles.min()):.3g} to "
             f"{math.degrees(angles.max()):.3g}° off the axis, {_beam_text(scene.laser)}"
@@ -231,9 +240,54 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         text = f"lateral_limit = {scene.transport.lateral_limit:.4g} m cuts {name}, which is seen out to {side:.4g} m"
         yield CheckMessage("warning", "transport.lateral_limit", text, {"side": side})
     bounds = np.array(scene.domain.bounds)
+    if _is_posed(scene):
+        there = to_world(scene.camera, corners)
+        low, high = there.min(axis=0), there.max(axis=0)
+        where = f"spans {_vector(low)} to {_vector(high)} m"
     if (low < bounds[0]).any() or (high > bounds[1]).any():
         text = f"{where}; the water reaches from {_vector(bounds[0])} to {_vector(bounds[1])} m: nothing outside is hit"
         yield CheckMessage("warning", name, text)
+
+    extent = np.ptp(image_points(scene.camera, seen[:, :2] / seen[:, 2:]), axis=0)
+    if extent.max() < 1.0:
+        text = (
+            f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and what is "
+            "beside it shares its pixel"
+        )
+        yield CheckMessage("warning", name, text, {"columns": float(extent[0]), "rows": float(extent[1])})
+
+
+def _scan(shape: _Shape) -> Iterator[CheckMessage]:
+    """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
+    scene = shape.scene
+    if scene.scan_positions == 1:
+        return
+    detector, laser = scene.detector, scene.beam
+    if scene.laser.direction != type(scene.laser)().direction:
+        text = f"direction = {list(scene.laser.direction)} is not looked at: a scan aims the laser"
+        yield CheckMessage("note", "laser.direction", text)
+    for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
+        if value := getattr(detector, name):
+            text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
+            yield CheckMessage("note", f"detector.{name}", text, {name: value})
+    if shape.target_range is None or shape.target_range[0] == 0.0:
+        return
+    distance = shape.target_range[0]
+    axis = np.array([0.0, 0.0, 1.0])
+    aside = float(np.linalg.norm(np.cross(np.array(laser.position), axis))) * abs(1.0 - distance / scene.scan.distance)
+    spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * distance
+    pixel = scene.camera.pixel_tangent * distance
+    if aside > spot + pixel:
+        text = (
+            f"at {distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, the spot's "
+            f"radius is {spot:.3g} m): scan.distance makes them cross"
+        )
+        values = {"aside": aside, "spot": spot, "pixel": pixel}
+        yield CheckMessage("warning", "scan.distance", text, values)
+
+
+def _is_posed(scene: Scene) -> bool:
+    return any((*scene.camera.position, *scene.camera.rotation_deg))
 
 
 def _timing(shape: _Shape) -> Iterator[CheckMessage]:
@@ -420,6 +474,9 @@ def _angles(points: Points, laser: Laser) -> Points:
 def _beam_text(laser: Laser) -> str:
     if laser.profile == "collimated":
         return f"the beam is parallel with a radius of {laser.beam_radius:.3g} m"
+    if laser.profile == "measured":
+        wide, tall = (math.degrees(math.atan(tangent)) for tangent in profile_extent(laser))
+        return f"the beam's image spans ±{wide:.3g}° and ±{tall:.3g}°"
     return f"the beam's half angle is {laser.half_angle_deg:.3g}°"
 
 

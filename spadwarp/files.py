@@ -44,12 +44,14 @@ _TRUTH = ("depth", "range", "normal", "reflectance")
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
-    "tallies: [component, height, width, bin]. "
+    "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
     "squares, if there: low and high 64 bits of the sum over photons / batch_size batches of the squared tally. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
-    "Camera frame: +x right, +y down, +z forward."
+    "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
+    "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
+    "in the camera frame."
 )
 
 
@@ -120,6 +122,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         if result.squares is not None:
             file.create_dataset("squares", data=result.squares, chunks=(1, rows, columns, bins), **packed)
         file.create_dataset("bin_edges", data=result.bin_edges)
+        if result.scene.scan_positions > 1:
+            file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)
         file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
         file.create_dataset("requested", data=np.array(result.requested, dtype=np.uint64))
         file.create_dataset("config", data=result.scene.to_toml())
@@ -188,6 +192,7 @@ def _requested(file: Any) -> tuple[int, int]:
 
 def _attributes(result: Result) -> dict[str, Any]:
     """What a reader without spadwarp needs, in SI units."""
+    from spadwarp.imaging import camera_attributes
     from spadwarp.result import COMPONENTS
 
     scene = result.scene
@@ -211,14 +216,16 @@ def _attributes(result: Result) -> dict[str, Any]:
         **medium.phase_parameters,
         "group_index": medium.group_index,
         "phase_index": medium.phase_index,
-        "laser_position": laser.position,
-        "laser_axis": laser.axis,
+        "laser_position": scene.beam.position,
+        "laser_axis": scene.beam.axis,
         "laser_wavelength": laser.wavelength_nm * 1e-9,
         "laser_pulse_energy": laser.pulse_energy,
         "laser_repetition_rate": laser.repetition_rate,
         "laser_photons_per_pulse": laser.photons_per_pulse,
         "laser_pulse_fwhm": laser.pulse_fwhm_ps * 1e-12,
         "camera_pixel_tangent": camera.pixel_tangent,
+        **camera_attributes(camera),
+        "scan": scene.scan.mode,
         "camera_aperture_area": camera.aperture_area,
         "detector_pde": detector.pde,
         "detector_jitter_fwhm": detector.jitter_fwhm_ps * 1e-12,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.depth import METHODS, Method
 from spadwarp.detector import Detection, detect
 from spadwarp.files import hdf5_file
+from spadwarp.imaging import camera_attributes
 from spadwarp.result import Result, pixel_directions, range_from_path
 
 if TYPE_CHECKING:
@@ -215,6 +216,7 @@ def _begin(file: Any, result: Result, some: Detection, frames: int, methods: Seq
             "group_index": scene.medium.group_index,
             "laser_position": scene.beam.position,
             "pixel_tangent": scene.camera.pixel_tangent,
+            **camera_attributes(scene.camera),
             "irf_sigma": some.irf.sigma,
             "irf_tail": some.irf.tail,
             "notes": list(some.notes),

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .pose import rotation_matrix
+
 if TYPE_CHECKING:
     from .config import Camera
 
-__all__ = ["image_points", "image_tangents", "is_invertible", "pixel_views", "view_box"]
+__all__ = ["camera_attributes", "image_points", "image_tangents", "is_invertible", "pixel_views", "view_box"]
 
 Points = NDArray[np.float64]
 
@@ -83,6 +85,20 @@ def pixel_views(camera: Camera) -> Points:
     four = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]])
     margin = _MARGIN / np.array(camera.focal_pixels)
     return np.concatenate([four.min(axis=0) - margin, four.max(axis=0) + margin], axis=-1)
+
+
+def camera_attributes(camera: Camera) -> dict[str, NDArray[np.float64] | float]:
+    """What a file says of a camera, for readers without spadwarp: OpenCV's `camera_matrix` `[3, 3]` [pixels], 0 being
+    the first pixel's centre, and `camera_distortion` (k1, k2, p1, p2, k3); `camera_position` [m] and `camera_rotation`
+    `[3, 3]`, the camera's axes in the world as columns; `camera_focus_distance` [m], NaN for a pinhole."""
+    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
+    return {
+        "camera_matrix": np.array([[fx, 0.0, column - 0.5], [0.0, fy, row - 0.5], [0.0, 0.0, 1.0]]),
+        "camera_distortion": np.array(camera.distortion),
+        "camera_position": np.array(camera.position),
+        "camera_rotation": rotation_matrix(camera.rotation_deg),
+        "camera_focus_distance": np.nan if camera.focus_distance is None else camera.focus_distance,
+    }
 
 
 def _grid(columns: Points, rows: Points) -> Points:

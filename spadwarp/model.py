@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spadwarp.brightness import tally_scale
 from spadwarp.config import SPEED_OF_LIGHT, Scene
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.hardware import physical_memory, pick_device
 from spadwarp.imaging import pixel_views, view_box
 from spadwarp.phase_functions import phase_function
 from spadwarp.pose import rotation_matrix, to_world
-from spadwarp.profiles import load_profile
+from spadwarp.profiles import load_profile, profile_extent
 from spadwarp.result import COMPONENTS, Truth, pixel_directions, scan_axes
 
 if TYPE_CHECKING:
@@ -23,52 +24,10 @@ if TYPE_CHECKING:
     from spadwarp.targets import TriangleMesh
     from spadwarp_kernels import Model
 
-# Photons that a tally can hold: the unit is chosen so that the brightest bin stays below 2^62 after this many.
-PHOTON_CAPACITY = 2**40
-
 # The paper's albedo is uniform in (0, 0.97).
 PAPER_ALBEDO = 0.97
 
 _UNLIMITED = 1.0e30
-
-
-def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
-    """Tally units per emitted photon, a power of two: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62.
-
-    The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered
-    evenly
-    in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that the
-    beam
-    spans; times 16 for what scatters more than once.
-    """
-    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
-    speed = SPEED_OF_LIGHT / medium.group_index
-    pixels = camera.width * camera.height
-    half_field = 0.5 * camera.width * camera.pixel_tangent
-    if laser.profile == "collimated":
-        spread, lit = 0.0, 1.0
-    else:
-        spread = math.tan(min(laser.half_angle, 1.5))
-        lit = min(max(math.pi * (spread / camera.pixel_tangent) ** 2, 1.0), pixels)
-    baseline = math.hypot(laser.position[0], laser.position[1])
-    nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
-    scattering = max(water.scattering for water in medium.waters)
-    extinction = min(water.extinction for water in medium.waters)
-    water = scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
-    surface = 0.0
-    if mesh is not None:
-        lower, upper = mesh.bounds.astype(float)
-        gap = float(np.linalg.norm(np.maximum(np.maximum(lower, -upper), 0.0)))
-        surface = 1.0 / (math.pi * max(gap, nearest) ** 2)
-        if mesh.specular is not None and mesh.roughness is not None:
-            # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
-            surface *= max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
-    path = 2.0 * nearest
-    brightest = 16.0 * camera.aperture_area * max(water, surface) * math.exp(-extinction * path) / lit
-    brightest = min(max(brightest, 1e-30), 1.0)
-    exponent = math.floor(62 - math.log2(PHOTON_CAPACITY) - math.log2(brightest))
-    # Beyond 2^52 an analog photon of weight 1 would not fit into one contribution.
-    return 2.0 ** min(exponent, 52)
 
 
 def build_model(
@@ -272,12 +231,10 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     laser.position = wp.vec3(*beam.position)
     laser.axis = wp.vec3(*beam.axis)
     if beam.profile == "measured":
-        image = load_profile(beam)
-        rows, columns = sk.profile_tables(image)
+        rows, columns = sk.profile_tables(load_profile(beam))
         laser.rows = wp.array(rows, dtype=float, device=device)
         laser.columns = wp.array(columns, dtype=float, device=device)
-        tangent = math.tan(beam.half_angle)
-        laser.extent = wp.vec2(tangent, tangent * image.shape[0] / image.shape[1])
+        laser.extent = wp.vec2(*profile_extent(beam))
         return laser
     laser.profile = sk.LASER_PROFILES.index(beam.profile)
     if beam.profile == "gaussian":

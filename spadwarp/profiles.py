@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import FileError, SpadwarpError
 
 if TYPE_CHECKING:
     from .config import Laser
 
-__all__ = ["load_profile"]
+__all__ = ["load_profile", "profile_axes", "profile_extent"]
 
 
 def load_profile(laser: Laser) -> NDArray[np.float64]:
@@ -44,6 +45,24 @@ def load_profile(laser: Laser) -> NDArray[np.float64]:
     if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() > 0.0):
         raise FileError(f"{where}: holds {values.min()} to {values.max()}; finite values >= 0 with light are needed")
     return values
+
+
+def profile_extent(laser: Laser) -> tuple[float, float]:
+    """Tangents of half the width and half the height of a measured beam; its image has square pixels."""
+    height, width = load_profile(laser).shape
+    wide = math.tan(laser.half_angle)
+    return wide, wide * height / width
+
+
+def profile_axes(axis: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Directions of a measured beam's columns (to the right) and rows (down) for the unit vector of its axis.
+
+    Those of the camera for a beam along z; "right" has no y component.
+    """
+    x, _, z = forward = np.asarray(axis, np.float64)
+    level = math.hypot(x, z)
+    right = np.array([z, 0.0, -x]) / level if level > 1e-6 else np.array([1.0, 0.0, 0.0])
+    return right, np.cross(forward, right)
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:

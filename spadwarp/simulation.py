@@ -203,7 +203,7 @@ class _Run:
     checkpoint: _Checkpoint
 
     def __call__(self, stopped: Any, relative_error: float | None) -> Result:
-        from spadwarp.model import tally_scale
+        from spadwarp.brightness import tally_scale
 
         self.unit = 1.0 / tally_scale(self.plan.scene, self.plan.mesh)
         if self.resumed is not None and self.resumed.unit != self.unit:
