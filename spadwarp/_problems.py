@@ -44,7 +44,7 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     for problem in error.errors(include_url=False):
         key, info = _locate(model, problem["loc"])
         lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
-    return list(lines.values())
+    return list(dict.fromkeys(lines.values()))  # a list that is too short misses each item
 
 
 def _locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, FieldInfo | None]:

@@ -121,6 +121,12 @@ def _at_5m(targets: Sequence[Mapping[str, Any]] = (), estimator: str = "next_eve
     }
 
 
+def _confocal() -> dict[str, Any]:
+    """A coaxial beam of 0.1° that visits the 64 x 64 pixels of the staircase in turn."""
+    scene = _at_5m([_STAIRCASE], "guided")
+    return {**scene, "laser": {"half_angle_deg": 0.1}, "scan": {"mode": "confocal"}}
+
+
 def _plane() -> dict[str, Any]:
     """A grey wall at 5 m in index 1, 16 bins of 0.8 m of path from 2 m on."""
     metre = 1.0 / SPEED_OF_LIGHT
@@ -181,6 +187,7 @@ def _cases() -> dict[str, Case]:
         Case("plane_5m", "a wall at 5 m, guided, 32 x 32 x 16 bins", scene=_plane()),
         Case("staircase_5m", "the staircase at 5 m, next_event, 64 x 64 x 1024 bins", scene=_at_5m([_STAIRCASE])),
         Case("staircase_5m_guided", "the same, guided", scene=_at_5m([_STAIRCASE], "guided")),
+        Case("confocal", "the staircase, guided, 64 x 64 positions scanned by beam and pixel", scene=_confocal()),
         Case("staircase_5m_dense", "the same, next_event, more than 100 000 faces", scene=_at_5m([_dense(5)])),
         Case("spheres", "twelve spheres, a million faces in all, next_event", scene=_at_5m(_spheres())),
         Case(
@@ -362,7 +369,7 @@ def _error(scene: Scene, device: wp.Device, photons: int, photons_per_second: fl
     """Relative error after a second at that rate; from a run of its own, since batches take time."""
     from spadwarp.simulation import simulate
 
-    result = simulate(scene, photons=max(photons, 2), device=device.alias, uncertainty=True)
+    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
     return result.relative_error * math.sqrt(result.photons / photons_per_second)
 
 

@@ -352,11 +352,29 @@ section_values = {
     ),
     "laser": st.fixed_dictionaries(
         {"position": vector},
-        optional={"preset": st.sampled_from(sorted(presets("laser"))), "pulse_energy": st.floats(1e-12, 1)},
+        optional={
+            "preset": st.sampled_from(sorted(presets("laser"))),
+            "pulse_energy": st.floats(1e-12, 1),
+            "frame": st.sampled_from(["camera", "world"]),
+        },
     ),
     "camera": st.one_of(
         st.just(MINIMAL["camera"]),
         st.fixed_dictionaries({"preset": st.just("paper")}, optional={"pixel_pitch_um": st.floats(1, 100)}),
+        st.fixed_dictionaries(
+            {"width": st.just(8), "height": st.just(6), "fx": st.floats(10, 50), "aperture_diameter": st.just(0.01)},
+            optional={
+                "fy": st.floats(10, 50),
+                "cx": st.floats(-3, 9),
+                "distortion": st.lists(st.floats(-0.01, 0.01), min_size=4, max_size=5),
+                "focus_distance": st.sampled_from([0.5, math.inf]),
+                "position": vector,
+                "rotation_deg": vector,
+            },
+        ),
+    ),
+    "scan": st.fixed_dictionaries(
+        {}, optional={"mode": st.sampled_from(["none", "confocal"]), "distance": st.sampled_from([3.0, math.inf])}
     ),
     "detector": st.fixed_dictionaries({}, optional={"fold": st.booleans(), "irf": st.just('/a "b"\\c\x07\n.csv')}),
     "gate": st.fixed_dictionaries(
@@ -494,3 +512,30 @@ def test_every_field_is_documented():
     for section in (scene().medium, scene().laser, scene().camera, scene().detector, scene().gate, scene().domain):
         for name, info in type(section).model_fields.items():
             assert info.description, f"{section.section}.{name}"
+
+
+def test_ways_to_give_a_camera_exclude_each_other(tmp_path):
+    assert problems({"camera": {**MINIMAL["camera"], "fx": 20.0}}) == (
+        "camera needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length; "
+        "given: horizontal_fov_deg, fx",
+    )
+    assert problems({"camera": {**MINIMAL["camera"], "cx": 2.0}}) == ("camera.cx = 2.0 goes with fx only",)
+    assert problems({"camera": {**MINIMAL["camera"], "distortion": [0.1, 0.2]}}) == (
+        "camera.distortion = [0.1, 0.2] has the wrong number of values",
+    )
+    (text,) = problems({"camera": {**MINIMAL["camera"], "horizontal_fov_deg": 120.0, "distortion": [-0.4, 0, 0, 0]}})
+    assert text.startswith("camera.distortion = [-0.4, 0.0, 0.0, 0.0, 0.0] folds the image")
+    lens = {"width": 8, "height": 6, "focal_length": 0.05, "pixel_pitch_um": 100.0, "f_number": 2.0}
+    assert problems({"camera": {**lens, "focus_distance": 0.04}}) == (
+        "camera.focus_distance = 0.04 is outside (0.05, inf], beyond the focal length",
+    )
+    # A later layer takes the place of an earlier one, whatever way it is given in.
+    path = tmp_path / "camera.json"
+    path.write_text('{"K": [[30, 0, 4], [0, 31, 3], [0, 0, 1]], "dist": [0.1, 0, 0, 0], "image_width": 8}')
+    one = scene().with_overrides({"camera.calibration": str(path)}).camera
+    assert (one.fx, one.fy, one.distortion[0], one.horizontal_fov_deg) == (30, 31, 0.1, None)
+    angle = scene(camera={"width": 8, "height": 6, "fx": 30.0, "aperture_diameter": 0.01})
+    assert angle.with_overrides({"camera.horizontal_fov_deg": 20.0}).camera.fx is None
+    assert problems(overrides={"camera.calibration": str(path), "camera.width": 9}) == (
+        "camera.width = 9 is not 8, the image's of the calibration",
+    )
