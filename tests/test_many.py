@@ -1,6 +1,5 @@
 """Runs on many devices, in parts and in spite of failures: all end with the bits of one run on one device."""
 
-import resource
 import signal
 import threading
 
@@ -11,6 +10,7 @@ import spadwarp
 import spadwarp_kernels
 from scenes import scene
 from spadwarp.photon_ids import Queue, count, joined, shard_of, without
+from statistics_of_samples import DEVICES
 
 PHOTONS = 300_000
 RUN = {"photons": PHOTONS, "seed": 5}
@@ -61,9 +61,15 @@ def test_shards_are_whole_units_and_together_the_run(parts, unit):
 # Several devices
 
 
+SEVERAL = ["cpu,cpu", "cpu,cpu,cpu", *(["cuda:0,cuda:0", "cuda:all"] if "cuda:0" in DEVICES else [])]
+
+
 @pytest.mark.parametrize("uncertainty", [False, True])
-@pytest.mark.parametrize("device", ["cpu,cpu", "cpu,cpu,cpu"])
+@pytest.mark.parametrize("device", SEVERAL)
 def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, whole):
+    one = whole[uncertainty]
+    if device.startswith("cuda"):
+        one = spadwarp.simulate(scene(), **RUN, device="cuda:0", uncertainty=uncertainty)
     seen = []
     cut = spadwarp.simulate(
         scene(),
@@ -74,8 +80,8 @@ def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, wh
         uncertainty=uncertainty,
         progress=lambda *report: seen.append(report),
     )
-    same(cut, whole[uncertainty])
-    assert cut.provenance["device"] == device
+    same(cut, one)
+    assert cut.provenance["device"] == device or device == "cuda:all"
     traced = [done for stage, done, _ in seen if stage == "trace"]
     assert traced == sorted(traced) and traced[-1] == cut.photons
 
@@ -190,6 +196,7 @@ def test_a_device_without_memory_is_named(monkeypatch):
 
 def test_a_full_disk_costs_no_photons(whole, tmp_path):
     """The checkpoint meets a limit on the size of files: the one before it stays, the run goes on to its end."""
+    resource = pytest.importorskip("resource")
     place = tmp_path / "checkpoint.h5"
     spadwarp.simulate(scene(), **{**RUN, "photons": 1000}, device="cpu").save(place)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
@@ -23,6 +25,9 @@ Note = Callable[[str], None]
 
 # A job that loses its worker this often is not run again: it is likely what kills them.
 LIVES = 4
+
+# Seconds after which a crew without any worker is worth a word.
+_PATIENCE = 30.0
 
 _MIB = 1 << 20
 
@@ -100,6 +105,7 @@ class Crew:
         self._pending: dict[Any, tuple[Literal["joined", "returned"], Member]] = {}
         self.members: list[Member] = []
         self._losses = 0  # since something was returned
+        self._patience = math.inf
 
     def __enter__(self) -> Crew:
         try:
@@ -117,6 +123,7 @@ class Crew:
             self._options, count = self._plan()
             for _ in range(count):
                 self._hire()
+            self._patience = time.monotonic() + _PATIENCE
         except BaseException:
             self.__exit__()
             raise
@@ -148,6 +155,10 @@ class Crew:
         share = next(k for k in range(int(max(cores)), 0, -1) if k == 1 or sum(n // k for n in cores) >= count)
         return {"num_cpus": int(share)}, count
 
+    def _resources(self) -> str:
+        there = self._ray.cluster_resources()
+        return ", ".join(f"{there.get(name, 0):g} {name}" for name in ("CPU", "GPU"))
+
     def _hire(self) -> None:
         ray = self._ray
         actor = (
@@ -176,6 +187,9 @@ class Crew:
 
     def wait(self, timeout: float) -> list[Event]:
         """What has happened, waiting for `timeout` seconds at most. Raises what a worker raised."""
+        if self._patience < time.monotonic() and all(member.about is None for member in self.members):
+            self._note(f"no worker has joined yet; the cluster has {self._resources()}")
+            self._patience = math.inf
         done, _ = self._ray.wait(list(self._pending), num_returns=1, timeout=timeout)
         return [self._event(reference) for reference in done]
 
