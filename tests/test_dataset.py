@@ -15,8 +15,10 @@ import h5py
 import numpy as np
 import pytest
 from scipy import stats
+from typer.testing import CliRunner
 
 import spadwarp
+from spadwarp.cli import app
 from spadwarp.config import SPEED_OF_LIGHT
 from spadwarp.dataset.plan import Plan
 from spadwarp.dataset.reading import FIELDS
@@ -361,6 +363,40 @@ def test_recipes_that_come_with_spadwarp(path):
         drawn = plan.scene(index)
         far = drawn.scene.gate.stop * SPEED_OF_LIGHT / drawn.scene.medium.group_index / 2.0
         assert codes[0] < 0.97 * (far - 2.0) and far < codes[1]
+
+
+def test_commands(tmp_path):
+    (tmp_path / "recipe.toml").write_text(recipe().to_toml())
+    out = str(tmp_path / "data")
+    runner = CliRunner()
+
+    def run(*words, code=0):
+        outcome = runner.invoke(app, ["dataset", *words])
+        assert outcome.exit_code == code, outcome.output
+        return outcome.output
+
+    make = ["make", str(tmp_path / "recipe.toml"), "--out", out, "--device", "cpu", "--set", "frames.per_scene=1"]
+    told = run(*make, "--shard", "1/2")
+    assert "3 shards with 3 frames" in told and "3 shards that others are to make" in told
+    assert "frames-00001.h5: missing" in run("verify", out, code=1)
+    assert "3 shards that were there" in run(*make, "--json", str(tmp_path / "told.json"))
+    assert json.loads((tmp_path / "told.json").read_text())["frames"] == 3
+    assert "whole" in run("verify", out)
+    told = run("info", out)
+    assert "staircase" in told and "36 x 24 pixels" in told
+    run("preview", out, "--frames", "4", "--out", str(tmp_path / "sheet.png"))
+    assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
+    for wrong in (["--shard", "3/2"], ["--shard", "x"], ["--engine", "cloud"]):
+        run(*make, *wrong, code=2)
+
+
+def test_hugging_face_reads_the_frames(folder, tmp_path):
+    datasets = pytest.importorskip("datasets")
+    files = {split: [str(folder / name) for name in (folder / f"{split}.txt").read_text().split()] for split in SPLITS}
+    read = datasets.load_dataset("hdf5", data_files=files, cache_dir=str(tmp_path))
+    with h5py.File(files["test"][0]) as file:
+        np.testing.assert_array_equal(np.array(read["test"][1]["depth"]), file["depth"][1])
+        assert len(read["test"]) == 2 * len(file["depth"])
 
 
 def test_plan_needs_no_order():
