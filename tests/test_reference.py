@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab
+from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab, stack
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, mean_path, snapped_mean_cosines
 from reference.single_scatter import Lidar, henyey_greenstein, lambertian_plane, single_scatter, single_scatter_total
 from reference.walk import Medium, cosine_law_on_box, isotropic, pencil, walk
@@ -25,6 +25,25 @@ def test_slabs_reproduce_published_totals(g, albedo, depth, reflected, transmitt
     for value, digits in ((solved.reflected, reflected), (solved.transmitted, transmitted)):
         # half a unit of the last digit given
         assert abs(value - float(digits)) <= 0.5000001 * 10.0 ** -len(digits.split(".")[1])
+
+
+@pytest.mark.parametrize(
+    ("g", "albedo", "depths", "reflected", "transmitted"),
+    [(0.75, 0.9, (0.5, 0.7, 0.8), 0.09739, 0.66096), (0.924, 0.8, (2.0, 1.0), 0.017351, 0.492535)],
+)
+def test_a_stack_of_equal_layers_is_the_slab(g, albedo, depths, reflected, transmitted):
+    solved = stack([(g, albedo, depth) for depth in depths])
+    assert solved == pytest.approx((reflected, transmitted), abs=5e-6)
+
+
+def test_a_stack_keeps_all_light_and_knows_its_order():
+    above, below = (0.8, 0.7, 0.6), (0.3, 1.0, 1.1)
+    black = stack([(0.8, 0.0, 0.6), (0.3, 0.0, 1.1)])
+    assert black == pytest.approx((0.0, math.exp(-1.7)), rel=1e-9)
+    # Without absorption nothing is lost, whatever the order.
+    for layers in ([(0.8, 1.0, 0.6), below], [below, (0.8, 1.0, 0.6)]):
+        assert sum(stack(layers)) == pytest.approx(1.0, abs=1e-9)
+    assert stack([above, below]) != pytest.approx(stack([below, above]), rel=1e-3)
 
 
 def test_slab_reproduces_the_published_reflection_function():

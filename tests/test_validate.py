@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reference import fournier_forand
-from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab
+from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab, stack
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
 from spadwarp.errors import ConfigError
@@ -61,6 +61,12 @@ def test_means_in_blocks_are_those_of_the_whole():
 def test_slab_references(row):
     solved = slab(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
     assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
+
+
+@pytest.mark.parametrize("row", references.STACKS, ids=lambda row: row.text)
+def test_stack_references(row):
+    solved = stack([(g, albedo, extinction * thickness) for g, albedo, extinction, thickness in row.layers])
+    assert (row.reflected, row.transmitted) == pytest.approx(solved, abs=6e-9)
 
 
 def test_exit_cosine_references():

@@ -26,10 +26,12 @@ __all__ = [
     "NEAR_AXIS",
     "SINGLE_SCATTER",
     "SLABS",
+    "STACKS",
     "TIME_RESOLVED",
     "Fluence",
     "Pulse",
     "Slab",
+    "Stack",
 ]
 
 
@@ -59,6 +61,26 @@ SLABS = (
     Slab(0.924, 0.97, 7.5, 0.10822358, 0.61149022),
     Slab(0.0, 0.8, math.inf, 0.28525450, 0.0),
     Slab(0.924, 0.95, math.inf, 0.10773397, 0.0),
+)
+
+
+class Stack(NamedTuple):
+    """Layers from the lit one on, each (anisotropy, albedo, extinction [1/m], thickness [m]); normal incidence."""
+
+    layers: tuple[tuple[float, float, float, float], ...]
+    reflected: float
+    transmitted: float
+
+    @property
+    def text(self) -> str:
+        return "τ " + ", ".join(f"{extinction * thickness:g}" for *_, extinction, thickness in self.layers)
+
+
+# Adding–doubling. The same layers from both sides.
+_LAYERS = ((0.924, 0.8, 1.0, 1.0), (0.5, 0.9, 3.0, 0.5), (0.0, 0.5, 0.5, 1.0))
+STACKS = (
+    Stack(_LAYERS, 0.11763994, 0.30108700),
+    Stack(_LAYERS[::-1], 0.14047414, 0.30510878),
 )
 
 # Diffuse light by the cosine of its direction to the face's normal: adding–doubling.

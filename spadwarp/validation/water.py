@@ -51,6 +51,22 @@ def _slabs(run: Run) -> list[Quantity]:
     return quantities
 
 
+def _stacks(run: Run) -> list[Quantity]:
+    quantities = []
+    for stack in known.STACKS:
+        waters: list[dict[str, float]] = []
+        depth = 0.0
+        for anisotropy, albedo, extinction, thickness in stack.layers:
+            waters.append({"start": depth, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy})
+            depth += thickness
+        first = {name: value for name, value in waters[0].items() if name != "start"}
+        tables = scene({**first, "layers": waters[1:]}, PENCIL, domain=slab_domain(depth), **_ROULETTE)
+        estimates = _measure(run, tables, lambda r: [_leaving(r, "exit_z_low"), _leaving(r, "exit_z_high")])
+        for name, estimate, reference in zip("RT", estimates, (stack.reflected, stack.transmitted), strict=True):
+            quantities.append(Quantity(f"{name}, layers of {stack.text}", estimate, reference))
+    return quantities
+
+
 def _exit_cosines(run: Run) -> list[Quantity]:
     quantities = []
     edges = known.EXIT_COSINE_EDGES
@@ -171,6 +187,7 @@ def _cube60(run: Run) -> list[Quantity]:
 
 CASES = (
     Case("slab", "Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows", _slabs),
+    Case("layers", "Three layers of different waters, lit from either side: adding–doubling", _stacks),
     Case("exit-cosines", "What leaves a slab, by exit cosine: adding–doubling", _exit_cosines),
     Case(
         "time-resolved",

@@ -1,9 +1,9 @@
-"""Radiative transfer in a plane-parallel, index-matched slab by doubling (van de Hulst 1980, chapter 4), in float64.
+"""Radiative transfer in plane-parallel, index-matched slabs by doubling and adding (van de Hulst 1980, chapter 4).
 
-Everything is averaged over azimuth, which is all that normal incidence asks for. Kernels R(μ, μ') are reflection
-functions: the radiance that leaves along μ is R(μ, μ')·μ'·F for a beam of irradiance πF normal to itself, so that a
-diffuse kernel acts on another by (A∘B)(μ, μ'') = 2∫A(μ, μ')·B(μ', μ'')·μ' dμ'. The undeviated beam is kept apart from
-the diffuse kernels, which lets the start be a layer so thin (τ·2⁻⁴⁰) that single scattering is exact for it.
+In float64. Everything is averaged over azimuth, which is all that normal incidence asks for. Kernels R(μ, μ') are
+reflection functions: the radiance that leaves along μ is R(μ, μ')·μ'·F for a beam of irradiance πF normal to itself, so
+that a diffuse kernel acts on another by (A∘B)(μ, μ'') = 2∫A(μ, μ')·B(μ', μ'')·μ' dμ'. The undeviated beam is kept apart
+from the diffuse kernels, which lets the start be a layer so thin (τ·2⁻⁴⁰) that single scattering is exact for it.
 
 Nodes of weight zero (the beam's cosine 1, and any cosine where the exit density is wanted) take part as rows and
 columns and carry no flux, so the result at them is as exact as the quadrature and needs no interpolation.
@@ -16,6 +16,7 @@ length of the time-resolved reflectance; `cumulative_reflectance` inverts it num
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,15 +45,9 @@ def slab(
     *, anisotropy: float, albedo: complex, optical_depth: complex, mu: ArrayLike = (), nodes: int | None = None
 ) -> Slab:
     """Solve a slab, or with optical_depth = math.inf the half-space; `nodes` per hemisphere (None: by g)."""
-    if nodes is None:
-        needed = 0 if abs(anisotropy) < 1e-3 else math.log(1e-12) / (2 * math.log(abs(anisotropy)))
-        nodes = max(48, math.ceil(needed))
-    x, gauss = np.polynomial.legendre.leggauss(nodes)
+    beam = nodes or _needed_nodes(anisotropy)
     asked = np.maximum(np.atleast_1d(np.asarray(mu, np.float64)), 1e-14)
-    cosines = np.concatenate([(x + 1) / 2, [1.0], asked])
-    flux = np.zeros(cosines.size)
-    flux[:nodes] = gauss * (x + 1) / 2  # 2 μ dμ, with dμ = gauss/2
-    beam = nodes
+    cosines, flux = _nodes(beam, asked)
 
     half_space = optical_depth == math.inf
     target = 64.0 if half_space else optical_depth
@@ -62,7 +57,8 @@ def slab(
     doublings = 0
     while doublings < _START or (half_space and np.abs(transmit).max() > 1e-14):
         # not by squaring: forty squarings of 1 - 1e-12 would leave an error of 1e-6 in the energy
-        reflect, transmit = _double(reflect, transmit, np.exp(-depth * 2.0**doublings / cosines), flux)
+        layer = (reflect, transmit, np.exp(-depth * 2.0**doublings / cosines))
+        reflect, transmit, _ = _add(layer, layer, flux)
         doublings += 1
     direct = 0.0 if half_space else np.exp(-optical_depth)
 
@@ -170,14 +166,53 @@ def _single_scattering(cosines: NDArray, same: NDArray, opposite: NDArray, albed
     return reflect, transmit
 
 
-def _double(reflect: NDArray, transmit: NDArray, direct: NDArray, flux: NDArray):
-    """Two equal layers on top of each other: down and up are the diffuse kernels at the interface between them."""
-    weighted = reflect * flux
-    twice = weighted @ reflect
+def _add(upper: tuple[NDArray, NDArray, NDArray], lower: tuple[NDArray, NDArray, NDArray], flux: NDArray):
+    """Reflection, transmission and direct beam of a uniform layer on top of another or of a stack, lit from above.
+
+    Each is (reflect, transmit, direct); down and up are the diffuse kernels at the interface between them.
+    """
+    reflect, transmit, direct = upper
+    below, passed, direct_below = lower
+    twice = (reflect * flux) @ below
     down = np.linalg.solve(np.eye(flux.size) - twice * flux, transmit + twice * direct)
-    up = reflect * direct + weighted @ down
-    passed = transmit * flux
+    up = below * direct + (below * flux) @ down
     return (
-        reflect + direct[:, None] * up + passed @ up,
-        transmit * direct + direct[:, None] * down + passed @ down,
+        reflect + direct[:, None] * up + (transmit * flux) @ up,
+        passed * direct + direct_below[:, None] * down + (passed * flux) @ down,
+        direct * direct_below,
     )
+
+
+def stack(layers: Sequence[tuple[float, float, float]], *, nodes: int | None = None) -> tuple[float, float]:
+    """Reflected and transmitted fractions of layers (anisotropy, albedo, optical depth) from the lit one on, normal
+    incidence."""
+    nodes = nodes or max(_needed_nodes(anisotropy) for anisotropy, *_ in layers)
+    cosines, flux = _nodes(nodes)
+    solved = []
+    for anisotropy, albedo, optical_depth in layers:
+        depth = optical_depth * 2.0**-_START
+        reflect, transmit = _single_scattering(cosines, *_redistribution(cosines, anisotropy), albedo, depth)
+        for doubling in range(_START):
+            direct = np.exp(-depth * 2.0**doubling / cosines)
+            reflect, transmit, _ = _add((reflect, transmit, direct), (reflect, transmit, direct), flux)
+        solved.append((reflect, transmit, np.exp(-optical_depth / cosines)))
+    whole = solved.pop()
+    while solved:
+        whole = _add(solved.pop(), whole, flux)
+    reflect, transmit, direct = whole
+    return float(flux @ reflect[:, nodes]), float(flux @ transmit[:, nodes] + direct[nodes])
+
+
+def _needed_nodes(anisotropy: float) -> int:
+    """Gauss nodes per hemisphere that resolve the phase function: g^{2N} < 1e-12."""
+    needed = 0 if abs(anisotropy) < 1e-3 else math.log(1e-12) / (2 * math.log(abs(anisotropy)))
+    return max(48, math.ceil(needed))
+
+
+def _nodes(count: int, asked: ArrayLike = ()) -> tuple[NDArray, NDArray]:
+    """Cosines: Gauss nodes, the beam's 1 at index `count`, those asked for; and their fluxes, 0 for the latter."""
+    x, gauss = np.polynomial.legendre.leggauss(count)
+    cosines = np.concatenate([(x + 1) / 2, [1.0], np.asarray(asked, np.float64)])
+    flux = np.zeros(cosines.size)
+    flux[:count] = gauss * (x + 1) / 2  # 2 μ dμ, with dμ = gauss/2
+    return cosines, flux
