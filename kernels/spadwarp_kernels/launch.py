@@ -246,11 +246,19 @@ def launch_transport(
         seed: 0 ... 2^64 - 1. A photon's history depends on (seed, id) alone.
         first_id: 64-bit.
         photon_count: 1 ... 2^26 in one launch.
+
+    Raises:
+        ValueError: A count out of range, or surfaces that the spec does not describe, see `surface_choices`.
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
     if spec.few_faces and model.surfaces.planes.size == 0:
         raise ValueError(f"spec.few_faces = True is for meshes of 1 to {FEW_FACES} faces")
+    for name, needed in surface_choices(model.surfaces).items():
+        if spec.mesh and getattr(spec, name) != needed:
+            raise ValueError(
+                f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
+            )
     threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
