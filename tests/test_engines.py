@@ -14,6 +14,7 @@ import engine_jobs
 import spadwarp
 from scenes import scene
 from spadwarp.engines import Ray, interruptible, run_jobs
+from test_dataset import checksums, recipe
 from test_many import PHOTONS, RUN, same, whole  # noqa: F401
 
 # One Ray for all tests of this file, also where they are dealt out to several processes.
@@ -164,3 +165,17 @@ def test_what_ray_cannot_do_is_said(cluster):
         spadwarp.simulate(scene(), **RUN, device="cuda", engine=Ray())
     with pytest.raises(spadwarp.ConfigError, match="workers = 0"):
         spadwarp.simulate(scene(), **RUN, engine=Ray(workers=0))
+
+
+def test_a_dataset_whose_workers_are_killed_has_the_files_of_a_local_one(cluster, tmp_path):
+    small, killer = recipe(**{"frames.per_scene": 1, "scenes_per_target": 3}), Killer(2, seed=3)
+    spadwarp.make_dataset(small, tmp_path / "here", device="cpu")
+    spadwarp.make_dataset(
+        small,
+        tmp_path / "ray",
+        engine=Ray(workers=2),
+        progress=lambda stage, done, total: killer("trace" if stage == "frames" else stage, done, total),
+    )
+    assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == 2
+    assert checksums(tmp_path / "ray") == checksums(tmp_path / "here")
+    assert not spadwarp.verify_dataset(tmp_path / "ray")
