@@ -231,6 +231,8 @@ def show_image(
         ticks = _log_ticks(low, high)
         colour_bar.set_ticks(list(ticks), labels=list(ticks.values()))
         colour_bar.minorticks_off()
+    else:
+        colour_bar.locator = MaxNLocator(nbins=4 if high >= 1e4 else 6)  # what is long needs room
 
 
 def _log_ticks(low: float, high: float) -> dict[float, str]:

@@ -106,6 +106,22 @@ def test_tutorial_runs(checkout):
                     run(line)
 
 
+def test_gallery_pictures_are_made_by_the_commands_below_them(checkout):
+    """Each picture has commands that name what there is; the tutorial runs their like."""
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"^!\[[^\]]+\]\([^)]+\)\n\n```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(pictures) == text.count("![")
+    for line in "".join(pictures).replace("\\\n", " ").splitlines():
+        program, *words = shlex.split(line)
+        if program == "python":
+            told = (ROOT / words[0]).read_text()
+        else:
+            command = words[:2] if words[0] == "dataset" else words[:1]
+            told = CliRunner().invoke(app, [*command, "--help"]).stdout
+        assert all(word in told for word in words if word.startswith("--")), line
+        assert all((ROOT / word).is_file() for word in words if word.startswith("configs/")), line
+
+
 def run(line):
     """A command, in this process."""
     for pattern, smaller in SMALLER.items():
