@@ -158,6 +158,7 @@ def presets(
     """Named waters, lasers and detectors with their sources.
 
     Cameras and gates too. A scene takes one by `preset = "NAME"` in the section of that name.
+    The waters are for about 532 nm; `spadwarp water` has other wavelengths.
 
     \b
     Example:
