@@ -174,7 +174,8 @@ def presets(
         if (preset.section, preset.source) != source:
             say(f"{'' if source is None else chr(10)}[{preset.section}] {preset.source}")
             source = (preset.section, preset.source)
-        values = ", ".join(f"{name} {_number(value)}" for name, value in preset.values.items())
+        shown = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in preset.values.items()}
+        values = ", ".join(f"{name} {value}" for name, value in shown.items())
         say(f"  {preset.name:<28}  {values}")
     write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]}, json_path)
 
