@@ -32,16 +32,17 @@ def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
     """Backscatter gating: keep depths where a frame has more of them than the water explains, `[N, H, W]` [m].
 
     The histogram of a frame's depths is compared with the backscatter's density, scaled to what arrives in the nearest
-    part of the gate that holds a tenth of it. From the first to the last bin with a significant excess is the target's
-    gate; what lies outside is replaced by the nearest pixel inside, and a small median follows.
+    part of the gate that holds a tenth of it. Where 99 % of the significant excess lies is the target's gate; what lies
+    outside is replaced by the nearest pixel inside, and a small median follows.
     """
     from scipy.ndimage import median_filter as filtered
 
     bins = 100
     out = np.empty_like(frames.depth)
     for index, (depth, scaled, density) in enumerate(zip(frames.depth, frames.scaled, frames.density, strict=True)):
-        there = np.isfinite(scaled)
-        place = np.clip(np.nan_to_num(scaled) * bins, 0, bins - 1).astype(np.int64)[there]
+        with np.errstate(invalid="ignore"):
+            there = (scaled >= 0) & (scaled < 1)
+        place = (scaled[there] * bins).astype(np.int64)
         counts = np.bincount(place, minlength=bins).astype(np.float64)
         # Mean density of the depths in each bin; empty bins take that of the last one before.
         level = np.bincount(place, density[there], minlength=bins) / np.maximum(counts, 1)
@@ -49,9 +50,12 @@ def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
         level = np.maximum(level[np.maximum.accumulate(filled)], 1e-3)
         near = max(3, int(np.searchsorted(np.cumsum(level), 0.1 * level.sum())))
         expected = level * (counts[:near].sum() / level[:near].sum())
-        excess = np.flatnonzero(counts > expected + 4.0 * np.sqrt(expected) + 4.0)
-        if excess.size:
-            outside = (scaled < (excess[0] - 1) / bins) | (scaled > (excess[-1] + 2) / bins)
+        excess = np.maximum(counts - expected - 4.0 * np.sqrt(expected) - 4.0, 0.0)
+        if excess.any():
+            within = np.cumsum(excess) / excess.sum()
+            first, last = np.searchsorted(within, (0.005, 0.995))
+            with np.errstate(invalid="ignore"):
+                outside = (scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)
             depth = np.where(outside, np.float32(np.nan), depth)
         out[index] = filtered(fill_missing(depth, 0.5 * sum(frames.gate)), window, mode="nearest")
     return out
