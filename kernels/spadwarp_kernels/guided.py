@@ -21,7 +21,7 @@ class Guiding:
     Attributes:
         probability: Chance that a water collision draws its direction from the lobe about the lens, in [0, 1).
         surface_probability: The same at a surface.
-        anisotropy: g of that Henyey-Greenstein lobe.
+        anisotropy: g of that Henyey-Greenstein lobe; phase functions with a guide have one of their own.
         return_probability: Chance that an event outside the view draws its direction from a lobe towards the optical
             axis, so that light that strayed comes back into the view more often, in [0, 1).
         return_anisotropy: g of that lobe.
