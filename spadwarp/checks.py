@@ -14,6 +14,7 @@ from ._frustum import beam_planes, points_inside, view_planes
 from .catalog import WATER_INDICES
 from .config import SPEED_OF_LIGHT, Laser, Layer, Medium, Scene
 from .imaging import image_points
+from .phase_functions import phase_function
 from .pose import to_world
 from .profiles import profile_extent
 from .water import group_index, molecular_density, pure_water_absorption, water_optics
@@ -49,7 +50,8 @@ class CheckMessage:
 def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
     """Everything worth knowing about a scene, warnings first.
 
-    `mesh` is the scene's mesh if the caller has it; else it is built. Occlusion is not looked at. Raises `MeshError`.
+    `mesh` is the scene's mesh if the caller has it; else it is built. Occlusion is not looked at. Raises `MeshError`;
+    `FileError` or `ConfigError` for the table of a phase function.
     """
     shape = _Shape(scene, mesh)
     messages = [*_targets(shape), *_scan(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
@@ -354,6 +356,7 @@ def _water(shape: _Shape) -> Iterator[CheckMessage]:
                 yield _preset_at_another_wavelength(name, water.preset, laser)
     if medium.layers:
         yield from _molecular_scattering(shape.scene)
+    yield from _continued_table(shape.scene)
     thickest = max(water.extinction for water in medium.waters)
     mean = thickest * shape.scene.path_limit  # collisions along the longest path that counts
     most = mean + 3.0 * math.sqrt(mean)
@@ -394,6 +397,20 @@ def _preset_at_another_wavelength(name: str, preset: str, laser: Laser) -> Check
         }
         text += f", where pure water absorbs {values['pure_water']:.3g} 1/m and not {values['pure_water_532']:.3g}"
     return CheckMessage("warning", f"{name}.preset", text, values)
+
+
+def _continued_table(scene: Scene) -> Iterator[CheckMessage]:
+    """A table that begins far from 0° leaves most of the light to its power law."""
+    if scene.medium.phase_function != "tabulated":
+        return
+    law = phase_function(scene.medium)
+    continued = law.fraction_below(law.first_angle) if law.first_angle > 0.0 else 0.0
+    if continued > 0.1:
+        text = (
+            f"begins at {math.degrees(law.first_angle):.3g}°: {100.0 * continued:.2g} % of the scattered light is "
+            "below that, where the law between the first two points is continued"
+        )
+        yield CheckMessage("note", "medium.phase_table", text, {"continued": continued})
 
 
 def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:

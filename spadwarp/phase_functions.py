@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -31,12 +32,14 @@ class PhaseFunction:
         parameters: The medium's fields that it takes.
         molecular_share: Part of the scattering that is the water's own and not of that name.
         over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
+        first_angle: Of a table [rad]; below it the table is continued.
     """
 
     name: str
     parameters: dict[str, float | str]
     molecular_share: float
     over_t: Callable[[Floats], Floats]
+    first_angle: float = 0.0
 
     def density(self, angle: ArrayLike) -> Floats:
         """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
@@ -58,6 +61,13 @@ class PhaseFunction:
 
         return sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
 
+    def fraction_below(self, angle: float) -> float:
+        """Part of the light that is scattered by less than an angle [rad] in (0, π]."""
+        from spadwarp_kernels import sphere_integral
+
+        share = math.sin(0.5 * angle) ** 2
+        return share * sphere_integral(lambda t: self.over_t(share * t))
+
 
 def phase_function(medium: Medium) -> PhaseFunction:
     """The phase function of a scene's medium, `phase_function(scene.medium)`.
@@ -67,6 +77,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
     import spadwarp_kernels as sk
 
     density: Callable[[Floats], Floats]
+    first_angle = 0.0
     name, parameters = medium.phase_function, medium.phase_parameters
     if name == "tabulated":
         table = str(medium.phase_table)
@@ -74,6 +85,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
         angles, values = read_phase_table(path)
         try:
             density = sk.interpolated_density(np.radians(angles), values)
+            first_angle = math.radians(float(angles[0]))
         except ValueError as error:
             raise ConfigError(f"medium.phase_table: {path}: {error}") from None
     else:
@@ -86,7 +98,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
         def density(t: Floats) -> Floats:
             return (1.0 - share) * of_particles(t) + share * molecular_density(t)
 
-    return PhaseFunction(name, parameters, share, density)
+    return PhaseFunction(name, parameters, share, density, first_angle)
 
 
 def read_phase_table(path: str | Path) -> tuple[Floats, Floats]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp
+from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from scenes import scene
 from spadwarp.catalog import PHASE_TABLES
@@ -50,6 +51,26 @@ def test_petzolds_average_particle_has_its_published_moments():
     # Below 0.1° the power law goes on: Mobley's exponent there is -1.346.
     ratio = law.density(math.radians(0.01)) / law.density(math.radians(0.1))
     assert math.log10(ratio) == pytest.approx(1.346, abs=0.01)
+
+
+def test_parts_below_an_angle():
+    ff = spadwarp.phase_function(Medium(**WATER, phase_function="fournier_forand"))
+    expected = fournier_forand.cumulative(2 * np.sin(np.radians([0.1, 60.0]) / 2) ** 2, 1.10, 3.5835)
+    assert [ff.fraction_below(math.radians(angle)) for angle in (0.1, 60.0)] == pytest.approx(expected, rel=1e-9)
+    assert ff.fraction_below(math.pi) == pytest.approx(1.0, rel=1e-9)
+    assert ff.fraction_below(math.pi / 2) + ff.backscatter_fraction == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_check_reads_the_table_and_says_what_it_leaves_out(tmp_path):
+    path = tmp_path / "vsf.csv"
+    one = scene(medium={"phase_function": "tabulated", "phase_table": str(path)})
+    with pytest.raises(FileError):
+        spadwarp.check(one)
+    path.write_text("5,4.3\n10,1.15\n90,0.0043\n180,0.0031\n")
+    (note,) = [message for message in spadwarp.check(one) if message.field == "medium.phase_table"]
+    assert note.text.startswith("begins at 5°: ") and note.values["continued"] > 0.5
+    petzold = one.with_overrides(medium={"phase_table": "petzold-average-particle"})
+    assert not [message for message in spadwarp.check(petzold) if message.field == "medium.phase_table"]
 
 
 @pytest.mark.parametrize("name", PHASE_TABLES)
