@@ -124,7 +124,8 @@ def _at_5m(targets: Sequence[Mapping[str, Any]] = (), estimator: str = "next_eve
 def _confocal() -> dict[str, Any]:
     """A coaxial beam of 0.1° that visits the 64 x 64 pixels of the staircase in turn."""
     scene = _at_5m([_STAIRCASE], "guided")
-    return {**scene, "laser": {"half_angle_deg": 0.1}, "scan": {"mode": "confocal"}}
+    transport = {**scene["transport"], "axis_threshold": 1.0}
+    return {**scene, "laser": {"half_angle_deg": 0.1}, "scan": {"mode": "confocal"}, "transport": transport}
 
 
 def _plane() -> dict[str, Any]:

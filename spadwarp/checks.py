@@ -54,7 +54,7 @@ def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
     `FileError` or `ConfigError` for the table of a phase function.
     """
     shape = _Shape(scene, mesh)
-    messages = [*_targets(shape), *_scan(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
+    messages = [*_targets(shape), *_focus(shape), *_scan(shape), *_timing(shape), *_water(shape), *_statistics(shape)]
     return sorted(messages, key=lambda message: message.level != "warning")
 
 
@@ -259,6 +259,24 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         yield CheckMessage("warning", name, text, {"columns": float(extent[0]), "rows": float(extent[1])})
 
 
+def _focus(shape: _Shape) -> Iterator[CheckMessage]:
+    """How far a thin lens is out of focus on what it sees."""
+    camera = shape.scene.camera
+    if camera.focus_distance is None or shape.target_range is None or shape.target_range[0] == 0.0:
+        return
+    blur = {
+        distance: 2.0 * camera.aperture_radius * abs(1.0 / distance - camera.inverse_focus) / camera.pixel_tangent
+        for distance in shape.target_range
+    }
+    worst = max(blur, key=blur.__getitem__)
+    if blur[worst] > 1.0:
+        text = (
+            f"a point at {worst:.4g} m is blurred over {blur[worst]:.3g} pixels; truth maps and the analytic simulator "
+            "are sharp"
+        )
+        yield CheckMessage("note", "camera.focus_distance", text, {"distance": worst, "pixels": blur[worst]})
+
+
 def _scan(shape: _Shape) -> Iterator[CheckMessage]:
     """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
     scene = shape.scene
@@ -268,6 +286,14 @@ def _scan(shape: _Shape) -> Iterator[CheckMessage]:
     if scene.laser.direction != type(scene.laser)().direction:
         text = f"direction = {list(scene.laser.direction)} is not looked at: a scan aims the laser"
         yield CheckMessage("note", "laser.direction", text)
+    snapped = math.degrees(math.acos(scene.transport.axis_threshold))
+    pixel_deg = math.degrees(math.atan(scene.camera.pixel_tangent))
+    if snapped > pixel_deg:
+        text = (
+            f"axis_threshold = {scene.transport.axis_threshold:g} scatters light within {snapped:.3g}° of the optical "
+            f"axis as if it went along it, and a pixel sees {pixel_deg:.3g}°: 1 is exact"
+        )
+        yield CheckMessage("warning", "transport.axis_threshold", text, {"degrees": snapped, "pixel_deg": pixel_deg})
     for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
         if value := getattr(detector, name):
             text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"

@@ -153,7 +153,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
 
     scene = result.scene
     per_pulse = scene.laser.photons_per_pulse * scene.detector.pde
-    scale = result.unit / result.photons * per_pulse
+    # In a scan the positions' numbers of photons differ by one at most.
+    scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
     photons = f"{result.photons:,}".replace(",", " ")
     return _Page(

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import spadwarp
+import spadwarp.checks
 from scenes import scene
 from spadwarp.brightness import PHOTON_CAPACITY, tally_scale
 from spadwarp.errors import ConfigError, FileError
@@ -167,6 +168,23 @@ def test_checks_tell_where_beam_and_pixel_of_a_scan_miss():
     assert "0.1 m beside what its pixel sees" in fields(one)["scan.distance"]
     assert {"laser.direction", "detector.hot_pixel_fraction"} <= fields(one, "note").keys()
     assert "scan.distance" not in fields(one.with_overrides({"scan.distance": 2.2}))
+    assert "transport.axis_threshold" not in fields(one)
+    paper = one.with_overrides({"transport.axis_threshold": 0.9998})
+    assert "within 1.15° of the optical axis" in fields(paper)["transport.axis_threshold"]
+
+
+def test_checks_tell_how_far_out_of_focus_a_target_is():
+    """2 a |1/z - 1/focus| as a tangent, over a pixel's: 0.4 m of lens, pixels of 4 x 4 over 50°."""
+    one = scene(
+        camera={"focus_distance": 1.1}, targets=[{"builtin": "sphere", "size": 1.0, "translation": [0, 0, 2.7]}]
+    )
+    pixel = 2 * math.tan(math.radians(25)) / 4
+    far = spadwarp.checks.summary(one)["target_range"][1]
+    (message,) = [message for message in spadwarp.check(one) if message.field == "camera.focus_distance"]
+    assert message.values["pixels"] == pytest.approx(0.4 * (1 / 1.1 - 1 / far) / pixel)
+    assert not any(
+        m.field == "camera.focus_distance" for m in spadwarp.check(one.with_overrides({"camera.focus_distance": 2.5}))
+    )
 
 
 def test_the_beam_of_a_laser_in_the_world():

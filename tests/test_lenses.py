@@ -196,3 +196,28 @@ def test_a_camera_outside_the_water_is_refused():
         spadwarp.simulate(outside, photons=10, device="cpu")
     with pytest.raises(ConfigError, match=r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"):
         spadwarp.simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_layers_of_water_stand_in_the_world(device):
+    """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
+    turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
+    layers = [{"start": 0.7, "extinction": 3.0, "albedo": 0.5}, {"start": 1.5, "extinction": 0.2, "albedo": 0.9}]
+    here = scene(medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]}, targets=[])
+    start = float(turn @ [0.6, 0.0, 0.8] @ shift)
+    there = scene(
+        medium={
+            "layers": [{**layer, "start": layer["start"] + start} for layer in layers],
+            "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist(),
+        },
+        camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn)},
+        targets=[],
+    )
+    assert there.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) == pytest.approx(
+        here.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0))
+    )
+    first, second = (spadwarp.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
+    apart = np.linalg.norm(second.position - (first.position @ turn.T + shift), axis=1)
+    # A rounding may tip one history over an edge of something; most end where they must to float32.
+    assert np.quantile(apart, 0.98) < 1e-3
+    assert (first.collisions == second.collisions).mean() > 0.98
