@@ -147,6 +147,10 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
+        if (path.parent / "recipe.toml").is_file():
+            raise FileError(
+                f"{folder}: not finished; `spadwarp dataset make` makes the shards that are missing"
+            ) from None
         raise FileError(f"{folder}: no dataset there (no manifest.json)") from None
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot be read: {error}") from error
