@@ -9,11 +9,13 @@ import tomllib
 from contextlib import suppress
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import spadwarp
+from scenes import scene as make_scene
 from spadwarp.cli import app
 
 ROOT = Path(__file__).parents[1]
@@ -194,3 +196,25 @@ def test_ballistic_light_of_the_figure_is_the_analytic_signal():
     assert abs(mean[ballistic] - 1.0) < 4.5 * error[ballistic] < 0.1
     # Light that scatters forward still comes back; it cannot be more than without any loss by scattering.
     assert 1.2 < mean[target] < np.exp(2.0 * figure.ALBEDO * 0.4)
+
+
+def test_formats_page_names_everything_in_the_files(tmp_path):
+    """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
+    from spadwarp.frame_files import record_frames
+    from spadwarp.records import save_records
+
+    scene = make_scene(transport={"photons": 2000, "seed": 1})
+    result = spadwarp.simulate(scene, device="cpu", uncertainty=True)
+    record_frames(result, tmp_path / "frames.h5", pulses=100, frames=1, seed=1, tags=True, device="cpu")
+    save_records(spadwarp.trace(scene, photons=10, device="cpu"), tmp_path / "records.h5", scene=scene)
+    paths = [result.save(tmp_path / "result.h5"), tmp_path / "frames.h5", tmp_path / "records.h5"]
+    paths.append(spadwarp.analytic(scene, frames=1, device="cpu").save(tmp_path / "analytic.h5"))
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    for path in paths:
+        with h5py.File(path) as file:
+            names = [*file.attrs]
+            file.visititems(
+                lambda name, one, names=names: names.append(name) if isinstance(one, h5py.Dataset) else None
+            )
+        missing = [name for name in names if f"`{name}`" not in text]
+        assert not missing, f"{path.name}: docs/formats.md does not name {missing}"
