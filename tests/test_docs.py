@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 import spadwarp
 from scenes import scene as make_scene
 from spadwarp.cli import app
+from spadwarp.config import Target
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -165,6 +166,27 @@ def test_scenes_in_the_text_are_valid(page, checkout):
             spadwarp.load_scene("configs/scenes/plane_5m.toml", {} if {"camera", "gate"} <= set(tables) else tables)
             if {"camera", "gate"} <= set(tables):
                 spadwarp.Scene.from_dict(tables)
+
+
+def test_reference_is_that_of_the_code():
+    made = load(ROOT / "docs" / "reference.py").pages()
+    old = [name for name, text in made.items() if (ROOT / "docs" / "reference" / name).read_text() != text]
+    assert not old, f"docs/reference: {', '.join(old)} differ from the code: run `python docs/reference.py`"
+    assert len(list((ROOT / "docs" / "reference").iterdir())) == len(made)
+
+
+def test_reference_tells_every_field():
+    """Also with its range: what lies outside of it is refused in these words."""
+    text = (ROOT / "docs" / "reference" / "scene.md").read_text()
+    for name, section in spadwarp.Scene.model_fields.items():
+        model = section.annotation if isinstance(section.annotation, type) else Target
+        part = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
+        for field, info in model.model_fields.items():
+            assert f"| `{field}` |" in part and info.description, f"{name}.{field}"
+    row = next(line for line in text.splitlines() if line.startswith("| `anisotropy` |"))
+    with pytest.raises(spadwarp.ConfigError, match=r"anisotropy = 1\.2 .*is outside \(-1, 1\)"):
+        spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml", {"medium.anisotropy": 1.2})
+    assert "(-1, 1)" in row and "`0.924`" in row
 
 
 def test_pages_of_the_site_exist():
