@@ -107,6 +107,21 @@ def test_label_noisy_and_clean_depth_agree(folder):
     assert stats.kstest(z, "norm").pvalue > 1e-3
 
 
+def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
+    with h5py.File(folder / "scenes.h5") as file:
+        profiles, edges = file["backscatter_profile"][...], file["profile_edges"][...]
+    np.testing.assert_allclose((profiles * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
+    for item in spadwarp.iterate_dataset(folder, "train", fields=("noisy", "prior")):
+        noisy, prior = item["noisy"], item["prior"]
+        assert (np.isnan(noisy) == np.isnan(prior)).all()
+        bins = np.searchsorted(edges[item["scene"]], np.nan_to_num(noisy), side="right") - 1
+        near_an_edge = np.abs(noisy[..., None] - edges[item["scene"]]).min(axis=-1) < 1e-4
+        inside = (bins >= 0) & (bins < 64) & ~near_an_edge & np.isfinite(noisy)
+        assert inside.mean() > 0.2
+        np.testing.assert_array_equal(prior[inside], profiles[item["scene"]][bins[inside]])
+        assert (prior[(bins < 0) & np.isfinite(noisy) & ~near_an_edge] == 0).all()
+
+
 def test_realised_fraction_is_the_requested_one(folder):
     values = []
     for item in spadwarp.iterate_dataset(folder, "all", fields=("label",)):

@@ -253,10 +253,13 @@ class _Shard:
 
     def _prior(self, scene: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         edges, profile = self.edges[scene], self.profiles[scene]
-        position = (depth - edges[0]) * np.float32(len(profile) / (edges[-1] - edges[0]))
-        index = np.nan_to_num(position, nan=0.0).astype(np.int32)
-        density = np.where((index >= 0) & (index < len(profile)), profile[np.clip(index, 0, len(profile) - 1)], 0.0)
-        return np.where(np.isnan(depth), np.nan, density).astype(np.float32)
+        # Density 0 on both sides of the profile.
+        density = np.concatenate([[0.0], profile, [0.0]]).astype(np.float32)
+        place = (depth - edges[0]) * np.float32(len(profile) / (edges[-1] - edges[0])) + np.float32(1.0)
+        place = np.nan_to_num(np.clip(place, 0.0, np.float32(len(density) - 1)), copy=False)
+        prior = density[place.astype(np.intp)]
+        np.copyto(prior, np.nan, where=np.isnan(depth))
+        return prior
 
 
 def _opened(path: Path) -> Any:
