@@ -90,7 +90,7 @@ def test_python_in_the_text_runs(page, checkout, tmp_path):
 
 # The same commands at a small size.
 SMALLER = {
-    r"--photons \S+": "--photons 5e3",
+    r"--photons \S+": "--photons 5e3 --set camera.width=16 --set camera.height=12",
     r"--pulses 20000": "--pulses 500",
     r"(dataset make \S+small\.toml)": r"\1 --set scenes_per_target=1 --set scenes_per_shard=1 --set frames.per_scene=2",
     r"(train \S+)": r"\1 --steps 2",
