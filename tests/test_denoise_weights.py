@@ -1,0 +1,181 @@
+"""The weights of the package: what they make of frames, and what they say about themselves."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import spadwarp
+from spadwarp import DeviceError, FileError
+from spadwarp.denoising import baselines, inference, metrics
+from spadwarp.denoising.frames import depth_frames
+from spadwarp.denoising.recipe import MODELS
+from spadwarp.files import read_exr
+
+torch.set_num_threads(1)
+
+GATE = (13.5, 16.0)
+
+
+def scene(height=48, width=64):
+    """A plane at 15 m with three steps of 10 cm, and sky in a corner."""
+    depth = np.full((height, width), 15.0, np.float32)
+    for k in range(3):
+        depth[6:-6, 10 + 14 * k : 24 + 14 * k] = 14.9 - 0.1 * k
+    depth[:5, :5] = np.nan
+    return depth
+
+
+def noisy_frame(clean, share=0.3, seed=0):
+    generator = np.random.default_rng(seed)
+    frame = clean + generator.normal(0, 0.003, clean.shape).astype(np.float32)
+    stray = generator.random(clean.shape) < share
+    reach = np.nan_to_num(clean, nan=GATE[1]) - GATE[0]
+    frame[stray] = (GATE[0] + generator.random(clean.shape) * reach)[stray]
+    return frame.astype(np.float32)
+
+
+# Networks with the weights of the package
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_network_improves_a_frame_it_has_never_seen(model):
+    clean = scene(96, 128)
+    noisy = noisy_frame(clean)
+    seen = np.isfinite(clean)
+    found = np.where(seen, spadwarp.denoise(noisy, gate=GATE, model=model, device="cpu"), np.nan)
+    before = metrics.score(clean, np.nan_to_num(noisy, nan=14.75), gate=GATE)
+    after = metrics.score(clean, np.nan_to_num(found, nan=14.75), gate=GATE)
+    assert after.psnr > before.psnr + 3
+    assert after.ssim > before.ssim
+
+
+def test_pyramid_beats_the_median_and_knows_where_nothing_is():
+    clean = scene(96, 128)
+    clean[:40, :40] = np.nan
+    noisy = noisy_frame(clean, 0.48)
+    frames = depth_frames(noisy, gate=GATE)
+    found, seen = inference.denoise_frames(frames, model="pyramid", device="cpu")
+    median = baselines.median_filter(frames, window=5)
+    assert metrics.score(clean, found[0], gate=GATE).psnr > metrics.score(clean, median[0], gate=GATE).psnr + 6
+    assert np.mean(seen[0] == np.isfinite(clean)) > 0.97
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (41, 67), (8, 100)])
+@pytest.mark.parametrize("model", MODELS)
+def test_any_size(model, shape):
+    depth = np.full(shape, 15.0, np.float32)
+    found = spadwarp.denoise(np.stack([depth, depth]), gate=GATE, model=model, device="cpu")
+    assert found.shape == (2, *shape) and found.dtype == np.float32
+
+
+def test_a_large_frame():
+    depth = np.full((768, 1024), 15.0, np.float32)
+    found = spadwarp.denoise(depth, gate=GATE, device="cpu")
+    assert found.shape == depth.shape
+    assert abs(np.nanmedian(found) - 15.0) < 0.01
+
+
+@pytest.mark.parametrize("model", [*MODELS, "median", "gating"])
+def test_an_empty_frame_stays_empty(model):
+    assert np.isnan(spadwarp.denoise(np.full((32, 40), np.nan), gate=GATE, model=model)).all()
+    assert np.isnan(spadwarp.denoise(np.zeros((2, 32, 40), np.float32), gate=GATE, model=model)).all()
+
+
+def test_pyramid_fills_what_the_camera_missed():
+    clean = np.full((64, 64), 15.0, np.float32)
+    dead = np.random.default_rng(1).random(clean.shape) < 0.1
+    found = spadwarp.denoise(np.where(dead, np.nan, clean), gate=GATE, device="cpu")
+    assert np.isfinite(found[dead]).mean() > 0.99
+    assert np.nanpercentile(np.abs(found - clean), 99) < 0.01
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_frame_takes_no_part_in_the_next(model):
+    frames = np.stack([noisy_frame(scene(), seed=seed) for seed in range(2)])
+    both = spadwarp.denoise(frames, gate=GATE, model=model, device="cpu")
+    for frame, found in zip(frames, both, strict=True):
+        alone = spadwarp.denoise(frame, gate=GATE, model=model, device="cpu")
+        assert np.nanmax(np.abs(alone - found)) < 1e-4
+
+
+def test_distance_does_not_matter_but_the_place_in_the_gate_does():
+    clean = scene()
+    noisy = noisy_frame(clean)
+    near = spadwarp.denoise(noisy, gate=GATE, device="cpu")
+    far = spadwarp.denoise(noisy + 35.0, gate=(GATE[0] + 35.0, GATE[1] + 35.0), device="cpu")
+    assert np.nanmax(np.abs(far - 35.0 - near)) < 2e-3
+
+
+def test_depth_outside_the_gate_is_said_and_left_out():
+    depth = np.full((32, 32), 15.0, np.float32)
+    depth[:4] = 40.0
+    with pytest.warns(UserWarning, match="128 of 1024 depths lie outside the gate of 13.5 to 16 m"):
+        found = spadwarp.denoise(depth, gate=GATE, device="cpu")
+    assert np.nanmax(found) <= 16.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"depth": np.zeros(5)}, "depth is float64"),
+        ({"depth": np.ones((4, 40))}, "4 x 40 pixels"),
+        ({"depth": -np.ones((32, 32))}, "outside"),
+        ({"gate": (16.0, 13.5)}, "gate"),
+        ({"gate": (1.0, np.inf)}, "gate"),
+        ({"model": "unet"}, "model = 'unet'"),
+        ({"profile": [-1.0, 2.0]}, "profile"),
+    ],
+)
+def test_errors_name_what_is_wrong(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        spadwarp.denoise(**{"depth": np.full((32, 32), 15.0), "gate": GATE, **arguments})
+
+
+def test_weights_must_be_weights(tmp_path):
+    depth = np.full((32, 32), 15.0)
+    with pytest.raises(FileError, match="no such file"):
+        spadwarp.denoise(depth, gate=GATE, weights=tmp_path / "none.safetensors")
+    (tmp_path / "junk.safetensors").write_bytes(b"\x00" * 100)
+    with pytest.raises(FileError, match=r"junk.safetensors"):
+        spadwarp.denoise(depth, gate=GATE, weights=tmp_path / "junk.safetensors")
+    with pytest.raises(FileError, match="weights of 'usdn', not of 'dncnn'"):
+        spadwarp.denoise(depth, gate=GATE, model="dncnn", weights=inference.WEIGHTS / "usdn.safetensors")
+    with pytest.raises(DeviceError, match="cuda:77"):
+        spadwarp.denoise(depth, gate=GATE, device="cuda:77")
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_weights_say_how_they_were_made(model):
+    card = inference.weights_card(model)
+    assert card["model"] == model
+    assert card["recipe"]["model"] == model
+    assert float(card["hours"]) < 8 / 60
+    assert min(card["validation_psnr"].values()) > 10
+    assert sum(one.stat().st_size for one in inference.WEIGHTS.iterdir()) < 8e6
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_weights_of_the_package_come_from_the_training_set(model):
+    assert inference.weights_card(model)["recipe"]["data"] == "data/training"
+
+
+EXTRA = Path(os.environ.get("SPADWARP_EXTRA_DATA", "")) / "ue_exr"
+
+
+@pytest.mark.skipif(
+    not os.environ.get("SPADWARP_EXTRA_DATA") or not EXTRA.is_dir(), reason="SPADWARP_EXTRA_DATA holds no ue_exr"
+)
+@pytest.mark.parametrize("name", ["babiao", "cat"])
+def test_exports_of_an_engine_are_denoised_as_well_as_other_frames(name):
+    """A game engine's depth, in steps of a centimetre, with strays: 20 dB or more are gained at BS 0.264."""
+    channels, _ = read_exr(EXTRA / f"{name}_RGBD.EXR")
+    clean = channels["A"].astype(np.float32) / 100
+    clean[(clean < GATE[0]) | (clean >= GATE[1])] = np.nan
+    noisy = noisy_frame(clean, 0.264)
+    frames = depth_frames(noisy, gate=GATE)
+    found, _ = inference.denoise_frames(frames, model="pyramid", device="cpu")
+    before = metrics.score(clean, np.nan_to_num(noisy, nan=14.75), gate=GATE)
+    assert metrics.score(clean, found[0], gate=GATE).psnr > before.psnr + 18
