@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from spadwarp import look_at, opencv_pose
+from spadwarp import load_scene, look_at, opencv_pose
 from spadwarp.config import Camera
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.imaging import image_points, image_tangents, pixel_views, view_box
@@ -217,3 +217,19 @@ def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
     assert problem in str(caught.value) and str(path) in str(caught.value)
     with pytest.raises(FileError, match="No such file"):
         Camera(calibration=str(tmp_path / "none.yml"), aperture_diameter=0.01, width=64, height=48)
+
+
+def test_files_beside_a_scene_are_found_from_anywhere(tmp_path):
+    (tmp_path / "lens.yml").write_text(_OPENCV_YAML)
+    (tmp_path / "scene.toml").write_text(
+        "[medium]\nextinction = 0.3\nalbedo = 0.8\n[gate]\nbin_width_ps = 100\nbins = 10\n"
+        '[camera]\ncalibration = "lens.yml"\naperture_diameter = 0.01\n'
+        '[laser]\nprofile = "measured"\nprofile_image = "beam.npy"\n'
+    )
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.camera == Camera(**INTRINSICS, distortion=LENSES["barrel"])
+    assert scene.laser.profile_image == str(tmp_path / "beam.npy")
+    # The numbers stand in the text of the scene, which needs the calibration's file no more.
+    (tmp_path / "lens.yml").unlink()
+    (tmp_path / "again.toml").write_text(scene.to_toml())
+    assert load_scene(tmp_path / "again.toml") == scene
