@@ -382,7 +382,8 @@ def _water(shape: _Shape) -> Iterator[CheckMessage]:
                 yield _preset_at_another_wavelength(name, water.preset, laser)
     if medium.layers:
         yield from _molecular_scattering(shape.scene)
-    yield from _continued_table(shape.scene)
+    if medium.has_phase_table:
+        yield from _phase_function(shape.scene)
     thickest = max(water.extinction for water in medium.waters)
     mean = thickest * shape.scene.path_limit  # collisions along the longest path that counts
     most = mean + 3.0 * math.sqrt(mean)
@@ -425,11 +426,18 @@ def _preset_at_another_wavelength(name: str, preset: str, laser: Laser) -> Check
     return CheckMessage("warning", f"{name}.preset", text, values)
 
 
-def _continued_table(scene: Scene) -> Iterator[CheckMessage]:
-    """A table that begins far from 0° leaves most of the light to its power law."""
-    if scene.medium.phase_function != "tabulated":
-        return
+def _phase_function(scene: Scene) -> Iterator[CheckMessage]:
+    """A forward peak narrower than the near-axis rule; a table that leaves most of the light to its power law."""
     law = phase_function(scene.medium)
+    snapped = math.acos(scene.transport.axis_threshold)
+    within = law.fraction_below(snapped) if snapped > 0.0 else 0.0
+    if within > 0.1:
+        text = (
+            f"axis_threshold = {scene.transport.axis_threshold:g} takes light within {math.degrees(snapped):.3g}° of "
+            f"the optical axis for axial, and {100.0 * within:.2g} % of the scattered light turns by less than that; "
+            "guided follows the forward peak with axis_threshold = 1 only, else single photons stand out"
+        )
+        yield CheckMessage("warning", "transport.axis_threshold", text, {"within": within})
     continued = law.fraction_below(law.first_angle) if law.first_angle > 0.0 else 0.0
     if continued > 0.1:
         text = (

@@ -73,6 +73,19 @@ def test_a_check_reads_the_table_and_says_what_it_leaves_out(tmp_path):
     assert not [message for message in spadwarp.check(petzold) if message.field == "medium.phase_table"]
 
 
+def test_a_check_warns_of_a_peak_narrower_than_the_near_axis_rule():
+    one = scene(medium={"phase_function": "fournier_forand"}, transport={"axis_threshold": 0.9998})
+    warnings = [message for message in spadwarp.check(one) if message.field == "transport.axis_threshold"]
+    within = float(fournier_forand.cumulative(1 - 0.9998, 1.10, 3.5835))
+    assert [message.values["within"] for message in warnings if "within" in message.values] == pytest.approx([within])
+    exact = one.with_overrides(transport={"axis_threshold": 1.0})
+    broad = one.with_overrides(
+        medium={"phase_function": "two_term_henyey_greenstein", "g1": 0.8, "g2": 0.0, "alpha": 0.9}
+    )
+    for other in (exact, broad):
+        assert not [message for message in spadwarp.check(other) if "within" in message.values]
+
+
 @pytest.mark.parametrize("name", PHASE_TABLES)
 def test_shipped_tables_are_sourced_and_offered(name):
     assert len(PHASE_TABLES[name][1]) > 30
