@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from .columns import FRAME_COLUMNS, scene_columns
+from .histograms import MEANING
 from .plan import Plan
 from .recipe import SPLITS
 
@@ -17,6 +19,7 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
     recipe = plan.recipe
     used = [split for split in SPLITS if manifest["splits"][split]["shards"]]
     size = sum(one["bytes"] for one in manifest["files"].values())
+    room = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     front = [
         "---",
         f"pretty_name: {json.dumps(recipe.name)}",
@@ -40,8 +43,13 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
         f"| {manifest['splits'][split]['seed']} |"
         for split in used
     ]
-    frames = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in FRAME_COLUMNS.items()]
-    scenes = [f"| `{name}` | {unit} | {text} |" for name, (_, _, unit, text) in scene_columns(plan).items()]
+    tables = _table("`frames-*.h5`", "A row a frame.", FRAME_COLUMNS)
+    columns = {name: (unit, text) for name, (_, _, unit, text) in scene_columns(plan).items()}
+    tables += _table(
+        "`scenes.h5`", "A row a scene. Refers to the files in `scenes/`, which have to be beside it.", columns
+    )
+    if any(name.startswith("histograms-") for name in manifest["files"]):
+        tables += _table("`histograms-*.h5`", "Of the scenes that were traced photon by photon.", MEANING)
     return "\n".join(
         [
             *front,
@@ -50,7 +58,7 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
             "",
             *([recipe.description, ""] if recipe.description else []),
             f"{plan.sample_count} simulated single-photon depth frames of {plan.shape[1]} × {plan.shape[0]} pixels, of "
-            f"{plan.scene_count} underwater scenes with {len(plan.targets)} targets; {size / 1e9:.3g} GB. Made by "
+            f"{plan.scene_count} underwater scenes with {len(plan.targets)} targets; {room}. Made by "
             f"spadwarp {manifest['version']} from `recipe.toml`, seed {recipe.seed}. Splits share neither targets nor "
             "seeds.",
             "",
@@ -63,7 +71,7 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
             "```python",
             "import spadwarp",
             "",
-            'for item in spadwarp.iterate_dataset("<this folder>", split="train"):',
+            f'for item in spadwarp.iterate_dataset("<this folder>", split="{used[0]}"):',
             '    item["noisy"], item["clean"], item["label"]     # float32 [1, H, W]; NaN: no return, nothing hit',
             "```",
             "",
@@ -71,22 +79,14 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
             f" (here {plan.depth_offset:.6g} m and {plan.depth_step:.6g} m); code 0 is no return; "
             "`np.unpackbits(label, axis=-1)[..., :width]` are the labels.",
             "",
-            "## `frames-*.h5`",
-            "",
-            "| dataset | unit | meaning |",
-            "|---|---|---|",
-            *frames,
-            "",
-            "## `scenes.h5`",
-            "",
-            "It refers to the files in `scenes/`, which have to be beside it.",
-            "",
-            "| dataset | unit | meaning |",
-            "|---|---|---|",
-            *scenes,
-            "",
+            *tables,
         ]
     )
+
+
+def _table(title: str, text: str, columns: Mapping[str, tuple[str, str]]) -> list[str]:
+    rows = [f"| `{name}` | {unit} | {meaning} |" for name, (unit, meaning) in columns.items()]
+    return [f"## {title}", "", text, "", "| dataset | unit | meaning |", "|---|---|---|", *rows, ""]
 
 
 def _size_category(count: int) -> str:
