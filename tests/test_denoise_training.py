@@ -9,9 +9,9 @@ from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
 from spadwarp.denoising import networks, noise
-from spadwarp.denoising.noise import CleanScenes, draw_batch
+from spadwarp.denoising.noise import Batch, CleanScenes, draw_batch
 from spadwarp.denoising.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
-from spadwarp.denoising.training import fit
+from spadwarp.denoising.training import fit, loss_of
 
 torch.set_num_threads(1)
 
@@ -131,6 +131,16 @@ def test_one_seed_gives_one_batch():
     first, again, other = (draw(Noise(), size=8, seed=seed) for seed in (1, 1, 2))
     assert torch.equal(first.frame, again.frame) and torch.equal(first.clean, again.clean)
     assert not torch.equal(first.frame, other.frame)
+
+
+def test_crops_without_a_target_teach_no_depth():
+    frame, clean, hit = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.4), torch.ones(2, 1, 32, 32)
+    hit[1] = 0.0
+    clean[1] = 1.0
+    output = torch.full((2, 1, 32, 32), 0.5)
+    alone = loss_of(output[:1], Batch(frame[:1], clean[:1], hit[:1]), kind="mse")
+    assert alone == pytest.approx(0.01, rel=1e-5)
+    assert loss_of(output, Batch(frame, clean, hit), kind="mse") == pytest.approx(0.01, rel=1e-5)
 
 
 RECIPE = {

@@ -157,12 +157,15 @@ def fit(
 def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
     """Error of depth where a target is seen, and of what else the network says; a scalar.
 
-    Where nothing is hit the depth to learn is 1, the end of the gate, at a fiftieth of the weight.
+    Where nothing is hit the depth to learn is 1, the end of the gate, at a fiftieth of the weight. Crops without a
+    target teach no depth: a network that cannot tell would learn to answer 1 for what it can hardly see.
     """
     depth, logits = output[:, :1], output[:, 1:]
     weight = 0.02 + 0.98 * batch.hit
     square = (weight * (depth - batch.clean).square()).flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
-    error = square.mean() if kind == "mse" else 0.1 * torch.log(square + _FLOOR).mean()
+    error = square if kind == "mse" else 0.1 * torch.log(square + _FLOOR)
+    shows = (batch.hit.flatten(1).mean(dim=1) > 0.02).float()
+    error = (shows * error).sum() / shows.sum().clamp_min(1.0)
     if logits.shape[1]:
         reported = batch.frame[:, :1]
         true = batch.hit * ((reported - batch.clean).abs() < _TRUE)
