@@ -105,7 +105,27 @@ class BenchResult:
 # ---- Cases
 
 _WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924, "group_index": "seawater"}
-_STAIRCASE = {"builtin": "staircase", "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
+
+
+def _staircase(subdivisions: int = 0) -> list[dict[str, Any]]:
+    """A plate of 4 x 4 m, its face at 5 m, and nine bars 0.1 to 0.6 m proud of it: ten boxes, 120 faces."""
+    boxes = [((-2.0, -2.0), (2.0, 2.0), -0.1)]  # two corners, and how far it stands out
+    for i in range(3):
+        boxes += [
+            ((-2.0 + 0.67 * i, -2.0), (-1.37 + 0.67 * i, 2.0), 0.6 - 0.1 * i),
+            ((0.0, -2.0 + 0.7 * i), (2.0, -1.4 + 0.7 * i), 0.3 - 0.1 * i),
+            ((0.67 * i, 0.0), (0.63 + 0.67 * i, 2.0), 0.3 - 0.1 * i),
+        ]
+    return [
+        {
+            "builtin": "box",
+            "size": [right - left, bottom - top, abs(proud)],
+            "subdivisions": subdivisions,
+            "translation": [0.5 * (left + right), 0.5 * (top + bottom), 5.0 - 0.5 * proud],
+            "reflectance": 0.5,
+        }
+        for (left, top), (right, bottom), proud in boxes
+    ]
 
 
 def _at_5m(targets: Sequence[Mapping[str, Any]] = (), estimator: str = "next_event", **camera: Any) -> dict[str, Any]:
@@ -123,7 +143,7 @@ def _at_5m(targets: Sequence[Mapping[str, Any]] = (), estimator: str = "next_eve
 
 def _confocal() -> dict[str, Any]:
     """A coaxial beam of 0.1° that visits the 64 x 64 pixels of the staircase in turn."""
-    scene = _at_5m([_STAIRCASE], "guided")
+    scene = _at_5m(_staircase(), "guided")
     transport = {**scene["transport"], "axis_threshold": 1.0}
     return {**scene, "laser": {"half_angle_deg": 0.1}, "scan": {"mode": "confocal"}, "transport": transport}
 
@@ -178,18 +198,14 @@ def _cube60() -> dict[str, Any]:
     }
 
 
-def _dense(subdivisions: int) -> dict[str, Any]:
-    return {**_STAIRCASE, "subdivisions": subdivisions}
-
-
 def _cases() -> dict[str, Case]:
     listed = [
         Case("water", "water alone, next_event, 64 x 64 x 1024 bins", scene=_at_5m()),
         Case("plane_5m", "a wall at 5 m, guided, 32 x 32 x 16 bins", scene=_plane()),
-        Case("staircase_5m", "the staircase at 5 m, next_event, 64 x 64 x 1024 bins", scene=_at_5m([_STAIRCASE])),
-        Case("staircase_5m_guided", "the same, guided", scene=_at_5m([_STAIRCASE], "guided")),
+        Case("staircase_5m", "the staircase at 5 m, next_event, 64 x 64 x 1024 bins", scene=_at_5m(_staircase())),
+        Case("staircase_5m_guided", "the same, guided", scene=_at_5m(_staircase(), "guided")),
         Case("confocal", "the staircase, guided, 64 x 64 positions scanned by beam and pixel", scene=_confocal()),
-        Case("staircase_5m_dense", "the same, next_event, more than 100 000 faces", scene=_at_5m([_dense(5)])),
+        Case("staircase_5m_dense", "the same, next_event, more than 100 000 faces", scene=_at_5m(_staircase(5))),
         Case("spheres", "twelve spheres, a million faces in all, next_event", scene=_at_5m(_spheres())),
         Case(
             "cube60",
@@ -203,7 +219,7 @@ def _cases() -> dict[str, Case]:
             "analytic",
             "depth frames of 400 x 400 pixels from the analytic simulator",
             kind="analytic",
-            scene=_at_5m([_STAIRCASE], width=400, height=400),
+            scene=_at_5m(_staircase(), width=400, height=400),
         ),
         Case("detect", "first-photon counts of 1e6 pulses; a frame of 256 x 192 x 1024 bins on a GPU", kind="detect"),
     ]
@@ -216,7 +232,7 @@ CASES: dict[str, Case] = _cases()
 
 def _scaling(cuda: bool) -> list[Case]:
     """How cost and memory grow with photons, faces and bins; on a GPU further than on a CPU."""
-    base = _at_5m([_STAIRCASE])
+    base = _at_5m(_staircase())
     box = {"builtin": "box", "size": [3.0, 3.0, 0.5], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096)]
     return [
@@ -232,7 +248,7 @@ def _scaling(cuda: bool) -> list[Case]:
             Case(
                 f"bins_{width}x{height}x{bins}",
                 f"staircase_5m into {width} x {height} x {bins} bins",
-                scene=_at_5m([_STAIRCASE], width=width, height=height, bins=bins),
+                scene=_at_5m(_staircase(), width=width, height=height, bins=bins),
             )
             for width, height, bins in (images if cuda else images[:3])
         ),

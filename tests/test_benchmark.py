@@ -45,7 +45,7 @@ def test_cases_have_the_faces_they_promise():
     faces = {name: build_mesh(scene(name)) for name in ("water", "plane_5m", "staircase_5m", "staircase_5m_dense")}
     assert faces["water"] is None
     assert faces["plane_5m"].face_count == 2
-    assert faces["staircase_5m"].face_count == 160
+    assert faces["staircase_5m"].face_count == 120
     assert faces["staircase_5m_dense"].face_count >= 100_000
 
 
@@ -116,7 +116,7 @@ def test_command_writes_and_compares(kept, tmp_path):
         "staircase_5m", "--device", "cpu", "--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept
     )
     assert result.exit_code == 0, result.output
-    assert "160" in result.output
+    assert "120" in result.output
     assert "×" in result.output
     again = load_report(out)
     assert again["ratios"]["staircase_5m"]["photons"] > 0
