@@ -80,8 +80,6 @@ def test_python_in_the_text_uses_names_that_exist(page):
 @pytest.mark.parametrize("page", WITH_CODE, ids=by_name)
 def test_python_in_the_text_runs(page, checkout, tmp_path):
     """The blocks of a page, one after the other, as one program in a checkout."""
-    if page.name == "denoising.md" and not (ROOT / "spadwarp" / "denoising" / "weights").is_dir():
-        pytest.skip("the weights of the networks are not in this checkout")
     blocks = [code for language, code in _FENCE.findall(page.read_text(encoding="utf-8")) if language == "python"]
     program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
     program.write_text("\n".join(blocks), encoding="utf-8")
