@@ -142,26 +142,29 @@ class PyramidNet(nn.Module):
             x = before(down(x))
         for level in (2, 1, 0):
             x = self.after[level](skipped[level] + F.pixel_shuffle(self.up[level](x), 2))
-        head = F.pixel_shuffle(self.leave(F.relu(x)), 2).float()
-        weights, (own, seen, true) = head[:, : self.candidates + 1], head[:, self.candidates + 1 :].split(1, dim=1)
+        head = F.pixel_shuffle(self.leave(F.relu(x)), 2).float().permute(0, 2, 3, 1)  # candidates side by side
+        weights = head[..., : self.candidates + 1]
+        own, seen, true = head[..., self.candidates + 1 :].permute(0, 3, 1, 2).split(1, dim=1)
 
         depth, reported = depth.float(), reported.float()
-        trust = F.logsigmoid(true) + 1e4 * (reported - 1.0)
-        values, trusts = [_neighbourhood(depth, self.radius)], [_neighbourhood(trust, self.radius)]
         certainty = torch.sigmoid(true) * reported
+        values = [_windows(depth, self.radius)]
+        trusts = [_windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), self.radius)]
         for side in self.blocks:
             share = F.avg_pool2d(certainty, side)
             mean = F.avg_pool2d(certainty * depth, side) / (share + 1e-6)
-            for image, into in ((mean, values), (torch.log(share + 1e-6), trusts)):
-                into.append(F.interpolate(_neighbourhood(image, 1), scale_factor=side))
-        shares = torch.cat([weights[:, :-1] + torch.cat(trusts, dim=1), weights[:, -1:]], dim=1).softmax(dim=1)
-        found = (shares * torch.cat([*values, 0.5 + own], dim=1)).sum(dim=1, keepdim=True)
+            values.append(_enlarged(_windows(mean, 1), side))
+            trusts.append(_enlarged(_windows(torch.log(share + 1e-6), 1), side))
+        values.append(0.5 + own.permute(0, 2, 3, 1))
+        trusts.append(torch.zeros_like(values[-1]))
+        shares = (weights + torch.cat(trusts, dim=-1)).softmax(dim=-1)
+        found = (shares * torch.cat(values, dim=-1)).sum(dim=-1)[:, None]
         return torch.cat([found, seen, true], dim=1)[..., :height, :width]
 
 
 def _ranks(depth: Tensor, ranks: tuple[int, ...]) -> list[Tensor]:
     """Order statistics of each 3×3 neighbourhood by a sorting network of 25 exchanges (Floyd)."""
-    values = list(_neighbourhood(depth, 1).split(1, dim=1))
+    values = [one[..., 0][:, None] for one in _windows(depth, 1).split(1, dim=-1)]
     for i, j in _SORT_NINE:
         values[i], values[j] = torch.minimum(values[i], values[j]), torch.maximum(values[i], values[j])
     return [values[rank] for rank in ranks]
@@ -173,12 +176,18 @@ _SORT_NINE = (
 )  # fmt: skip
 
 
-def _neighbourhood(image: Tensor, radius: int) -> Tensor:
-    """`[B, 1, H, W]` to `[B, (2 radius + 1)², H, W]`, the image continued beyond its border: a view, row by row."""
+def _windows(image: Tensor, radius: int) -> Tensor:
+    """`[B, 1, H, W]` to `[B, H, W, (2 radius + 1)²]`: windows, row by row, beyond the border too."""
     size = 2 * radius + 1
-    padded = F.pad(image, (radius, radius, radius, radius), mode="replicate")
-    views = padded.unfold(2, size, 1).unfold(3, size, 1)  # [B, 1, H, W, size, size]
-    return views.permute(0, 4, 5, 1, 2, 3).flatten(1, 3)
+    padded = F.pad(image, (radius, radius, radius, radius), mode="replicate")[:, 0]
+    return padded.unfold(1, size, 1).unfold(2, size, 1).flatten(3)
+
+
+def _enlarged(image: Tensor, side: int) -> Tensor:
+    """`[B, H, W, C]` with every pixel repeated `side` times along rows and columns."""
+    batch, height, width, channels = image.shape
+    wide = image[:, :, None, :, None].expand(batch, height, side, width, side, channels)
+    return wide.reshape(batch, height * side, width * side, channels)
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {"usdn": USDN, "dncnn": DnCNN, "pyramid": PyramidNet}
