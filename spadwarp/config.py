@@ -261,6 +261,13 @@ class Medium(_Water):
                 raise ValueError(
                     f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
                 )
+            # A preset may bring one with it, which is no more than what the medium's own preset may.
+            own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
+            if self.phase_function != "henyey_greenstein" and layer.anisotropy not in (None, own):
+                raise ValueError(
+                    f"layers[{i}].anisotropy = {layer.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
+                    " layers share any other"
+                )
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
 

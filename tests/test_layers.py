@@ -204,6 +204,10 @@ def test_layers_survive_the_way_through_toml(tmp_path):
         ({"layers": [{"start": 1.0}]}, "medium.layers[0] needs exactly two of"),
         ({"layers": [{**MURKY, "albedo": "paper"}]}, "medium.layers[0].albedo = 'paper' does not go with 0.8"),
         ({"layers": [{**MURKY, "group_index": 1.3}]}, "medium.layers[0].group_index is not a known field"),
+        (
+            {"phase_function": "fournier_forand", "layers": [MURKY]},
+            "medium.layers[0].anisotropy = 0.5 goes with phase_function = 'henyey_greenstein' only",
+        ),
         ({"layers": [MURKY], "layer_axis": [0.0, 0.0, 0.0]}, "medium.layer_axis = [0.0, 0.0, 0.0] has no length"),
     ],
 )

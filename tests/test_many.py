@@ -132,7 +132,8 @@ def test_an_interrupted_shard_knows_where_it_ends(whole):
             signal.raise_signal(signal.SIGTERM)
 
     fired = []
-    options = {**RUN, "device": "cpu", "shard": (2, 2), "pass_size": 1000}
+    # Few threads: many would have walked all photons before the first of them is reported.
+    options = {**RUN, "device": "cpu", "threads": 2, "shard": (2, 2), "pass_size": 1000}
     part = spadwarp.simulate(scene(), **options, progress=interrupt)
     assert part.partial and part.requested == (PHOTONS // 2, PHOTONS) and fired == [PHOTONS // 2]
     rest = spadwarp.simulate(scene(), device="cpu", resume=part)
@@ -205,7 +206,8 @@ def test_a_full_disk_costs_no_photons(whole, tmp_path):
         if stage == "trace":
             resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
 
-    options = {**RUN, "device": "cpu", "pass_size": 2000, "progress": fill}
+    # Few threads: many would have walked all photons before the first checkpoint is due.
+    options = {**RUN, "device": "cpu", "threads": 2, "pass_size": 2000, "progress": fill}
     try:
         with pytest.warns(RuntimeWarning, match=r"no checkpoint, the run goes on: .*checkpoint\.h5: cannot be written"):
             result = spadwarp.simulate(scene(), **options, checkpoint=place, checkpoint_every=0.0)

@@ -33,7 +33,8 @@ _EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 -
 class Run:
     """How the cases are run: photons for each scene, seed, device (None: the default one).
 
-    With a folder for `tables` every Henyey–Greenstein function goes through a file of angles and values.
+    With a folder for `tables` every Henyey–Greenstein function goes through a file of angles and values, but for those
+    of layers, which cannot have a table each.
     """
 
     photons: int
@@ -61,7 +62,7 @@ class Run:
 
     def _scene(self, tables: Mapping[str, Any]) -> Scene:
         medium = tables["medium"]
-        if self.tables is None or "phase_function" in medium:
+        if self.tables is None or "phase_function" in medium or "layers" in medium:
             return Scene.from_dict(tables)
         path = self.tables / f"g{medium.get('anisotropy', 0.924)}.csv"
         if not path.exists():
