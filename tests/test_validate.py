@@ -170,7 +170,7 @@ def test_deviations_are_standard_normal(results):
 
 
 def test_a_table_of_henyey_greenstein_passes_as_well():
-    cases = ["slab", "near-axis", "single-scatter"]
+    cases = ["slab", "near-axis", "single-scatter", "layers"]
     assert all(r.passed for r in validate(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
 
 
