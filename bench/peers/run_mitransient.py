@@ -140,7 +140,7 @@ if __name__ == "__main__":
 
     def ours(seed: int) -> tuple[np.ndarray, float]:
         # Long enough that the way of the histogram to the host does not count.
-        result = spadwarp.simulate(ours_scene, photons=100 * args.photons, seed=seed, device=args.device)
+        result = spadwarp.simulate(ours_scene, photons=10 * args.photons, seed=seed, device=args.device)
         return result.histogram, result.timing["trace"]
 
     seconds, _ = fastest(lambda: render(1), args.repeats)
