@@ -39,8 +39,8 @@ def beam_planes(laser: Laser) -> Points:
         right, down = profile_axes(laser.axis)
         normals = np.array([wide * axis - right, wide * axis + right, tall * axis - down, tall * axis + down, axis])
         return np.column_stack([normals, -normals @ origin])
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    b1 = np.cross(axis, helper) / np.linalg.norm(np.cross(axis, helper))
+    other = np.eye(3)[np.argmin(np.abs(axis))]
+    b1 = np.cross(axis, other) / np.linalg.norm(np.cross(axis, other))
     phi = np.arange(24) * (2.0 * math.pi / 24)
     outward = np.cos(phi)[:, None] * b1 + np.sin(phi)[:, None] * np.cross(axis, b1)
     slope, radius = 0.0, max(laser.beam_radius, 1e-6)

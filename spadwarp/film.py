@@ -54,7 +54,7 @@ def video(
         raise ValueError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
     if pictures < 1 or not 0 < fps <= 50:
         raise ValueError(f"pictures = {pictures} and fps = {fps:g} are not in [1, inf) and (0, 50]")
-    cube, edges, label, per_metre = _light(source, frame)
+    cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
     cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
     merged = -(-cube.shape[2] // pictures)
@@ -62,7 +62,7 @@ def video(
     cube = np.add.reduceat(cube, starts, axis=2)
     edges = np.append(edges[starts], edges[-1])
     label += " and picture" if merged > 1 else " and bin"
-    drawn = _pictures(cube, edges, label, per_metre, scale)
+    drawn = _pictures(cube, edges, label, metres_per_ns, scale)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_path(path) as temporary:
         write(drawn, temporary, fps)
@@ -107,7 +107,7 @@ def _pictures(
     cube: NDArray[np.float64],
     edges: NDArray[np.float64],
     label: str,
-    per_metre: float,
+    metres_per_ns: float,
     scale: str,
 ) -> Iterator[NDArray[np.uint8]]:
     """RGB pictures, one after the other."""
@@ -132,7 +132,7 @@ def _pictures(
     for index in range(cube.shape[2]):
         image.set_data(cube[:, :, index])
         middle = 0.5 * (edges[index] + edges[index + 1])
-        title.set_text(f"{middle:.2f} ns, path {middle * per_metre:.2f} m")
+        title.set_text(f"{middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
         canvas.draw()
         if index == 0:
             figure.set_layout_engine("none")  # measured once, so that nothing moves

@@ -72,7 +72,7 @@ def simulate(
         pass_size: Photons in one launch, up to 2^26, on the CPU 2^20.
         progress: Called from the caller's thread.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
-            at most 1/32; the histogram takes 2 2/3 times the memory.
+            at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
         relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
             `uncertainty`, and `photons` is the most that are traced.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.

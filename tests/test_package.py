@@ -23,7 +23,7 @@ ARROWS = {
     "spadwarp/budgets.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
     "spadwarp/detector.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
     "spadwarp/depth.py": {"spadwarp.simulation", "spadwarp_kernels.transport"},
-    "spadwarp/config.py": {"spadwarp.simulation", "spadwarp.result", "spadwarp.model"},
+    "spadwarp/config": {"spadwarp.simulation", "spadwarp.result", "spadwarp.model"},
 }
 
 

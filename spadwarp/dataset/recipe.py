@@ -29,14 +29,15 @@ from pydantic import (
 
 from spadwarp._layers import parse_override, toml_value
 from spadwarp._problems import describe
-from spadwarp.config import Scene, Whole, _listed
+from spadwarp.config import Scene
+from spadwarp.config.sections import Whole, listed
 from spadwarp.errors import ConfigError, FileError
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 
 SPLITS = ("train", "validation", "test")
 
-Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
 
 
 class _Table(BaseModel):
@@ -52,7 +53,7 @@ class _Table(BaseModel):
 class Distribution(_Table):
     """One of `choices`, or even between `low` and `high`."""
 
-    choices: Annotated[tuple[Any, ...], BeforeValidator(_listed)] = ()
+    choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
     low: float | None = Field(None, description="lowest value")
     high: float | None = Field(None, description="highest value")
     log: bool = Field(False, description="whether the logarithm is even")
