@@ -6,7 +6,7 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spadwarp
@@ -33,7 +33,7 @@ def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, devic
     assert _bits(other) != _bits(whole)
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25)
 @given(
     extinction=st.floats(0.01, 20),
     albedo=st.floats(0, 1),
