@@ -90,7 +90,7 @@ def draw_targets(
         shaded = _halved(_shaded(truth.normal))
         colours = _halved(_coloured(truth.depth, reach))
         axis.imshow(np.concatenate([shaded, colours], axis=1), interpolation="lanczos")
-        axis.set_title(name.replace("_", " "), fontsize=11, pad=3)
+        axis.set_title(name, fontsize=11, pad=3)
     bar = figure.colorbar(
         ScalarMappable(reach, "viridis_r"), ax=list(axes), orientation="horizontal", fraction=0.012, aspect=70, pad=0.01
     )
