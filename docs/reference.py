@@ -52,10 +52,11 @@ def scene() -> str:
     """Sections and fields with kinds, ranges, defaults and units, and the presets."""
     parts = [
         MADE + "# Scene file\n\n"
-        "A scene is a TOML file of sections. Units are SI where the name carries none; lengths are in the camera frame "
-        "(lens at the origin, +x right, +y down, +z forward). A field that a file leaves out has its default, or the "
-        "value of the section's `preset`; `--set SECTION.FIELD=VALUE` lies over both. What is not valid is "
-        "refused with the field, its value and its range; `spadwarp check FILE` does so without running anything.\n\n"
+        "A scene is a TOML file of sections. Units are SI where the name carries none; the camera looks along +z, with "
+        "+x right and +y down, from the origin unless it has a pose ([frames](../optics.md#frames)). A field that a "
+        "file leaves out has its default, or the value of the section's `preset`; `--set SECTION.FIELD=VALUE` lies "
+        "over both. What is not valid is refused with the field, its value and its range; `spadwarp check FILE` does "
+        "so without running anything.\n\n"
         "```toml\n" + _EXAMPLE + "```\n"
     ]
     for name, field in Scene.model_fields.items():

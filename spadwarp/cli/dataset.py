@@ -54,9 +54,9 @@ def make(
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """Makes what is missing or broken of a dataset; the same recipe gives the same files.
+    """Makes a dataset, or what is missing or broken of it.
 
-    May be stopped at any moment and called again: whole shards stay.
+    The same recipe gives the same files. May be stopped at any moment and called again: whole shards stay.
 
     \b
     Examples:
@@ -101,7 +101,9 @@ def _part(text: str) -> tuple[int, int]:
 
 @group.command()
 def verify(folder: Folder, quiet: Quiet = False, json_path: Json = None) -> None:
-    """Compares every file of a dataset with its checksum; exit code 1 if something is missing or damaged.
+    """Compares every file of a dataset with its checksum.
+
+    Exit code 1 if something is missing or damaged.
 
     \b
     Example:
@@ -155,7 +157,9 @@ def preview(
     split: Annotated[Split, typer.Option(help="Which frames.")] = Split.all,
     frames: Annotated[int, typer.Option(min=1, metavar="N", help="How many, evenly over the split.")] = 20,
 ) -> None:
-    """Draws frames of a dataset on one sheet: true depth, measured depth, recorded photons.
+    """Draws frames of a dataset on one sheet.
+
+    True depth, measured depth, recorded photons.
 
     \b
     Example:

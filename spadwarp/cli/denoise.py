@@ -276,10 +276,10 @@ def train(
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """Train a denoiser on the clean scenes of a dataset; noise is drawn anew for each step.
+    """Train a denoiser on the clean scenes of a dataset.
 
-    Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same command goes on with a run that was
-    cut short. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    Noise is drawn anew for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
+    command goes on with a run that was cut short. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

@@ -221,10 +221,10 @@ def budget(
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """What comes back from a face on the optical axis: signal, background, depth error, pulses for 1 cm.
+    """What comes back from a face on the optical axis.
 
-    Per pulse and pixel, over range and water; from the analytic model. Depth errors in brackets are not reached: more
-    than 1 % of the fits would lock on background.
+    Signal and background per pulse and pixel, depth error, pulses for 1 cm; over range and water, from the analytic
+    model. Depth errors in brackets are not reached: more than 1 % of the fits would lock on background.
 
     \b
     Example:
