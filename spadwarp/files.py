@@ -6,7 +6,7 @@ import io
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
     "atomic_path",
+    "file_within",
     "hdf5_file",
     "load_result",
     "load_truth_exr",
@@ -53,6 +54,18 @@ _READ_ME = (
     "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
     "in the camera frame."
 )
+
+
+def file_within(place: str | Path, names: Sequence[str]) -> Path:
+    """A file itself, or the only one of `names` in a directory. Raises `FileError` where there are none or several."""
+    path = Path(place)
+    if not path.is_dir():
+        return path
+    found = [path / name for name in names if (path / name).is_file()]
+    if len(found) != 1:
+        what = " and ".join(one.name for one in found) if found else f"no {' and no '.join(names)}"
+        raise FileError(f"{path}: holds {what}; name the file")
+    return found[0]
 
 
 @contextmanager
@@ -152,7 +165,10 @@ def load_result(path: str | Path) -> Result:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise FileError(f"{path}: an HDF5 file, but not a spadwarp result (attribute format is not {FORMAT!r})")
+                kind = file.attrs.get("format", "unknown")
+                raise FileError(
+                    f"{path}: an HDF5 file, but not a spadwarp result: its format is {kind!r}, not {FORMAT!r}"
+                )
             version = int(file.attrs["format_version"])
             if version > FORMAT_VERSION:
                 raise FileError(

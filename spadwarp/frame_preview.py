@@ -181,8 +181,16 @@ def draw_depth(
     show_image(images[0], bars[0], image, title=title, label=label, colours="viridis_r", low=low, high=high)
     bright = intensity.astype(np.float64)
     top = float(np.percentile(bright, 99.5)) or float(bright.max()) or 1.0
+    exponent = 0 if 1e-2 <= top < 1e4 else int(np.floor(np.log10(top)))
     show_image(
-        images[1], bars[1], bright, title="Intensity", label="sum over bins", colours="cividis", low=0.0, high=top
+        images[1],
+        bars[1],
+        bright / 10.0**exponent,
+        title="Intensity",
+        label="sum over bins" + (f" [$10^{{{exponent}}}$]" if exponent else ""),
+        colours="cividis",
+        low=0.0,
+        high=top / 10.0**exponent,
     )
     return _write(figure, path)
 

@@ -263,7 +263,7 @@ def _caption(result: Result, figure: Figure) -> None:
     if medium.layers:
         extinctions = ", ".join(f"{one.extinction:.3g}" for one in medium.waters)
         water = f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
-    photons = f"{result.photons:.3g}" if result.photons >= 1e6 else str(result.photons)
+    photons = f"{result.photons:.3g}" if result.photons >= 1e6 else f"{result.photons:,}".replace(",", "\u2009")
     if "e+" in photons:
         mantissa, power = photons.split("e+")
         photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"

@@ -78,9 +78,9 @@ def depth_of(
     """
     scene = histograms.scene
     if histograms.bin_width is None:
-        raise ValueError("bin width is missing: the file does not tell it")
+        raise ValueError("bin width is missing (--bin-width-ps): the file does not tell it")
     if scene is None and group_index is None:
-        raise ValueError("group index is missing: 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
+        raise ValueError("group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
     if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
         raise ValueError("group index and field of view are those of the file's scene")
     index = scene.medium.group_index if scene is not None else float(group_index or 0)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
-from spadwarp.files import atomic_path, load_result
+from spadwarp.files import atomic_path, file_within, load_result
 from spadwarp.result import COMPONENTS, Result, pixel_directions
 
 if TYPE_CHECKING:
@@ -118,14 +118,7 @@ def view(
 
 def find_run(place: str | Path) -> Path:
     """The file of a result or of frames, or the one that a directory holds; raises `FileError` where it is not one."""
-    path = Path(place)
-    if not path.is_dir():
-        return path
-    found = [path / name for name in ("frames.h5", "result.h5") if (path / name).is_file()]
-    if len(found) != 1:
-        what = " and ".join(one.name for one in found) or "neither frames.h5 nor result.h5"
-        raise FileError(f"{path}: holds {what}; name the file")
-    return found[0]
+    return file_within(place, ("frames.h5", "result.h5"))
 
 
 def _of_file(place: str | Path, method: str | None, frame: int, device: Any) -> _Page:

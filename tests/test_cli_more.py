@@ -160,7 +160,7 @@ def test_depth_of_a_result_is_that_of_python(done, tmp_path):
 
 def test_depth_of_frames_knows_the_response(done, tmp_path):
     run("detect", done, "--out", tmp_path / "frames", "--frames", 2, "--quiet", *DEVICE)
-    run("depth", tmp_path / "frames" / "frames.h5", "--out", tmp_path / "out", "--method", "matched", *DEVICE)
+    run("depth", tmp_path / "frames", "--out", tmp_path / "out", "--method", "matched", *DEVICE)
     with h5py.File(tmp_path / "frames" / "frames.h5") as file:
         assert np.allclose(np.load(tmp_path / "out" / "depth.npy"), file["depth/matched"], rtol=1e-5, equal_nan=True)
     asked = run("depth", done, "--out", tmp_path / "x", "--bin-width-ps", 5, code=2)

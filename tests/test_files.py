@@ -158,6 +158,9 @@ def test_missing_foreign_and_newer_files_are_told_apart(result: Result, tmp_path
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["data"] = np.arange(3)
     assert "not a spadwarp result" in error_of(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "foreign.h5", "r+") as file:
+        file.attrs["format"] = "spadwarp frames"
+    assert "its format is 'spadwarp frames'" in error_of(tmp_path / "foreign.h5")
     newer = result.save(tmp_path / "newer.h5")
     with h5py.File(newer, "r+") as file:
         file.attrs["format_version"] = 99

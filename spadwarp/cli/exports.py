@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 import spadwarp
-from spadwarp.errors import FileError
 
 from ._app import app, say
 from ._options import Json, Out, Overwrite, Quiet, arguments_checked, prepare_directory, rows, write_json
@@ -69,7 +68,8 @@ def export(
     prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
     written: dict[str, list[Path]] = {}
     with arguments_checked():
-        for one in dict.fromkeys(formats):
+        # Those that not every source has go first, so that nothing is written where one is refused.
+        for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
             path = out / f"{source.resolve().stem}.{one.value}"
             written[one.value] = spadwarp.export(source, path, frames=chosen, split=split)
     if not quiet:
@@ -83,14 +83,11 @@ def export(
 
 def _inside(place: Path) -> Path:
     """The file, or the one that can be exported in a directory."""
-    if not place.is_dir() or (place / "manifest.json").is_file():
+    from spadwarp.files import file_within
+
+    if (place / "manifest.json").is_file():
         return place
-    names = ("frames.h5", "result.h5", "analytic.h5")
-    found = [place / name for name in names if (place / name).is_file()]
-    if len(found) != 1:
-        what = " and ".join(one.name for one in found) if found else f"none of {', '.join(names)}"
-        raise FileError(f"{place}: holds {what}; name the file")
-    return found[0]
+    return file_within(place, ("frames.h5", "result.h5", "analytic.h5"))
 
 
 def _frames(text: str | None) -> int | slice | None:

@@ -78,7 +78,7 @@ def detect(
     quiet: Quiet = False,
     json_path: Json = None,
 ) -> None:
-    """Frames of counts that the camera would record of a run, and their depth.
+    """Frames of counts that the camera would record of a run.
 
     Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
     takes fields of the detector, and pulse_energy, repetition_rate and pulse_fwhm_ps of the laser.
@@ -172,7 +172,9 @@ def depth(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="A result or frames (.h5), or measured: .npy, .mat, .ptu.", show_default=False
+            metavar="FILE",
+            help="A result or frames (.h5, or their directory), or measured: .npy, .mat, .ptu.",
+            show_default=False,
         ),
     ],
     out: Out,
@@ -224,12 +226,13 @@ def depth(
       spadwarp depth counts.npy --bin-width-ps 55 --group-index 1.3566 --horizontal-fov-deg 15 \\
           --irf-fwhm-ps 200 --method likelihood --out depth/
     """
+    from spadwarp.files import file_within
     from spadwarp.histogram_files import read_histograms
     from spadwarp.reduction import depth_of, write_depth
 
     if ply is not None:
         check_writable(ply.parent)
-    histograms = read_histograms(path / "result.h5" if path.is_dir() else path, variable=variable)
+    histograms = read_histograms(file_within(path, ("frames.h5", "result.h5")), variable=variable)
     prepare_directory(out, overwrite=overwrite, needed=8 * histograms.values.size // histograms.values.shape[-1])
     with arguments_checked():
         histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
