@@ -7,7 +7,7 @@ from .tables import DensityTables
 
 @wp.struct
 class Medium:
-    """Homogeneous water.
+    """One water: all there is, or with `Layers` what they share.
 
     Attributes:
         extinction: c = a + b [1/m], >= 0; 0 is vacuum.
