@@ -489,7 +489,7 @@ def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
     scene = shape.scene
     size = shape.histogram_bytes
     if size > _MEMORY_LIMIT:
-        text = f"one set of tallies takes {size / 2**30:.3g} GiB, and on the CPU every thread has its own"
+        text = f"the tallies take {size / 2**30:.3g} GiB, and a run on the CPU needs twice that"
         yield CheckMessage("warning", "gate.bins", text, {"bytes": size})
     samples, signal = shape.samples_per_pixel, shape.signal_per_pulse
     if shape.target_range is None or samples is None or signal is None:

@@ -7,7 +7,7 @@ import json
 import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,19 +94,56 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 # HDF5
 
 
+class _Patient(io.RawIOBase):
+    """A new file for HDF5, which brings the whole process down when it meets a full disk: every write succeeds, and the
+    first that did not is kept in `error`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        try:
+            while self.error is None and done < len(view):
+                done += self._file.write(view[done:])
+        except OSError as error:
+            self.error = error
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def readinto(self, buffer: Any) -> int:
+        return self._file.readinto(buffer)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 @contextmanager
 def hdf5_file(path: str | Path, **options: Any) -> Iterator[h5py.File]:
-    """An HDF5 file to write to, which is at `path` when the block ends well; see `atomic_path`.
-
-    It is made in memory: HDF5 brings the whole process down when it meets a full disk.
-    """
+    """An HDF5 file to write to, which is at `path` when the block ends well; see `atomic_path`."""
     import h5py
 
-    memory = io.BytesIO()
-    with atomic_path(path) as temporary:
-        with h5py.File(memory, "w", **options) as file:
-            yield file
-        temporary.write_bytes(memory.getbuffer())
+    with atomic_path(path) as temporary, closing(_Patient(temporary)) as patient:
+        try:
+            with h5py.File(patient, "w", **options) as file:
+                yield file
+        except (OSError, RuntimeError):
+            if patient.error is None:
+                raise
+        if patient.error is not None:
+            raise patient.error
 
 
 def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Path:

@@ -211,7 +211,7 @@ def _case_1(wavelength_nm: float, chlorophyll: float) -> tuple[float, float, flo
 @functools.cache
 def _table(name: str) -> tuple[NDArray[np.float64], ...]:
     """Columns of a table that comes with the package."""
-    lines = (files("spadwarp") / "tables" / f"{name}.csv").read_text().splitlines()
+    lines = (files("spadwarp") / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
     rows = [line.split(",") for line in lines if line[0].isdigit()]
     return tuple(np.array(rows, dtype=float).T)
 

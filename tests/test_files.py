@@ -17,6 +17,7 @@ from hypothesis.extra import numpy as arrays
 from spadwarp.errors import FileError
 from spadwarp.files import (
     atomic_path,
+    hdf5_file,
     load_result,
     load_truth_exr,
     read_exr,
@@ -134,6 +135,14 @@ def test_a_write_that_fails_midway_says_where_and_cleans_up(tmp_path: Path) -> N
         temporary.write_bytes(b"half")
         raise OSError("disk full")
     assert list(path.parent.iterdir()) == []
+
+
+def test_hdf5_does_not_wait_in_memory(tmp_path: Path) -> None:
+    with hdf5_file(tmp_path / "large.h5") as file:
+        file["zeros"] = np.zeros(1 << 20)
+        file.flush()
+        assert sum(one.stat().st_size for one in tmp_path.iterdir()) > 8 << 20
+    assert [one.name for one in tmp_path.iterdir()] == ["large.h5"]
 
 
 def test_folders_that_cannot_be_made_are_named(result: Result, tmp_path: Path) -> None:

@@ -269,7 +269,7 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
         written.append(_save(result, out / "result.h5"))
     text = out / "scene.toml"
     try:
-        text.write_text(scene.to_toml())
+        text.write_text(scene.to_toml(), encoding="utf-8")
     except OSError as error:
         raise FileError(f"{text}: cannot be written: {error.strerror}") from error
     written.append(text)
