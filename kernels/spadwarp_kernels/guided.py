@@ -84,6 +84,8 @@ class PhaseGuide(NamedTuple):
         density: ``(theta: float, medium: Medium) -> float``, q itself.
         lobe_pdf: ``(t: float, medium: Medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens.
         lobe_sample: ``(xi: float, medium: Medium, guiding: Guiding) -> float``, returns t.
+        chord: The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) in place of theta, which spares
+            trigonometry: Henyey-Greenstein is (a^2 + c^2)^(-3/2) without approximation, a^2 = (1 - g)^2/g.
     """
 
     complement: wp.Function
@@ -91,32 +93,33 @@ class PhaseGuide(NamedTuple):
     density: wp.Function
     lobe_pdf: wp.Function
     lobe_sample: wp.Function
+    chord: bool = False
 
 
 @wp.func
 def _a2(medium: Medium) -> float:
-    """a^2 = (1 - g)^2/g of q ~ (a^2 + theta^2)^(-3/2); nearly uniform for g < 0.05."""
+    """a^2 = (1 - g)^2/g of q ~ (a^2 + c^2)^(-3/2); nearly uniform for g < 0.05."""
     return (1.0 - medium.anisotropy) * (1.0 - medium.anisotropy) / wp.max(medium.anisotropy, 0.05)
 
 
 @wp.func
-def _hg_complement(theta: float, medium: Medium) -> float:
-    """1 - theta/sqrt(a^2 + theta^2) without cancellation."""
+def _hg_complement(chord: float, medium: Medium) -> float:
+    """1 - c/sqrt(a^2 + c^2) without cancellation."""
     a2 = _a2(medium)
-    s = wp.sqrt(a2 + theta * theta)
-    return a2 / (s * (s + theta))
+    s = wp.sqrt(a2 + chord * chord)
+    return a2 / (s * (s + chord))
 
 
 @wp.func
-def _hg_angle(value: float, medium: Medium) -> float:
-    """theta = a F/sqrt(1 - F^2) with F = 1 - value."""
+def _hg_chord(value: float, medium: Medium) -> float:
+    """c = a F/sqrt(1 - F^2) with F = 1 - value."""
     return wp.sqrt(_a2(medium)) * (1.0 - value) / wp.sqrt(value * (2.0 - value))
 
 
 @wp.func
-def _hg_density(theta: float, medium: Medium) -> float:
+def _hg_density(chord: float, medium: Medium) -> float:
     a2 = _a2(medium)
-    q = a2 + theta * theta
+    q = a2 + chord * chord
     return a2 / (q * wp.sqrt(q))
 
 
@@ -130,13 +133,57 @@ def _hg_lobe_sample(xi: float, medium: Medium, guiding: Guiding) -> float:
     return sample_henyey_greenstein(xi, guiding.anisotropy)
 
 
-HENYEY_GREENSTEIN_GUIDE = PhaseGuide(_hg_complement, _hg_angle, _hg_density, _hg_lobe_pdf, _hg_lobe_sample)
+HENYEY_GREENSTEIN_GUIDE = PhaseGuide(_hg_complement, _hg_chord, _hg_density, _hg_lobe_pdf, _hg_lobe_sample, chord=True)
+
+
+@wp.func
+def _turn(d: float, along: float, r: float) -> wp.vec2:
+    """(1 - cos, 1 + cos) of the angle theta = atan2(d, -along), neither as a difference; r^2 = d^2 + along^2."""
+    far = r + wp.abs(along)
+    small = d * d / (r * far)
+    large = far / r
+    return wp.where(along < 0.0, wp.vec2(small, large), wp.vec2(large, small))
+
+
+@wp.func
+def _angle_of_turn(d: float, along: float, r: float) -> float:
+    return wp.atan2(d, -along)
+
+
+@wp.func
+def _chord_of_turn(d: float, along: float, r: float) -> float:
+    return wp.sqrt(2.0 * _turn(d, along, r)[0])
+
+
+@wp.func
+def _along_angle(d: float, angle: float) -> float:
+    return -d * cotangent(angle)
+
+
+@wp.func
+def _along_chord(d: float, chord: float) -> float:
+    h = 0.25 * chord * chord
+    return -d * (1.0 - 2.0 * h) / (chord * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
+
+
+@wp.func
+def _angle_slope(d: float, along: float, r: float) -> float:
+    return d / (r * r)
+
+
+@wp.func
+def _chord_slope(d: float, along: float, r: float) -> float:
+    return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
 
 
 @functools.cache
 def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Function:
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``."""
-    complement, angle_of, turn_density = guide.complement, guide.angle, guide.density
+    complement, inverse, guide_density = guide.complement, guide.angle, guide.density
+    # What the guide takes: of a place on the flight, the place that has it, its derivative along the flight.
+    turn_of, along_of, slope = (
+        (_chord_of_turn, _along_chord, _chord_slope) if guide.chord else (_angle_of_turn, _along_angle, _angle_slope)
+    )
 
     @wp.func
     def sample_flight(
@@ -144,9 +191,9 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
     ) -> FlightSample:
         """A point of the flight x + s u within the interval, x relative to the lens point.
 
-        Half the points are drawn from exp(-c s), half in the angle at which the light must turn to reach the lens:
-        towards the lens theta(s) = atan2(D, t_c - s) from the guide's q(theta), which follows the phase function; away
-        from it (s0 >= t_c) uniformly in psi = atan2(D, s - t_c), D = |x cross u|.
+        Half the points are drawn from exp(-c s), half in the angle theta(s) = atan2(D, t_c - s), D = |x cross u|, by
+        which the light must turn to reach the lens: from the guide, which follows the phase function; on flights that
+        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small for places far off.
         """
         sample = FlightSample()
         s0 = interval[0]
@@ -157,34 +204,33 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
         d = wp.max(wp.length(wp.cross(x, u)), 1.0e-7)
         kept = 1.0 - wp.exp(-extinction * width)
         thick = extinction * width > 1.0e-4
-        # Angles between the flight and the direction to the lens, or its opposite: small ones for places far off.
-        away = s0 >= t_c
-        sign = wp.where(away, -1.0, 1.0)
-        first = wp.atan2(d, sign * (t_c - s0))
-        last = wp.atan2(d, sign * (t_c - s1))
-        begin = wp.where(away, first, complement(first, medium))
-        end = wp.where(away, last, complement(last, medium))
+        first = s0 - t_c
+        last = s1 - t_c
+        r_first = wp.sqrt(d * d + first * first)
+        r_last = wp.sqrt(d * d + last * last)
+        away = first >= 0.0
+        begin = wp.where(away, d / (r_first + first), complement(turn_of(d, first, r_first), medium))
+        end = wp.where(away, d / (r_last + last), complement(turn_of(d, last, r_last), medium))
         span = begin - end
         angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
 
         s = float(0.0)
         if xi_choice < angular:
             g = begin - xi * span
-            angle = wp.where(away, g, angle_of(g, medium))
-            s = t_c - sign * d * cotangent(angle)
+            s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
         else:
             s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
         s = wp.clamp(s, s0, s1)
 
         along = s - t_c
-        r2 = d * d + along * along
+        r = wp.sqrt(d * d + along * along)
         linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
-        theta = wp.atan2(d, -along)
-        angular_density = wp.where(away, 1.0, turn_density(theta, medium)) * d / (r2 * wp.max(span, 1.0e-30))
+        towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)
+        angular_density = wp.where(away, d / (r * (r + along)), towards) / wp.max(span, 1.0e-30)
         if angular == 0.0:
             angular_density = 0.0
         sample.s = s
-        sample.r = wp.sqrt(r2)
+        sample.r = r
         sample.density = (1.0 - angular) * linear_density + angular * angular_density
         return sample
 

@@ -30,8 +30,9 @@ A2 = (1 - G) ** 2 / G
 
 
 def _hg_angle(theta):
-    """q ~ (a^2 + theta^2)^(-3/2) and its integral from theta on."""
-    return (A2 + theta**2) ** -1.5, (1 - theta / np.sqrt(A2 + theta**2)) / A2
+    """Over the angle, what is (a^2 + c^2)^(-3/2) over the chord c = 2 sin(theta/2), and its integral from theta on."""
+    c = 2 * np.sin(0.5 * theta)
+    return (A2 + c**2) ** -1.5 * np.cos(0.5 * theta), (1 - c / np.sqrt(A2 + c**2)) / A2
 
 
 _THETA = np.concatenate([np.geomspace(2.2e-5, 1.0, 40_001), np.linspace(1.0, np.pi, 20_001)[1:]])
@@ -120,7 +121,9 @@ def _mixture(law, s, x, u, s0, s1, c):
     r2 = d**2 + (s - t_c) ** 2
     linear = c * np.exp(-c * (s - s0)) / -math.expm1(-c * (s1 - s0))
     if s0 >= t_c:
-        angular = d / r2 / (np.arctan2(d, s0 - t_c) - np.arctan2(d, s1 - t_c))
+        psi = np.arctan2(d, s - t_c)
+        ends = np.tan(0.5 * np.arctan2(d, np.array([s0, s1]) - t_c))
+        angular = 0.5 / np.cos(0.5 * psi) ** 2 * d / r2 / (ends[0] - ends[1])
     else:
         rest = law(np.arctan2(d, t_c - np.array([s0, s1])))[1]
         angular = law(np.arctan2(d, t_c - s))[0] / (rest[0] - rest[1]) * d / r2
