@@ -75,6 +75,7 @@ def scene(mi: Any, mesh: str, roulette_from: int) -> dict[str, Any]:
         },
         "target": {
             "type": "ply",
+            "face_normals": True,  # else Mitsuba smooths them over the corners
             "filename": mesh,
             "exterior": water,
             "bsdf": {"type": "twosided", "material": {"type": "diffuse", "reflectance": 0.5}},
