@@ -504,7 +504,8 @@ def _statistics(shape: _Shape) -> Iterator[CheckMessage]:
         text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
         yield CheckMessage("note", "laser.pulse_energy", text, {"signal_per_pulse": signal})
     if scene.transport.estimator == "analog":
-        photons = signal * scene.transport.photons / (scene.laser.photons_per_pulse * scene.detector.pde or math.inf)
+        emitted = scene.transport.photons / scene.scan_positions
+        photons = signal * emitted / (scene.laser.photons_per_pulse * scene.detector.pde or math.inf)
         if photons < 10.0:
             text = (
                 f"analog: only about {photons:.2g} of {scene.transport.photons:.3g} photons reach a pixel unscattered"

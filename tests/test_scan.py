@@ -147,3 +147,13 @@ def test_beam_and_line_of_sight_cross_at_the_distance_of_the_scan():
     np.testing.assert_allclose(np.cross(axes, 2.5 * view - np.array([-0.3, 0.1, 0.0])), 0.0, atol=1e-12)
     np.testing.assert_array_equal(scan_axes(scene(scan={"mode": "confocal"})), view)
     assert isinstance(one.camera, Camera)
+
+
+def test_the_check_knows_that_a_pixel_gets_the_photons_of_its_position_alone():
+    few = {"laser": CONFOCAL["laser"], "transport": {"estimator": "analog", "photons": 100}}
+    told = [
+        next(message for message in spadwarp.check(one) if message.field == "transport.estimator")
+        for one in (scene(**few), scene(**few, scan={"mode": "confocal"}))
+    ]
+    flash, scan = (message.values["photons_per_pixel"] for message in told)
+    assert scan == pytest.approx(flash / 16, rel=0.05)
