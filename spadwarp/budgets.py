@@ -387,7 +387,8 @@ def plot_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> An
     for axis, (label, _, worth) in zip(axes, _PANELS.values(), strict=True):
         axis.set(xlabel="range [m]", ylabel=label, xscale="log", yscale="log")
         low, high = axis.get_ylim()
-        axis.set_ylim(max(low, worth[0]), min(high, worth[1]))
+        low, high = max(low, worth[0]), min(high, worth[1])
+        axis.set(yscale="log" if high > 20 * low else "linear", ylim=(low, high))
         _plain_range_ticks(axis, [row.range for row in rows])
     axes[1].axhline(TOLERANCE * 1e3, color="0.5", linewidth=0.8, linestyle=":")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -458,8 +459,11 @@ def _plain_range_ticks(axis: Any, ranges: Sequence[float]) -> None:
     from matplotlib.ticker import FixedLocator, NullLocator
 
     low, high = min(ranges), max(ranges)
-    ticks = [m * 10.0**e for e in range(-2, 4) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
+    ticks = sorted(set(ranges))
+    if len(ticks) > 6:
+        ticks = [m * 10.0**e for e in range(-2, 4) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
     if len(ticks) > 1:
+        axis.set_xlim(low * (low / high) ** 0.05, high * (high / low) ** 0.05)  # also where nothing comes back
         axis.xaxis.set_major_locator(FixedLocator(ticks))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

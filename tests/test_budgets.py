@@ -134,6 +134,7 @@ def test_pictures_are_written_whole(tmp_path):
     rows = budget(SCENE, ranges=[1, 3, 9], media=["uwoc-clear", "uwoc-harbour"])
     figure = plot_budget(rows, tmp_path / "budget.png")
     assert len(figure.axes) == 4
+    assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["1", "3", "9"]
     assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == [
         "uwoc-clear (0.149/m)",
         "uwoc-harbour (2.17/m)",
