@@ -201,7 +201,10 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         where += " in the camera frame"
     seen = points_inside(triangles, shape.view)
     if not len(seen):
-        depth = max(float(high[2]), 0.0)
+        depth = float(high[2])
+        if depth <= 0:
+            yield CheckMessage("warning", name, f"behind the camera: {where}", {"depth": depth})
+            return
         left, top, right, bottom = (depth * tangent for tangent in scene.camera.view_box)
         wide, tall = max(-left, right), max(-top, bottom)
         text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
