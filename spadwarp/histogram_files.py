@@ -79,6 +79,8 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
         raise FileError(
             f"{path}: {values.dtype} {values.shape}; real numbers [H, W, T] or [frames, H, W, T] are needed"
         )
+    if values.dtype.kind == "f" and np.isnan(values).any():
+        raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
     return read

@@ -109,7 +109,7 @@ def depth_of(
     filtered = method in ("matched", "likelihood")
     response = histograms.response if filtered else histograms.irf
     if filtered and response is None:
-        raise ValueError(f"method = {method!r} needs an instrument response")
+        raise ValueError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
     time = arrival_time(
         values,
         gate_start=histograms.gate_start,

@@ -35,7 +35,7 @@ def test_every_kind_of_file_holds_the_same_histograms(tmp_path):
     [
         (COUNTS[0], r"\(5, 40\); real numbers \[H, W, T\]"),
         (COUNTS - 2.0, "not negative"),
-        (np.full((2, 2, 2), np.nan), "finite"),
+        (np.full((2, 2, 2), np.nan), "holds NaN, as depth does"),
         (COUNTS.astype(complex), "complex128"),
         (np.zeros((0, 2, 2)), r"\(0, 2, 2\)"),
     ],

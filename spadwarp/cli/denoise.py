@@ -127,7 +127,8 @@ def denoise(
                 irf_fwhm_ps=irf_fwhm_ps,
             )
         there = float(np.isfinite(done.depth).mean())
-        told[one.name] = f"{len(done.depth)} frames, {100 * there:.3g} % of the pixels have a depth"
+        frames = "1 frame" if len(done.depth) == 1 else f"{count(len(done.depth))} frames"
+        told[one.name] = f"{frames}, {100 * there:.3g} % of the pixels have a depth"
         summary.append({"file": one, "gate": done.gate, "filled": there, "files": done.files, "notes": done.notes})
         if not quiet:
             for note in done.notes:
