@@ -92,7 +92,9 @@ def _chosen(exposures: Exposures, frames: int | slice | None) -> range:
         return every[frames : frames + 1]
     chosen = every if frames is None else every[frames]
     if not chosen:
-        raise ValueError(f"{exposures.place} holds {exposures.count} frames, none of them in {frames}")
+        ends = (None, None) if frames is None else (frames.start, frames.stop)
+        asked = ":".join("" if end is None else str(end) for end in ends)
+        raise ValueError(f"{exposures.place} holds {exposures.count} frames, none of them in {asked}")
     return chosen
 
 

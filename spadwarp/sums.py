@@ -66,7 +66,10 @@ def merge(results: Iterable[Result]) -> Result:
             ("batch size", first.batch_size, other.batch_size),
         ):
             if a != b:
-                detail = f" ({a} and {b})" if name != "scene" else ": only photons and output may differ"
+                detail = f" ({a} and {b})"
+                if name == "scene":
+                    sections = [one for one in type(first.scene).model_fields if getattr(a, one) != getattr(b, one)]
+                    detail = f" in {', '.join(sections)}: only photons and output may differ"
                 raise ConfigError(f"merge: the {name} of the results differs{detail}")
     try:
         ranges = joined(r for part in parts for r in part.photon_ranges)

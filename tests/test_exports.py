@@ -185,6 +185,9 @@ def test_command(frames, tmp_path):
         in run(tmp_path, "--format", "npy", "--out", tmp_path / "c", code=1).output
     )
     assert "outside" in run(frames, "--format", "npy", "--frames", 9, "--out", tmp_path / "d", code=2).output
+    assert (
+        "none of them in 5:" in run(frames, "--format", "npy", "--frames", "5:", "--out", tmp_path / "d", code=2).output
+    )
     make_result(make_scene()).save(tmp_path / "result.h5")
     refused = run(tmp_path / "result.h5", "--format", "npy", "--format", "mat", "--out", tmp_path / "e", code=2).output
     assert "draw frames first" in refused and not list((tmp_path / "e").iterdir())  # the array neither
