@@ -122,7 +122,7 @@ def test_what_cannot_be_merged_is_refused():
     with pytest.raises(spadwarp.ConfigError, match="seed of the results differs"):
         spadwarp.merge([a, spadwarp.simulate(one, photons=1000, seed=6, device="cpu", first_photon=1000)])
     other = one.with_overrides({"medium.extinction": 0.6})
-    with pytest.raises(spadwarp.ConfigError, match="scene"):
+    with pytest.raises(spadwarp.ConfigError, match="scene of the results differs in medium: only photons"):
         spadwarp.merge([a, spadwarp.simulate(other, photons=1000, seed=5, device="cpu", first_photon=1000)])
     with pytest.raises(spadwarp.ConfigError, match="photons = 1000 is outside"):
         spadwarp.simulate(one, photons=1000, device="cpu", resume=a)
