@@ -158,7 +158,11 @@ def evaluate(
         int, typer.Option(parser=whole_number, metavar="N", help="Frames of each level for BM3D, up to a minute each.")
     ] = 0,
     report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Also write a report: HTML, pictures, scores.json.")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Also write here: report.html, its pictures, scores.json; of a result photons.png alone.",
+        ),
     ] = None,
     seed: Annotated[
         int, typer.Option(parser=whole_number, metavar="N", help="Of the counts that are drawn from a result.")
@@ -249,7 +253,7 @@ def _sweep(
     if not quiet:
         say(f"RMSE [mm]; {found.about}")
         for row, ratio in enumerate(found.sbr):
-            table = Table(f"SBR {ratio:g}", *(f"{n:g} photons" for n in found.photons))
+            table = Table(f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons))
             for name, values in found.rmse.items():
                 title = "likelihood of each pixel" if name == "input" else TITLES[name]
                 table.add_row(title, *(f"{1e3 * one:.3g}" for one in values[row]))

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import html
 import json
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,8 @@ def _figure(width: float, height: float) -> Any:
 def _metrics(evaluation: Evaluation) -> Any:
     fields = ("psnr", "ssim", "entropy", "rmse_mm")
     targets = evaluation.targets
-    figure = _figure(3.1 * len(targets) + 1.0, 2.3 * len(fields) + 0.9)
+    width = max(3.1 * len(targets) + 1.0, 5.2)
+    figure = _figure(width, 2.3 * len(fields) + 0.9)
     axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
     places, labels = _level_axis(evaluation)
     lines: dict[str, Any] = {}
@@ -124,7 +126,8 @@ def _metrics(evaluation: Evaluation) -> Any:
                 axis.set_xticks(places, labels, fontsize=8)
                 axis.set_xlabel(_level_name(evaluation))
     names = [TITLES[name] for name in lines]
-    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=len(names), frameon=False, fontsize=9)
+    columns = min(len(names), int(width / 1.7))  # 1.7 inches hold the longest name and its line
+    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
     _stated(figure, evaluation.about)
     return figure
 
@@ -185,7 +188,8 @@ def _ranking(evaluation: Evaluation) -> Any:
 
 
 def _stated(figure: Any, text: str) -> None:
-    figure.supxlabel(text, fontsize=8, color="0.35")
+    width = int(14 * figure.get_figwidth())  # characters of this size
+    figure.supxlabel(textwrap.fill(text, width), fontsize=8, color="0.35")
 
 
 def _colours() -> Any:
@@ -290,10 +294,12 @@ def _gains(evaluation: Evaluation) -> str:
                 continue
             one, before = evaluation.mean(method, level=level), evaluation.mean("input", level=level)
             if method == "input":
-                cells.append((f"{one.psnr:.2f} dB, {one.ssim:.3f}", False))
+                cells.append((f"{one.psnr:.2f}\N{NO-BREAK SPACE}dB, {one.ssim:.3f}", False))
             else:
                 ssim = 100 * (one.ssim / before.ssim - 1)
-                cells.append((f"{one.psnr - before.psnr:+.2f} dB, {ssim:+.0f} %", False))
+                cells.append(
+                    (f"{one.psnr - before.psnr:+.2f}\N{NO-BREAK SPACE}dB, {ssim:+.0f}\N{NO-BREAK SPACE}%", False)
+                )
         window = " (" + ", ".join(map(str, evaluation.windows.values())) + ")" if method == "median" else ""
         rows.append((TITLES[method] + window, cells))
     return _html_table(["PSNR, SSIM", *evaluation.levels], rows)

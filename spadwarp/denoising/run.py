@@ -89,14 +89,16 @@ def draw_learning_curves(log: str | Path, path: str | Path, *, title: str) -> Pa
 
     lines = [json.loads(line) for line in Path(log).read_text().splitlines()]
     steps = [line["step"] for line in lines]
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained", facecolor="white")
+    size = 6.0 if len(lines) == 1 else 3.0  # a single point has no line to be seen by
+    figure = Figure(figsize=(9.6, 3.4), layout="constrained", facecolor="white")
     loss, psnr = figure.subplots(1, 2)
-    loss.plot(steps, [line["loss"] for line in lines], color="#0072B2", marker=".")
+    loss.plot(steps, [line["loss"] for line in lines], color="#0072B2", marker="o", markersize=size)
     loss.set(yscale="log", xlabel="step", ylabel="loss")
     for level, shade in zip(lines[-1]["psnr"], np.linspace(0.75, 0.0, len(lines[-1]["psnr"])), strict=True):
-        psnr.plot(steps, [line["psnr"][level] for line in lines], color=str(shade), marker=".", label=f"BS {level}")
+        values = [line["psnr"][level] for line in lines]
+        psnr.plot(steps, values, color=str(shade), marker="o", markersize=size, label=f"BS {level}")
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
-    psnr.legend(frameon=False, fontsize=8, ncols=2)
+    psnr.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (loss, psnr):
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(color="0.92")
