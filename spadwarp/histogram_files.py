@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
 
     `.h5`: a result or frames of spadwarp. `.npy`: `[H, W, T]` or `[frames, H, W, T]`. `.mat`: such an array in a file
     of MATLAB, version 7.3 included. `.ptu`: a T3 image of PicoQuant, frames and channels added up; its bins count from
-    the sync.
+    the sync, or from the start of the gate that `spadwarp export` wrote in its comment.
 
     Args:
         path: The file.
@@ -189,6 +190,15 @@ def _read_ptu(path: Path) -> Histograms:
             raise FileError(f"{path}: not a T3 image; {file.measurement_mode.name}, {file.measurement_submode.name}")
         image = file.decode_image(frame=-1, channel=-1, dtype=np.uint32, keepdims=False)
         width = float(file.tcspc_resolution)
+        start = _own_gate(file)
     if image.ndim == 2:  # a line scan
         image = image[None]
-    return Histograms(values=np.ascontiguousarray(image), bin_width=width)
+    return Histograms(values=np.ascontiguousarray(image), bin_width=width, gate_start=start)
+
+
+def _own_gate(file: Any) -> float:
+    """Time of flight at the start of bin 0 [s] as `spadwarp export` writes it in the comment; 0 for other writers."""
+    if file.tags.get("CreatorSW_Name") != "spadwarp":
+        return 0.0
+    found = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "")
+    return 1e-9 * float(found[1]) if found else 0.0

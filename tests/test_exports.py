@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 import spadwarp
 from spadwarp.cli import app
+from spadwarp.config import SPEED_OF_LIGHT
 from spadwarp.errors import FileError
 from spadwarp.frame_files import record_frames
 from spadwarp.histogram_files import read_histograms
@@ -117,6 +118,33 @@ def test_ptu_is_read_back_by_ptufile(frames, detection, tmp_path):
     spadwarp.export(frames, tmp_path / "one.ptu", frames=0)
     again = read_histograms(tmp_path / "one.ptu")
     assert again.values.sum() == detection.counts[0].sum()
+
+
+def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu", frames=0)
+    assert detection.gate_start > 0
+    assert read_histograms(path).gate_start == pytest.approx(detection.gate_start, abs=1e-15)
+    # The same words by another writer are not ours to believe.
+    with ptufile.PtuFile(path) as file:
+        about = file.comment
+    ptufile.imwrite(
+        tmp_path / "b.ptu",
+        np.ones((1, 2, 2, 1, 4), np.uint32),
+        global_resolution=50e-9,
+        tcspc_resolution=4e-12,
+        comment=about,
+    )
+    assert read_histograms(tmp_path / "b.ptu").gate_start == 0
+
+    ranges = {}
+    for name, options in {"own": (), "given": ("--gate-start-ns", 0)}.items():
+        arguments = ("depth", path, "--group-index", 1.3638, *options, "--device", "cpu", "--out", tmp_path / name)
+        done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        assert done.exit_code == 0, done.output
+        ranges[name] = np.load(tmp_path / name / "range.npy")
+    later = 0.5 * SPEED_OF_LIGHT / 1.3638 * detection.gate_start
+    assert np.nanmedian(ranges["own"] - ranges["given"]) == pytest.approx(later, rel=1e-4)
 
 
 def test_exr_is_read_back_by_openexr(frames, detection, result, tmp_path):

@@ -183,7 +183,8 @@ def depth(
         float | None, typer.Option(metavar="PS", help="Width of a bin; measured histograms need it, .ptu knows it.")
     ] = None,
     gate_start_ns: Annotated[
-        float | None, typer.Option(metavar="NS", help="Time of flight at the start of bin 0. Measured: 0 if not given.")
+        float | None,
+        typer.Option(metavar="NS", help="Time of flight at the start of bin 0. By default what the file knows, or 0."),
     ] = None,
     group_index: Annotated[
         float | None,
