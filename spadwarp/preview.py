@@ -31,32 +31,42 @@ _DPI = 150
 
 
 def write_previews(
-    result: Result, directory: str | Path, *, depth: NDArray[np.float64] | None = None, method: Method = "centroid"
+    result: Result,
+    directory: str | Path,
+    *,
+    depth: NDArray[np.float64] | None = None,
+    method: Method = "centroid",
+    formats: Sequence[Literal["png", "pdf"]] = ("png",),
 ) -> list[Path]:
-    """Writes `depth.png`, `intensity.png`, `histogram.png` and `truth.png`; returns their paths.
+    """Writes pictures of depth, intensity, histograms and truth, such as `depth.png`; returns their paths.
 
     Args:
         result: What to show; empty frames give empty pictures, not errors.
         directory: The folder, made if it is not there.
         depth: Depth frame `[H, W]` [m] to show; `result.depth(method=method)` if not given.
         method: How the frame was, or is to be, made; named in the picture.
+        formats: "png", and "pdf" with vectors, for print.
 
     Raises:
         FileError: The folder or a file cannot be written.
     """
     frame = result.depth(method=method) if depth is None else np.asarray(depth, dtype=np.float64)
     figures = {
-        "depth.png": _depth_figure(result, frame, method),
-        "intensity.png": _intensity_figure(result),
-        "histogram.png": _histogram_figure(result),
-        "truth.png": _truth_figure(result),
+        "depth": _depth_figure(result, frame, method),
+        "intensity": _intensity_figure(result),
+        "histogram": _histogram_figure(result),
+        "truth": _truth_figure(result),
     }
     paths = []
     for name, figure in figures.items():
-        path = Path(directory) / name
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, dpi=_DPI, format="png")
-        paths.append(path)
+        for ending in formats:
+            path = Path(directory) / f"{name}.{ending}"
+            with atomic_path(path) as temporary:
+                # Without the date, so that the same result makes the same file.
+                figure.savefig(
+                    temporary, dpi=_DPI, format=ending, metadata={"CreationDate": None} if ending == "pdf" else {}
+                )
+            paths.append(path)
     return paths
 
 

@@ -76,3 +76,13 @@ def test_pictures_need_no_pyplot() -> None:
     # pyplot would choose a window system for the caller.
     code = "import sys, spadwarp.preview; assert 'matplotlib.pyplot' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, env={"PYTHONPATH": ":".join(sys.path)})
+
+
+def test_pictures_for_print_are_vectors_and_the_same_again(tmp_path: Path) -> None:
+    result = make_result(make_scene())
+    first, second = (write_previews(result, tmp_path / run, method="peak", formats=["pdf"]) for run in ("a", "b"))
+    assert [path.name for path in first] == [name.replace("png", "pdf") for name in NAMES]
+    for one, other in zip(first, second, strict=True):
+        content = one.read_bytes()
+        assert content.startswith(b"%PDF")
+        assert content == other.read_bytes()

@@ -51,7 +51,9 @@ _RECORD_BYTES = 52  # of one photon's terminal state, id included
 _OTHER_BYTES = 16 << 20  # pictures, maps, text
 _NAMES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr")
 _CHECKPOINT = "checkpoint.h5"  # there while a run is not finished
-_PICTURES = ("depth.png", "intensity.png", "histogram.png", "truth.png")
+_PICTURES = tuple(
+    f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")
+)
 
 
 @app.command()
@@ -286,8 +288,9 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
     frame = result.depth(method=output.depth_method, device=device, **options)
     if output.exr:
         written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_exr(result, out / "truth.exr")]
-    if output.png:
-        written += write_previews(result, out, depth=frame, method=output.depth_method)
+    if output.png or output.pdf:
+        formats = [ending for ending in ("png", "pdf") if getattr(output, ending)]
+        written += write_previews(result, out, depth=frame, method=output.depth_method, formats=formats)
     return written, frame
 
 
