@@ -36,7 +36,7 @@ def write_previews(
     *,
     depth: NDArray[np.float64] | None = None,
     method: Method = "centroid",
-    formats: Sequence[Literal["png", "pdf"]] = ("png",),
+    formats: Sequence[str] = ("png",),
 ) -> list[Path]:
     """Writes pictures of depth, intensity, histograms and truth, such as `depth.png`; returns their paths.
 
