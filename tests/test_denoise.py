@@ -1,6 +1,7 @@
 """Denoising of frames and files, baselines, metrics, the evaluation and its report."""
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -221,6 +222,7 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert result.exit_code == 0, result.output
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5 and "http" not in page
+    assert re.search(r"[+-]\d+\.\d\d\u00a0dB, [+-]\d+\u00a0%", page)
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert {row["method"] for row in scores["scores"]} == {"input", "median"}
 
@@ -239,6 +241,13 @@ def test_training_from_a_dataset(dataset, tmp_path):
     assert result.exit_code == 0, result.output
     assert {one.name for one in (tmp_path / "run").iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert inference.weights_card("usdn", tmp_path / "run" / "usdn.safetensors")["seed"] == "0"
+    own = tmp_path / "run" / "usdn.safetensors"
+    trained = spadwarp.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
+    shipped = spadwarp.evaluate(dataset, models=("usdn",), frames=1, device="cpu")
+    assert trained.mean("usdn").psnr < shipped.mean("usdn").psnr  # two steps against a whole training
+    assert trained.mean("input") == shipped.mean("input") and str(own) in trained.about
+    with pytest.raises(ValueError, match="'usdn', which is not among models: dncnn"):
+        spadwarp.evaluate(dataset, models=("dncnn",), weights=own)
     recipe.write_text('model = "usdn"\n')
     assert CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "other")]).exit_code == 2
     with pytest.raises(ConfigError, match="data"):

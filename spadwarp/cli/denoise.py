@@ -164,6 +164,10 @@ def evaluate(
             help="Also write here: report.html, its pictures, scores.json; of a result photons.png alone.",
         ),
     ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of spadwarp train, for the network it names. By default the package's."),
+    ] = None,
     seed: Annotated[
         int, typer.Option(parser=whole_number, metavar="N", help="Of the counts that are drawn from a result.")
     ] = 0,
@@ -180,6 +184,7 @@ def evaluate(
     Examples:
       spadwarp dataset make configs/datasets/paper.toml --out data/paper/
       spadwarp evaluate data/paper/ --models all --report report/
+      spadwarp evaluate data/paper/ --weights runs/pyramid/pyramid.safetensors --report report/
       spadwarp evaluate out/result.h5 --report photons/
     """
     from rich.table import Table
@@ -194,11 +199,18 @@ def evaluate(
     if report is not None:
         check_writable(report)
     if data.is_file() or (data / "result.h5").is_file():
-        _sweep(data, chosen, report, seed=seed, device=device, quiet=quiet, json_path=json_path)
+        _sweep(data, chosen, report, weights=weights, seed=seed, device=device, quiet=quiet, json_path=json_path)
         return
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
         found = run(
-            data, models=chosen, split=split, frames=frames, bm3d_frames=bm3d_frames, device=device, progress=told
+            data,
+            models=chosen,
+            split=split,
+            frames=frames,
+            bm3d_frames=bm3d_frames,
+            weights=weights,
+            device=device,
+            progress=told,
         )
     written = write_report(found, report) if report is not None else []
     if not quiet:
@@ -233,6 +245,7 @@ def _sweep(
     models: list[str],
     report: Path | None,
     *,
+    weights: Path | None,
     seed: int,
     device: str | None,
     quiet: bool,
@@ -247,7 +260,12 @@ def _sweep(
     result = load_run(data)
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
         found = photon_sweep(
-            result, models=[one for one in models if one != "bm3d"], seed=seed, device=device, progress=told
+            result,
+            models=[one for one in models if one != "bm3d"],
+            weights=weights,
+            seed=seed,
+            device=device,
+            progress=told,
         )
     written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
     if not quiet:

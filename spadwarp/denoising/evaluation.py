@@ -19,7 +19,7 @@ from spadwarp.errors import FileError
 
 from .baselines import MEDIAN_WINDOWS
 from .frames import DepthFrames, depth_frames
-from .inference import METHODS, denoise_frames
+from .inference import METHODS, denoise_frames, own_weights
 from .metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
 
 __all__ = ["Evaluation", "Sample", "evaluate"]
@@ -110,6 +110,7 @@ def evaluate(
     split: str = "test",
     frames: int = 20,
     bm3d_frames: int = 0,
+    weights: str | os.PathLike[str] | None = None,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Evaluation:
@@ -121,6 +122,7 @@ def evaluate(
         split: "test", "validation", "train" or "all".
         frames: Of each target and level, at most; the same for each method.
         bm3d_frames: Of each level for BM3D, which takes up to a minute a frame; 0 leaves it out.
+        weights: File of `spadwarp train`, in place of the package's for the network that it names.
         device: torch device of the networks.
         progress: Called with ("frames", done, total).
 
@@ -129,8 +131,8 @@ def evaluate(
     middle of the gate.
 
     Raises:
-        ValueError: An argument out of range.
-        FileError: No dataset, or no frames in the split.
+        ValueError: An argument out of range; weights of a network that is not among the models.
+        FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + (["bm3d"] if bm3d_frames > 0 else [])
@@ -138,6 +140,7 @@ def evaluate(
         raise ValueError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
     if frames < 1:
         raise ValueError(f"frames = {frames} is outside [1, inf)")
+    own = own_weights(wanted, None if weights is None else Path(weights))
     chosen, photons, about = _chosen(data, split, frames)
     reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
     names = list(reader.manifest["targets"])
@@ -165,7 +168,7 @@ def evaluate(
             for method in methods:
                 if method == "bm3d" and used > quota:
                     continue
-                image = _estimate(noisy, method, windows.get(level, 5), device)
+                image = _estimate(noisy, method, windows.get(level, 5), own.get(method), device)
                 images[method] = image
                 raw.setdefault((method, target, level), []).append(score(clean, image, gate=noisy.gate))
                 if target == _STAIRCASE:
@@ -187,7 +190,7 @@ def evaluate(
         raise FileError(f"{data}: no frame of {split} sees a target")
     return Evaluation(
         data=f"{reader.manifest['name']} ({data})",
-        about=about,
+        about=about + "".join(f"; {name} with weights {path}" for name, path in own.items()),
         methods=methods,
         targets=tuple(dict.fromkeys(target for target, _ in counts)),
         levels=tuple(sorted(dict.fromkeys(level for _, level in counts), key=_level_order)),
@@ -260,10 +263,12 @@ def _has_target(clean: NDArray[np.float32], gate: tuple[float, float]) -> bool:
     return bool(seen.mean() > 0.01)
 
 
-def _estimate(frames: DepthFrames, method: str, window: int, device: str | None) -> NDArray[np.float32]:
+def _estimate(
+    frames: DepthFrames, method: str, window: int, weights: Path | None, device: str | None
+) -> NDArray[np.float32]:
     if method == "input":
         return np.nan_to_num(frames.depth[0], nan=0.5 * sum(frames.gate))
-    return denoise_frames(frames, model=method, window=window, device=device)[0][0]
+    return denoise_frames(frames, model=method, window=window, weights=weights, device=device)[0][0]
 
 
 def _best_windows(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -137,6 +137,20 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
     network = network.to(torch.device(device)).to(memory_format=torch.channels_last)
     return network.eval().requires_grad_(False), about
+
+
+def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, Path]:
+    """`weights` by the network that the file names; empty without. Raises `ValueError` if it is none of `models`."""
+    if weights is None:
+        return {}
+    if not Path(weights).is_file():
+        raise FileError(f"{weights}: no such file")
+    model = _metadata(Path(weights)).get("model")
+    if model not in MODELS:
+        raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
+    if model not in models:
+        raise ValueError(f"weights = {str(weights)!r} are of {model!r}, which is not among models: {', '.join(models)}")
+    return {model: Path(weights)}
 
 
 def _weights_path(model: str, weights: str | Path | None) -> Path:

@@ -26,7 +26,7 @@ from spadwarp.result import SPEED_OF_LIGHT
 
 from .baselines import MEDIAN_WINDOWS
 from .frames import DepthFrames, depth_frames
-from .inference import METHODS, denoise_frames
+from .inference import METHODS, denoise_frames, own_weights
 
 if TYPE_CHECKING:
     from spadwarp.result import Result
@@ -85,6 +85,7 @@ def photon_sweep(
     models: Sequence[str] = ("median", "usdn", "dncnn", "pyramid"),
     frames: int = 1,
     seed: int = 0,
+    weights: str | Path | None = None,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> PhotonSweep:
@@ -97,11 +98,13 @@ def photon_sweep(
         models: From `spadwarp.denoising.inference.METHODS`; the median has its best window everywhere.
         frames: Drawn and averaged for each point.
         seed: Of the counts.
+        weights: File of `spadwarp train`, in place of the package's for the network that it names.
         device: torch device of the networks.
         progress: Called with ("frames", done, total).
 
     Raises:
-        ValueError: An argument out of range.
+        ValueError: An argument out of range; weights of a network that is not among the models.
+        FileError: Weights that cannot be read.
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
     if unknown := [name for name in models if name not in METHODS]:
@@ -109,6 +112,7 @@ def photon_sweep(
     for name, values in (("photons", photons), ("sbr", sbr)):
         if not values or min(values) <= 0:
             raise ValueError(f"{name} = {list(values)} needs numbers in (0, inf)")
+    own = own_weights(models, weights)
     shape = (len(sbr), len(photons))
     squares = {name: np.zeros(shape) for name in ("input", *models)}
     tried = {window: np.zeros(shape) for window in MEDIAN_WINDOWS}
@@ -134,7 +138,7 @@ def photon_sweep(
                             found, _ = denoise_frames(noisy, model="median", window=window)
                             tried[window][row, column] += square(found[0])
                     else:
-                        found, _ = denoise_frames(noisy, model=name, device=device)
+                        found, _ = denoise_frames(noisy, model=name, weights=own.get(name), device=device)
                         squares[name][row, column] += square(found[0])
                 done += 1
                 if progress is not None:
@@ -148,6 +152,7 @@ def photon_sweep(
             f"Monte Carlo histograms of {result.photons:.2g} photons, water c = {scene.medium.extinction:.3g} 1/m, "
             f"target at {np.nanmedian(truth):.3g} m ({np.nanmedian(truth) * scene.medium.extinction:.2g} attenuation "
             f"lengths), gate of {scene.gate.bins} bins of {scene.gate.bin_width * 1e12:.3g} ps; seed {seed}"
+            + "".join(f"; {name} with weights {path}" for name, path in own.items())
         ),
         photons=tuple(map(float, photons)),
         sbr=tuple(map(float, sbr)),
