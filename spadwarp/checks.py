@@ -61,15 +61,25 @@ def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
 def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
     """Numbers that follow from a scene; lengths in m, None where there is no target in the view and the beam.
 
-    `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected number of unscattered
-    target photons that one pixel on the beam's axis detects from a pulse; `samples_per_pixel` how many of the traced
-    photons reach a pixel's part of the target unscattered. `histogram_bytes` is one set of tallies. Raises `MeshError`.
+    `attenuation_length` and `albedo` are those of the water before the first layer; `layers` has those of each layer,
+    with its start. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected number
+    of unscattered target photons that one pixel on the beam's axis detects from a pulse; `samples_per_pixel` how many
+    of the traced photons reach a pixel's part of the target unscattered. `histogram_bytes` is one set of tallies.
+    Raises `MeshError`.
     """
     shape = _Shape(scene, mesh)
     camera, gate, laser = scene.camera, scene.gate, scene.laser
     return {
         "attenuation_length": scene.medium.attenuation_length,
         "albedo": scene.medium.scattering / scene.medium.extinction,
+        "layers": [
+            {
+                "start": layer.start,
+                "attenuation_length": layer.attenuation_length,
+                "albedo": layer.scattering / layer.extinction,
+            }
+            for layer in scene.medium.layers
+        ],
         "target_range": shape.target_range,
         "target_arrival_ns": shape.arrival_ns,
         "optical_depth": shape.optical_depth,

@@ -260,7 +260,9 @@ def test_check_accepts_every_scene_that_comes_along():
     for path in sorted((ROOT / "configs" / "scenes").glob("*.toml")):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            assert "attenuation length" in run("check", path).stdout
+            told = run("check", path).stdout
+        lengths = told.partition("attenuation length")[2].partition("\n")[0].split("; ")
+        assert len(lengths) == len(spadwarp.load_scene(path).medium.waters) and all("albedo" in one for one in lengths)
 
 
 def test_info_tells_what_the_result_holds(scene, tmp_path):

@@ -73,7 +73,11 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
         return "-" if value is None else text.format(value)
 
     return {
-        "attenuation length": f"{numbers['attenuation_length']:.4g} m, albedo {numbers['albedo']:.3g}",
+        "attenuation length": "; ".join(
+            f"{water['attenuation_length']:.4g} m, albedo {water['albedo']:.3g}"
+            + (f" from {water['start']:.4g} m on" if "start" in water else "")
+            for water in (numbers, *numbers["layers"])
+        ),
         "target": f"{between(numbers['target_range'], 'm')}, {count(faces)} faces",
         "optical depth": about(numbers["optical_depth"], "{:.3g} one way"),
         "returns": between(numbers["target_arrival_ns"], "ns"),
