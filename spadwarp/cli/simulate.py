@@ -86,7 +86,7 @@ def simulate(
         typer.Option(
             metavar="X",
             help="Stop when the bins that decide the depth are known this well (0.02: 2 %); --photons is then the most "
-            "that are traced.",
+            "that are traced, rounded up to whole batches.",
         ),
     ] = None,
     resume: Annotated[
