@@ -1,0 +1,23 @@
+"""A plane with steps in a gate, and depth frames of it with stray pixels."""
+
+import numpy as np
+
+GATE = (13.5, 16.0)
+
+
+def scene(height=48, width=64):
+    """A plane at 15 m with three steps of 10 cm, and sky in a corner."""
+    depth = np.full((height, width), 15.0, np.float32)
+    for k in range(3):
+        depth[6:-6, 10 + 14 * k : 24 + 14 * k] = 14.9 - 0.1 * k
+    depth[:5, :5] = np.nan
+    return depth
+
+
+def noisy_frame(clean, share=0.3, seed=0):
+    generator = np.random.default_rng(seed)
+    frame = clean + generator.normal(0, 0.003, clean.shape).astype(np.float32)
+    stray = generator.random(clean.shape) < share
+    reach = np.nan_to_num(clean, nan=GATE[1]) - GATE[0]
+    frame[stray] = (GATE[0] + generator.random(clean.shape) * reach)[stray]
+    return frame.astype(np.float32)
