@@ -66,11 +66,47 @@ def test_pyramid_costs_less_than_a_tenth_of_dncnn():
     assert ours < 0.1 * theirs
 
 
+def windows(image, radius):
+    """`[B, 1, H, W]` to `[B, H, W, (2 radius + 1)²]`, beyond the border too."""
+    size = 2 * radius + 1
+    padded = torch.nn.functional.pad(image, (radius,) * 4, mode="replicate")[:, 0]
+    return padded.unfold(1, size, 1).unfold(2, size, 1).flatten(3)
+
+
 def test_order_statistics_are_those_of_a_sort():
     image = torch.rand(2, 1, 11, 9, generator=torch.Generator().manual_seed(1))
-    expected = networks._windows(image, 1).sort(dim=-1).values
-    for rank, values in zip(range(9), networks._ranks(image, tuple(range(9))), strict=True):
+    expected = windows(image, 1).sort(dim=-1).values
+    for rank, values in zip((2, 4, 6), networks._ranks(image), strict=True):
         assert torch.equal(values[:, 0], expected[..., rank])
+
+
+def test_pyramid_weighs_the_depths_about_a_pixel_and_the_means_of_blocks_about_its_own():
+    """The same mean, pixel by pixel: 25 depths, nine means of 4×4, nine of 16×16 pixels, one value of the network's."""
+    generator = torch.Generator().manual_seed(4)
+    network = networks.PyramidNet().eval()
+    frame = torch.rand(2, 3, 48, 32, generator=generator)
+    frame[:, 1] = (frame[:, 1] > 0.2).float()
+    head = torch.randn(network.leave.bias.shape, generator=generator)
+    with torch.no_grad():
+        network.leave.weight.zero_()
+        network.leave.bias.copy_(head)
+        found = network(frame)
+    depth, reported = frame[:, :1], frame[:, 1:2]
+    head = head.view(-1, 2, 2).repeat(1, 24, 16)  # what it says of the four pixels of a block is the same everywhere
+    true = head[-1].expand(2, 1, -1, -1)
+    certainty = true.sigmoid() * reported
+    values, trusts = [windows(depth, 2)], [windows(certainty, 2)]
+    for side in (4, 16):
+        share = torch.nn.functional.avg_pool2d(certainty, side)
+        mean = torch.nn.functional.avg_pool2d(certainty * depth, side) / (share + 1e-6)
+        for parts, image in ((values, mean), (trusts, share + 1e-6)):
+            parts.append(windows(image, 1).repeat_interleave(side, dim=1).repeat_interleave(side, dim=2))
+    values.append((0.5 + head[-3]).expand(2, -1, -1)[..., None])
+    trusts.append(torch.ones_like(values[-1]))
+    weights = head[:44].exp().permute(1, 2, 0) * torch.cat(trusts, dim=-1)
+    expected = (weights * torch.cat(values, dim=-1)).sum(dim=-1) / weights.sum(dim=-1)
+    assert torch.allclose(found[:, 0], expected, atol=1e-5)
+    assert torch.equal(found[:, 2:], true)
 
 
 def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():

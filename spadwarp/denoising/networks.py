@@ -74,7 +74,7 @@ class _Residual(nn.Module):
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(F.relu(x))))
+        return x + self.second(F.relu(self.first(F.relu(x)), inplace=True))
 
 
 def _blocks(channels: int, count: int) -> nn.Sequential:
@@ -97,14 +97,14 @@ class PyramidNet(nn.Module):
     """
 
     radius = 2
-    ranks = (2, 4, 6)  # of nine sorted depths
+    ranks = 3  # third, fifth and seventh of nine sorted depths
     blocks = (4, 16)  # sides of the coarse candidates
     stride = 16  # sizes are padded to multiples of it
 
     def __init__(self, *, widths: tuple[int, int, int, int] = (40, 64, 80, 96)) -> None:
         super().__init__()
         one, two, three, four = widths
-        self.enter = nn.Conv2d(4 * (3 + len(self.ranks)), one, 3, padding=1)
+        self.enter = nn.Conv2d(4 * (3 + self.ranks), one, 3, padding=1)
         self.down = nn.ModuleList(
             nn.Conv2d(wide, deep, 2, stride=2) for wide, deep in ((one, two), (two, three), (three, four))
         )
@@ -117,7 +117,7 @@ class PyramidNet(nn.Module):
         self.candidates = near + 9 * len(self.blocks)
         # For each of the 4 pixels of a block: weights of the candidates and of the own value, the own value, the
         # logits of "this pixel sees a target" and of "this depth is the target's".
-        self.leave = nn.Conv2d(one, 4 * (self.candidates + 4), 1)
+        self.leave = _Planes(one, 4 * (self.candidates + 4), 1)
         with torch.no_grad():  # begins near the identity
             assert self.leave.bias is not None
             bias = torch.zeros(self.candidates + 4)
@@ -132,8 +132,8 @@ class PyramidNet(nn.Module):
         bottom, right = -height % self.stride, -width % self.stride
         if bottom or right:
             frame = F.pad(frame, (0, right, 0, bottom), mode="replicate")
-        depth, reported, density = frame[:, :1], frame[:, 1:2], frame[:, 2:3]
-        ranked = [rank - depth for rank in _ranks(depth, self.ranks)]
+        depth, reported, density = (one.contiguous() for one in frame.split(1, dim=1))
+        ranked = [rank - depth for rank in _ranks(depth)]
         inputs = torch.cat([depth - 0.5, reported, 0.25 * density, *ranked], dim=1)
         x = self.before[0](self.enter(F.pixel_unshuffle(inputs, 2)))
         skipped = []
@@ -142,52 +142,83 @@ class PyramidNet(nn.Module):
             x = before(down(x))
         for level in (2, 1, 0):
             x = self.after[level](skipped[level] + F.pixel_shuffle(self.up[level](x), 2))
-        head = F.pixel_shuffle(self.leave(F.relu(x)), 2).float().permute(0, 2, 3, 1)  # candidates side by side
-        weights = head[..., : self.candidates + 1]
-        own, seen, true = head[..., self.candidates + 1 :].permute(0, 3, 1, 2).split(1, dim=1)
 
+        # From here on over the blocks, in planes of one candidate for one of a block's 2×2 pixels.
+        head = self.leave(F.relu(x)).float().unflatten(1, (-1, 2, 2))
         depth, reported = depth.float(), reported.float()
+        true = F.pixel_shuffle(head[:, -1].flatten(1, 2), 2)
         certainty = torch.sigmoid(true) * reported
         values = [_windows(depth, self.radius)]
         trusts = [_windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), self.radius)]
         for side in self.blocks:
             share = F.avg_pool2d(certainty, side)
-            mean = F.avg_pool2d(certainty * depth, side) / (share + 1e-6)
-            values.append(_enlarged(_windows(mean, 1), side))
-            trusts.append(_enlarged(_windows(torch.log(share + 1e-6), 1), side))
-        values.append(0.5 + own.permute(0, 2, 3, 1))
-        trusts.append(torch.zeros_like(values[-1]))
-        shares = (weights + torch.cat(trusts, dim=-1)).softmax(dim=-1)
-        found = (shares * torch.cat(values, dim=-1)).sum(dim=-1)[:, None]
-        return torch.cat([found, seen, true], dim=1)[..., :height, :width]
+            values.append(_coarse_windows(F.avg_pool2d(certainty * depth, side) / (share + 1e-6), side))
+            trusts.append(_coarse_windows(torch.log(share + 1e-6), side))
+        weights = head[:, : self.candidates].split([one.shape[1] * one.shape[2] for one in values], dim=1)
+        logits = [one.unflatten(1, trust.shape[1:3]) + trust for one, trust in zip(weights, trusts, strict=True)]
+        own = head[:, self.candidates :, None]
+        found = _weighted_mean([*logits, own[:, :1]], [*values, 0.5 + own[:, 1:2]])
+        output = torch.cat([found[:, None], head[:, -2:]], dim=1)
+        return F.pixel_shuffle(output.flatten(1, 3), 2)[..., :height, :width]
 
 
-def _ranks(depth: Tensor, ranks: tuple[int, ...]) -> list[Tensor]:
-    """Order statistics of each 3×3 neighbourhood by a sorting network of 25 exchanges (Floyd)."""
-    values = [one[..., 0][:, None] for one in _windows(depth, 1).split(1, dim=-1)]
-    for i, j in _SORT_NINE:
-        values[i], values[j] = torch.minimum(values[i], values[j]), torch.maximum(values[i], values[j])
-    return [values[rank] for rank in ranks]
+class _Planes(nn.Conv2d):
+    """1×1 convolution whose output lies in planes, whatever the memory format of its input."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        assert self.bias is not None
+        weight = self.weight.flatten(1).expand(len(x), -1, -1)
+        return torch.bmm(weight, x.flatten(2)).add_(self.bias[:, None]).unflatten(2, x.shape[2:])
 
 
-_SORT_NINE = (
-    (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (0, 3), (3, 6), (0, 3), (1, 4), (4, 7),
-    (1, 4), (2, 5), (5, 8), (2, 5), (1, 3), (5, 7), (2, 6), (4, 6), (2, 4), (2, 3), (5, 6),
-)  # fmt: skip
+def _ranks(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The third, fifth and seventh of the nine sorted values of each 3×3 neighbourhood.
+
+    Columns are sorted, then rows, after which columns are still so: what can be third is the second in size of two
+    sorted pairs, and the fifth is the middle one of the diagonal (Paeth, Graphics Gems, 1990).
+    """
+    height, width = depth.shape[-2:]
+    padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
+    column = _sorted(*(padded[..., row : row + height, :] for row in range(3)))
+    least, middle, most = (_sorted(*(line[..., first : first + width] for first in range(3))) for line in column)
+    third = torch.minimum(torch.maximum(least[1], middle[0]), torch.minimum(least[2], most[0]))
+    fifth = _sorted(least[2], middle[1], most[0])[1]
+    seventh = torch.maximum(torch.minimum(middle[2], most[1]), torch.maximum(least[2], most[0]))
+    return third, fifth, seventh
+
+
+def _sorted(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    a, b = torch.minimum(a, b), torch.maximum(a, b)
+    b, c = torch.minimum(b, c), torch.maximum(b, c)
+    return torch.minimum(a, b), torch.maximum(a, b), c
 
 
 def _windows(image: Tensor, radius: int) -> Tensor:
-    """`[B, 1, H, W]` to `[B, H, W, (2 radius + 1)²]`: windows, row by row, beyond the border too."""
+    """`[B, 1, 2h, 2w]` to `[B, n, n, 2, 2, h, w]`, n = 2 radius + 1: windows about each of the pixels of 2×2 blocks."""
     size = 2 * radius + 1
     padded = F.pad(image, (radius, radius, radius, radius), mode="replicate")[:, 0]
-    return padded.unfold(1, size, 1).unfold(2, size, 1).flatten(3)
+    blocks = padded.unfold(1, size + 1, 2).unfold(2, size + 1, 2).permute(0, 3, 4, 1, 2).contiguous()
+    return blocks.unfold(1, size, 1).unfold(2, size, 1).permute(0, 5, 6, 1, 2, 3, 4)  # overlapping views
 
 
-def _enlarged(image: Tensor, side: int) -> Tensor:
-    """`[B, H, W, C]` with every pixel repeated `side` times along rows and columns."""
-    batch, height, width, channels = image.shape
-    wide = image[:, :, None, :, None].expand(batch, height, side, width, side, channels)
-    return wide.reshape(batch, height * side, width * side, channels)
+def _coarse_windows(image: Tensor, side: int) -> Tensor:
+    """`[B, 1, 2h / side, 2w / side]` to `[B, 3, 3, 2, 2, h, w]`: all pixels of a coarse one have the same window."""
+    height, width = image.shape[-2:]
+    padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
+    windows = torch.cat([padded[..., y : y + height, x : x + width] for y in range(3) for x in range(3)], dim=1)
+    windows = F.interpolate(windows, scale_factor=side // 2).unflatten(1, (3, 3))
+    return windows[:, :, :, None, None].expand(-1, -1, -1, 2, 2, -1, -1)
+
+
+def _weighted_mean(logits: list[Tensor], values: list[Tensor]) -> Tensor:
+    """Mean over the second and third dimension of all parts together, with their softmax for weights.
+
+    The parts are not laid side by side: what takes time here is memory.
+    """
+    highest = torch.stack([one.detach().amax(dim=(1, 2)) for one in logits]).amax(dim=0)[:, None, None]
+    weights = [(one - highest).exp_() for one in logits]
+    sums = [(one * value).sum(dim=(1, 2)) for one, value in zip(weights, values, strict=True)]
+    return torch.stack(sums).sum(dim=0) / torch.stack([one.sum(dim=(1, 2)) for one in weights]).sum(dim=0)
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {"usdn": USDN, "dncnn": DnCNN, "pyramid": PyramidNet}
