@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .cpu_bvh import mesh_query_ray_cpu
+
 _INV_PI = wp.constant(0.3183098861837907)
 
 
@@ -71,6 +73,22 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
         hit.face = query.face
         hit.distance = query.t
         hit.normal = wp.where(wp.dot(query.normal, u) > 0.0, -query.normal, query.normal)
+    return hit
+
+
+@wp.func
+def intersect_mesh_cpu(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float, any: bool) -> SurfaceHit:
+    """`intersect_mesh` on the CPU; `any` is content with the first face that is found, which need not be the
+    nearest."""
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.distance = max_distance
+    found = mesh_query_ray_cpu(mesh, x, u, max_distance, any)
+    if found[0] >= wp.float64(0.0):
+        hit.face = int(found[0])
+        hit.distance = float(found[1])
+        normal = wp.mesh_eval_face_normal(mesh, hit.face)
+        hit.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
     return hit
 
 

@@ -76,6 +76,23 @@ def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: int, value: wp.int6
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
+    return late;
+#else
+    long long* voxels = reinterpret_cast<long long*>(tally.data);
+    __builtin_prefetch(voxels + index, 1);
+    __atomic_fetch_add(voxels + late[0], static_cast<long long>(late[1]), __ATOMIC_RELAXED);
+    return wp::vec2l(index, value);
+#endif
+""")
+def add_late(tally: wp.array(dtype=wp.int64), late: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
+    """`atomic_add_int64`, on the CPU one call late: a core that waits for a voxel to come from memory stands still, so
+    the (index, value) that the call before returned is added now, and this one's voxel is sent for."""
+    ...
+
+
 @wp.func
 def to_ledger(weight: float) -> wp.int64:
     """A weight >= 0 in ledger units, rounded to nearest."""
@@ -107,22 +124,24 @@ def add_to_ledger(ledger: wp.array(dtype=wp.int64), thread: int, entry: int, val
 def deposit(
     tally: wp.array(dtype=wp.int64),
     ledger: wp.array(dtype=wp.int64),
+    late: wp.vec2l,
     thread: int,
     index: int,
     value: float,
     scale: float,
     dither: float,
-):
-    """Adds a contribution to a voxel of the tally; index -1 or -2 counts it in the ledger as before or after the
-    gate."""
+) -> wp.vec2l:
+    """Adds a contribution to a voxel of the tally, see `add_late`; index -1 or -2 counts it in the ledger as before or
+    after the gate."""
     units = to_fixed_point(value, scale, dither)
     if units < wp.int64(0):
         add_to_ledger(ledger, thread, wp.where(units == wp.int64(-1), CLIPPED, INVALID), wp.int64(1))
     elif index >= 0:
         if units > wp.int64(0):
-            atomic_add_int64(tally, index, units)
+            late = add_late(tally, late, index, units)
     else:
         # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
         add_to_ledger(
             ledger, thread, wp.where(index == -1, BEFORE_GATE, AFTER_GATE), (units + wp.int64(128)) >> OUTSIDE_SHIFT
         )
+    return late

@@ -49,6 +49,7 @@ from .surface import (
     face_reflectance,
     intersect_faces,
     intersect_mesh,
+    intersect_mesh_cpu,
     lambert_brdf,
     offset_from_surface,
     pattern_reflectance,
@@ -68,6 +69,7 @@ from .tally import (
     WATER_COLLISIONS,
     WEIGHT_CUTOFF,
     add_to_ledger,
+    atomic_add_int64,
     deposit,
     to_ledger,
 )
@@ -218,6 +220,7 @@ class _Walk:
     dither: float
     pending_index: int
     pending_value: float
+    late: wp.vec2l  # a voxel that is still to be added to
     # What the thread has to tell:
     absorbed_water: wp.int64
     absorbed_surface: wp.int64
@@ -304,6 +307,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         lane = thread % wp.static(32 if cuda else 1)
         s.first = thread - lane - wp.where(wp.static(cuda), thread_count, 1)
         s.taken = 32
+        if wp.static(not cuda):
+            # Launches on several cores write to slots of the ledger that lie in cache lines of their own.
+            thread = 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp wait for a ray
@@ -416,9 +422,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 if s.surface_count == 1 and s.collisions == 1:
                                     component = BALLISTIC
                                 s.contributions += 1
-                                deposit(
+                                s.late = deposit(
                                     tally,
                                     ledger,
+                                    s.late,
                                     thread,
                                     tally_index(camera, gate, pixel, s.path + crossing, component),
                                     s.weight,
@@ -516,7 +523,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 if not seen:
                                     s.ray = _NO_RAY
                         if seen:
-                            deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
+                            s.late = deposit(
+                                tally, ledger, s.late, thread, s.pending_index, s.pending_value, scale, s.dither
+                            )
                             s.ray = _NO_RAY
 
                 if s.stage == _SCATTER and s.ray == _NO_RAY:
@@ -730,7 +739,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             to = s.lens - origin
                             length = wp.length(to)
                             to = to / length
-                    hit = intersect_mesh(surfaces.mesh, origin, to, length)
+                    if wp.static(cuda):
+                        hit = intersect_mesh(surfaces.mesh, origin, to, length)
+                    else:
+                        hit = intersect_mesh_cpu(surfaces.mesh, origin, to, length, s.ray == _SHADOW_RAY)
                     if s.ray == _SURFACE_RAY:
                         s.surface_queries += 1
                         if hit.face >= 0:
@@ -742,9 +754,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     else:
                         s.shadow_queries += 1
                         if hit.face < 0:
-                            deposit(tally, ledger, thread, s.pending_index, s.pending_value, scale, s.dither)
+                            s.late = deposit(
+                                tally, ledger, s.late, thread, s.pending_index, s.pending_value, scale, s.dither
+                            )
                     s.ray = _NO_RAY
 
+        if wp.static(not cuda and spec.estimator != "none"):
+            atomic_add_int64(tally, int(s.late[0]), s.late[1])
         add_to_ledger(ledger, thread, ABSORBED_WATER, s.absorbed_water)
         add_to_ledger(ledger, thread, ABSORBED_SURFACE, s.absorbed_surface)
         add_to_ledger(ledger, thread, DIRECTED, s.directed)

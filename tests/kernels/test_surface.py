@@ -15,6 +15,7 @@ from spadwarp_kernels import (
     segment_meets_box,
     u01,
 )
+from spadwarp_kernels.surface import intersect_mesh_cpu
 from statistics_of_samples import DEVICES
 
 
@@ -64,6 +65,28 @@ def _boxes(x: wp.array(dtype=wp.vec3), u: wp.array(dtype=wp.vec3), length: float
     meets[i] = wp.where(box, 1, 0)
 
 
+@wp.kernel(enable_backward=False)
+def _both_walks(
+    mesh: wp.uint64,
+    x: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    reach: float,
+    face: wp.array2d(dtype=int),
+    distance: wp.array2d(dtype=float),
+):
+    """Nearest hit by Warp's walk, by the CPU's, and any hit by the CPU's."""
+    i = wp.tid()
+    query = wp.mesh_query_ray(mesh, x[i], u[i], reach)
+    face[i, 0] = wp.where(query.result, query.face, -1)
+    distance[i, 0] = wp.where(query.result, query.t, reach)
+    nearest = intersect_mesh_cpu(mesh, x[i], u[i], reach, False)
+    face[i, 1] = nearest.face
+    distance[i, 1] = nearest.distance
+    some = intersect_mesh_cpu(mesh, x[i], u[i], reach, True)
+    face[i, 2] = some.face
+    distance[i, 2] = some.distance
+
+
 SHAPES = {
     "box": (trimesh.creation.box(extents=(1, 2, 3)), (0.9, 1.8, 2.7)),
     "sphere": (trimesh.creation.icosphere(subdivisions=4, radius=1.0), (1.0, 1.0, 1.0)),
@@ -80,6 +103,30 @@ def test_random_rays_do_not_leak(name, device):
     leaks = wp.zeros(threads, dtype=int, device=device)
     wp.launch(_leaks, threads, [mesh.id, wp.vec3(*extent), rays, leaks], device=device)
     assert leaks.numpy().sum() <= (10 if device != "cpu" else 0)
+
+
+def test_the_walk_of_a_cpu_core_hits_what_warp_hits():
+    """In a soup of triangles of all sizes, from outside and inside, along the axes too; and in the shapes above."""
+    rng = np.random.default_rng(5)
+    corners = rng.normal(size=(3000, 1, 3)) + rng.lognormal(-2.0, 1.0, (3000, 1, 1)) * rng.normal(size=(3000, 3, 3))
+    soup = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(9000).reshape(-1, 3), process=False)
+    x = rng.uniform(-3, 3, size=(50_000, 3))
+    u = rng.normal(size=x.shape)
+    u[:5000, 0] = 0.0
+    u[2500:7500, 1] = 0.0
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    for shape in (soup, *(shape for shape, _ in SHAPES.values())):
+        mesh = _mesh(shape, "cpu")
+        arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3, device="cpu") for a in (x, u)]
+        face = wp.zeros((len(x), 3), dtype=int, device="cpu")
+        distance = wp.zeros((len(x), 3), dtype=float, device="cpu")
+        wp.launch(_both_walks, len(x), [mesh.id, *arrays, 4.0, face, distance], device="cpu")
+        face, distance = face.numpy(), distance.numpy()
+        assert 0.05 < (face[:, 0] >= 0).mean() < 0.95
+        np.testing.assert_array_equal(distance[:, 1], distance[:, 0])
+        assert (face[:, 1] == face[:, 0]).mean() > 0.999  # faces that share an edge may both be hit there
+        np.testing.assert_array_equal(face[:, 2] >= 0, face[:, 0] >= 0)
+        assert (distance[:, 2] >= distance[:, 0]).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)
