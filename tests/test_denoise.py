@@ -1,8 +1,13 @@
 """Denoising of frames and files, baselines, metrics, the evaluation and its report."""
 
 import json
+import os
 import re
+import subprocess
+import sys
+import time
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -233,6 +238,66 @@ def test_training_from_a_dataset(dataset, tmp_path):
     assert CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "other")]).exit_code == 2
     with pytest.raises(ConfigError, match="data"):
         spadwarp.train(recipe, tmp_path / "other")
+
+
+def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, monkeypatch):
+    """torchrun, stopped in the middle and started again, against one process that takes both halves of each batch.
+
+    They add up the same gradients in another order. Weights agree to a thousandth of the way they went, since Adam and
+    the maxima in the network enlarge differences of rounding; half the batch alone would send them another way.
+    """
+    from spadwarp.denoising import training
+    from spadwarp.denoising.recipe import load_training_recipe
+    from spadwarp.denoising.run import read_scenes
+
+    place, out = tmp_path / "recipe.toml", tmp_path / "two"
+    optimiser = "steps = 16\nbatch = 4\ncrop = 32\nreport_every = 4\nwarm_up = 2\naveraging = 0.5"
+    place.write_text(
+        f'model = "usdn"\ndata = "{dataset}"\nseed = 3\n[optimiser]\n{optimiser}\n[noise]\ncounting = 0.0\n'
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += ["-m", "spadwarp", "train", str(place), "--out", str(out), "--device", "cpu"]
+    paths = os.pathsep.join([str(Path(spadwarp.__file__).parents[1]), *filter(None, sys.path)])
+    options = {"env": {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}, "text": True}
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options) as run:
+        while run.poll() is None and not (out / "checkpoint.pt").is_file():
+            time.sleep(0.02)
+        run.terminate()
+        said = run.communicate(timeout=60)[1]
+    assert (out / "checkpoint.pt").is_file(), said
+    assert not (out / "usdn.safetensors").exists()
+    with (out / "log.jsonl").open("a") as file:
+        file.write('{"step": 1')  # of a kill between a line and its checkpoint
+    again = subprocess.run(command, capture_output=True, timeout=60, **options)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("written") == 1 and "strides" not in again.stderr
+    names = sorted(one.name for one in out.iterdir() if one.name[0] != ".")  # hidden: what was half written
+    assert names == ["checkpoint.pt", "curves.png", "log.jsonl", "usdn.safetensors"]
+    steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
+    assert steps == [4, 8, 12, 16]
+
+    streams = [torch.Generator().manual_seed(3 * 1009 + rank) for rank in range(2)]
+    draw, loss = training.draw_batch, training.loss_of
+
+    def both(scenes, noise, *, size, generator, **others):
+        if others.get("always_replaced"):  # of the validation
+            return draw(scenes, noise, size=size, generator=generator, **others)
+        halves = [vars(draw(scenes, noise, size=size // 2, generator=one, **others)) for one in streams]
+        return training.Batch(**{name: torch.cat([half[name] for half in halves]) for name in halves[0]})
+
+    def mean_loss(output, batch, *, kind):
+        halves = zip(*(one.chunk(2) for one in (output, batch.frame, batch.clean, batch.hit)), strict=True)
+        return sum(loss(one, training.Batch(*parts), kind=kind) for one, *parts in halves) / 2
+
+    monkeypatch.setattr(training, "draw_batch", both)
+    monkeypatch.setattr(training, "loss_of", mean_loss)
+    scenes = [read_scenes(dataset, split) for split in ("train", "validation")]
+    training.fit(load_training_recipe(place), *scenes, tmp_path / "one", device="cpu")
+    torch.manual_seed(3)
+    networks = training.build_network("usdn"), *(torch.load(one / "checkpoint.pt") for one in (out, tmp_path / "one"))
+    states = [networks[0].state_dict(), *(one["network"] for one in networks[1:])]
+    new, two, one = (torch.cat([values.flatten() for values in state.values()]) for state in states)
+    assert (one - two).norm() < 1e-3 * (one - new).norm()
 
 
 # Few photons

@@ -323,9 +323,10 @@ def train(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out: {out} is a file; a directory is needed")
     check_writable(out)
-    with arguments_checked(), progress(quiet=quiet, unit="steps") as told:
+    first = int(os.environ.get("RANK", "0")) == 0
+    with arguments_checked(), progress(quiet=quiet or not first, unit="steps") as told:
         trained = run(chosen, out, device=device, progress=told)
-    if int(os.environ.get("RANK", "0")) == 0:
+    if first:
         if not quiet:
             say(
                 rows(

@@ -167,7 +167,8 @@ class _Planes(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         assert self.bias is not None
-        weight = self.weight.flatten(1).expand(len(x), -1, -1)
+        weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # in this order for the layout of its gradient
+        weight = weight.expand(len(x), -1, -1)
         return torch.bmm(weight, x.flatten(2)).add_(self.bias[:, None]).unflatten(2, x.shape[2:])
 
 

@@ -92,8 +92,9 @@ def draw_learning_curves(log: str | Path, path: str | Path, *, title: str) -> Pa
     size = 6.0 if len(lines) == 1 else 3.0  # a single point has no line to be seen by
     figure = Figure(figsize=(9.6, 3.4), layout="constrained", facecolor="white")
     loss, psnr = figure.subplots(1, 2)
-    loss.plot(steps, [line["loss"] for line in lines], color="#0072B2", marker="o", markersize=size)
-    loss.set(yscale="log", xlabel="step", ylabel="loss")
+    losses = [line["loss"] for line in lines]
+    loss.plot(steps, losses, color="#0072B2", marker="o", markersize=size)
+    loss.set(yscale="log" if min(losses) > 0 else "linear", xlabel="step", ylabel="loss")  # "psnr" is a logarithm
     for level, shade in zip(lines[-1]["psnr"], np.linspace(0.75, 0.0, len(lines[-1]["psnr"])), strict=True):
         values = [line["psnr"][level] for line in lines]
         psnr.plot(steps, values, color=str(shade), marker="o", markersize=size, label=f"BS {level}")

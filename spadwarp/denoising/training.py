@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.files import atomic_path
 
+from .inference import _device
 from .networks import build_network
 from .noise import Batch, CleanScenes, draw_batch
 from .recipe import Noise, TrainingRecipe
@@ -69,11 +70,15 @@ def fit(
         recipe: Model, noise and optimiser.
         training, validation: Clean scenes, on any device.
         out: Folder for `checkpoint.pt`, `log.jsonl` and the weights.
-        device: torch device; default: the GPU of this process, else the CPU.
+        device: "cpu", "cuda" or "cuda:N"; default: the GPU of this process, else the CPU.
         progress: Called with ("steps", done, total).
+
+    Each process draws crops and noise of its own. A run by N processes is one by a single process whose batches are the
+    N parts side by side, to the rounding of sums; batch normalisation alone, DnCNN's, sees only its own part.
 
     Raises:
         ConfigError: The folder holds a run of another recipe, or a crop is larger than the scenes.
+        DeviceError: No such device.
         FileError: The weights cannot be written.
     """
     crew = _Crew(device)
@@ -81,7 +86,7 @@ def fit(
     if settings.crop > min(training.depth.shape[1:]):
         raise ConfigError(f"optimiser.crop = {settings.crop} is outside [32, {min(training.depth.shape[1:])}]")
     if settings.batch % crew.size:
-        raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {crew.size} GPUs")
+        raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {crew.size} processes")
     folder.mkdir(parents=True, exist_ok=True)
     training, validation = training.to(crew.device), validation.to(crew.device)
     torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = crew.is_cuda
@@ -240,8 +245,11 @@ class _Crew:
     def __init__(self, device: str | None) -> None:
         self.size, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
         self.is_cuda = torch.cuda.is_available() if device is None else device.startswith("cuda")
-        local = int(os.environ.get("LOCAL_RANK", 0))
-        self.device = torch.device(device or (f"cuda:{local}" if self.is_cuda else "cpu"))
+        if self.is_cuda and device in (None, "cuda"):
+            device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
+        elif self.is_cuda and self.size > 1:
+            raise ConfigError(f"device = {device!r} is one for all {self.size} processes; leave it out")
+        self.device = _device(torch, device)
         self.placed: dict[str, Any] = {"device_ids": [self.device.index]} if self.is_cuda else {}
         if self.is_cuda:
             torch.cuda.set_device(self.device)
@@ -257,9 +265,10 @@ def _resume(
     folder: Path, recipe: TrainingRecipe, state: dict[str, Any], generator: torch.Generator, crew: _Crew
 ) -> tuple[int, float]:
     """Steps done and seconds spent by an earlier part of the run, whose state is put back."""
-    path = folder / _CHECKPOINT
+    path, log = folder / _CHECKPOINT, folder / "log.jsonl"
     if not path.is_file():
-        (folder / "log.jsonl").unlink(missing_ok=True)
+        if crew.rank == 0:
+            log.unlink(missing_ok=True)
         return 0, 0.0
     try:
         kept = torch.load(path, map_location="cpu", weights_only=True)
@@ -271,6 +280,11 @@ def _resume(
         part.load_state_dict(kept[name])
     if crew.rank < len(kept["random"]):
         generator.set_state(kept["random"][crew.rank])
+    if crew.rank == 0 and log.is_file():  # a line is written before its checkpoint
+        lines = log.read_text().splitlines(keepends=True)
+        lines = lines[: math.ceil(kept["step"] / recipe.optimiser.report_every)]
+        with atomic_path(log) as temporary:
+            temporary.write_text("".join(lines))
     return int(kept["step"]), float(kept["seconds"])
 
 
