@@ -15,7 +15,7 @@ from spadwarp_kernels import (
     segment_meets_box,
     u01,
 )
-from spadwarp_kernels.surface import intersect_mesh_cpu
+from spadwarp_kernels.surface import intersect_faces, intersect_mesh_cpu
 from statistics_of_samples import DEVICES
 
 
@@ -71,10 +71,11 @@ def _both_walks(
     x: wp.array(dtype=wp.vec3),
     u: wp.array(dtype=wp.vec3),
     reach: float,
+    planes: wp.array(dtype=wp.vec4),
     face: wp.array2d(dtype=int),
     distance: wp.array2d(dtype=float),
 ):
-    """Nearest hit by Warp's walk, by the CPU's, and any hit by the CPU's."""
+    """Nearest hit by Warp's walk and by the CPU's; any hit by the CPU's; nearest of the faces tried one by one."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, x[i], u[i], reach)
     face[i, 0] = wp.where(query.result, query.face, -1)
@@ -85,6 +86,9 @@ def _both_walks(
     some = intersect_mesh_cpu(mesh, x[i], u[i], reach, True)
     face[i, 2] = some.face
     distance[i, 2] = some.distance
+    tried = intersect_faces(planes, x[i], u[i], reach)
+    face[i, 3] = tried.face
+    distance[i, 3] = tried.distance
 
 
 SHAPES = {
@@ -105,7 +109,7 @@ def test_random_rays_do_not_leak(name, device):
     assert leaks.numpy().sum() <= (10 if device != "cpu" else 0)
 
 
-def test_the_walk_of_a_cpu_core_hits_what_warp_hits():
+def test_a_cpu_core_hits_what_warp_hits_and_so_do_faces_one_by_one():
     """In a soup of triangles of all sizes, from outside and inside, along the axes too; and in the shapes above."""
     rng = np.random.default_rng(5)
     corners = rng.normal(size=(3000, 1, 3)) + rng.lognormal(-2.0, 1.0, (3000, 1, 1)) * rng.normal(size=(3000, 3, 3))
@@ -118,15 +122,19 @@ def test_the_walk_of_a_cpu_core_hits_what_warp_hits():
     for shape in (soup, *(shape for shape, _ in SHAPES.values())):
         mesh = _mesh(shape, "cpu")
         arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3, device="cpu") for a in (x, u)]
-        face = wp.zeros((len(x), 3), dtype=int, device="cpu")
-        distance = wp.zeros((len(x), 3), dtype=float, device="cpu")
-        wp.launch(_both_walks, len(x), [mesh.id, *arrays, 4.0, face, distance], device="cpu")
+        planes = sk.make_surfaces(mesh).planes  # of the box alone
+        face = wp.zeros((len(x), 4), dtype=int, device="cpu")
+        distance = wp.zeros((len(x), 4), dtype=float, device="cpu")
+        wp.launch(_both_walks, len(x), [mesh.id, *arrays, 4.0, planes, face, distance], device="cpu")
         face, distance = face.numpy(), distance.numpy()
         assert 0.05 < (face[:, 0] >= 0).mean() < 0.95
         np.testing.assert_array_equal(distance[:, 1], distance[:, 0])
         assert (face[:, 1] == face[:, 0]).mean() > 0.999  # faces that share an edge may both be hit there
         np.testing.assert_array_equal(face[:, 2] >= 0, face[:, 0] >= 0)
         assert (distance[:, 2] >= distance[:, 0]).all()
+        if planes.size:
+            assert ((face[:, 3] >= 0) == (face[:, 0] >= 0)).mean() > 0.999
+            np.testing.assert_allclose(distance[:, 3], distance[:, 0], rtol=1e-4, atol=0.0)
 
 
 @pytest.mark.parametrize("device", DEVICES)
