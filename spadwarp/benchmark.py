@@ -13,7 +13,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +53,8 @@ class Case:
         estimator: The kernel's, in place of the scene's: "none" walks without a camera.
         photons: Of one run; None: what suits the device.
         absorbed: Absorbed fraction of the light that is known from elsewhere, and half its last digit.
+        error: Whether to spend a run on the relative error.
+        enough: Seconds of timed runs after which none is repeated.
     """
 
     name: str
@@ -62,6 +64,8 @@ class Case:
     estimator: str | None = None
     photons: int | None = None
     absorbed: tuple[float, float] | None = None
+    error: bool = True
+    enough: float = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +86,8 @@ class BenchResult:
         memory: Most memory of the device that the case held at a time [bytes]; None where Warp cannot tell (the CPU).
         tally_bytes: Of it the histograms, known everywhere; None without a camera.
         error_per_root_second: Relative standard error of the bins that decide the depth (`Result.relative_error`) after
-            one second of transport, falling with the root of the time; None without a camera, infinite where nothing
-            returned.
+            one second of transport, falling with the root of the time; None where it was not asked for or there is no
+            camera, infinite where nothing returned.
         check: Where a mean is known from elsewhere: `name`, `value`, `standard_error`, `reference`, `passed`.
     """
 
@@ -235,7 +239,7 @@ def _scaling(cuda: bool) -> list[Case]:
     base = _at_5m(_staircase())
     box = {"builtin": "box", "size": [3.0, 3.0, 0.5], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096)]
-    return [
+    cases = [
         *(
             Case(f"photons_1e{power}", f"staircase_5m, 1e{power} photons", scene=base, photons=10**power)
             for power in range(5, 11 if cuda else 8)
@@ -253,6 +257,7 @@ def _scaling(cuda: bool) -> list[Case]:
             for width, height, bins in (images if cuda else images[:3])
         ),
     ]
+    return [replace(case, error=False, enough=2.0) for case in cases]
 
 
 GROUPS: dict[str, Callable[[bool], list[Case]]] = {"scaling": _scaling}
@@ -269,6 +274,7 @@ def bench(
     photons: int | None = None,
     repeats: int = 3,
     progress: Callable[[Case], None] | None = None,
+    found: Callable[[BenchResult], None] | None = None,
 ) -> list[BenchResult]:
     """Measures cases one after the other.
 
@@ -277,8 +283,10 @@ def bench(
         device: As for `spadwarp.simulate`.
         photons: Of one timed run of a transport case, > 0; by default 2^26 on a GPU and 2^18 a core on a CPU.
             "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
-        repeats: Timed runs of each case, > 0; rates are those of the fastest.
+        repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are repeated for two
+            seconds at most.
         progress: Called with each case before it is run.
+        found: Called with each result as it comes.
 
     Raises:
         ConfigError: An unknown case, or a number out of range.
@@ -298,40 +306,79 @@ def bench(
         if progress is not None:
             progress(case)
         results.append(_KINDS[case.kind](case, wp_device, photons, repeats))
+        if found is not None:
+            found(results[-1])
     return results
 
 
-def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int) -> BenchResult:
-    import spadwarp_kernels as sk
-    from spadwarp.model import build_model, transport_spec
-    from spadwarp.targets import build_mesh
+class TransportRun:
+    """A transport case on a device, set up and compiled.
 
+    Attributes:
+        setup, compile: Seconds that this took, see `BenchResult`.
+        faces: Triangles of the target.
+        tally_bytes: Of the histograms; None without a camera.
+    """
+
+    def __init__(self, case: Case, device: wp.Device) -> None:
+        import spadwarp_kernels as sk
+        from spadwarp.model import build_model, transport_spec
+        from spadwarp.targets import build_mesh
+
+        scene = Scene.from_dict(case.scene)
+        began = time.perf_counter()
+        mesh = build_mesh(scene)
+        blind = case.estimator == "none"
+        self._model: Model = build_model(scene, device, mesh, camera=not blind)
+        self._data: Data = sk.make_data(self._model)
+        self._spec = transport_spec(scene, mesh, **({} if case.estimator is None else {"estimator": case.estimator}))
+        _wait(device)
+        ready = time.perf_counter()
+        sk.load_transport_kernel(self._spec, device)
+        self.setup, self.compile = ready - began, time.perf_counter() - ready
+        self.faces = 0 if mesh is None else mesh.face_count
+        self.tally_bytes = None if blind else 8 * self._model.tally_size
+
+    def run(self, photons: int, *, first: int = 0) -> tuple[dict[str, int], dict[str, int], float]:
+        """Ledger and counters of the photons with ids from `first` on, on a CPU with a thread for each core, and the
+        seconds until the device had finished."""
+        import spadwarp_kernels as sk
+
+        def launch(start: int, stop: int) -> None:
+            for at in range(start, stop, _PASS):
+                sk.launch_transport(
+                    self._spec, self._model, self._data, seed=0, first_id=at, photon_count=min(_PASS, stop - at)
+                )
+
+        device = self._model.device
+        workers = 1 if device.is_cuda else min(core_count(), photons)
+        edges = [first + photons * i // workers for i in range(workers + 1)]
+        self._data.ledger.zero_()
+        _wait(device)
+        began = time.perf_counter()
+        if workers == 1:
+            launch(first, first + photons)
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(launch, edges[:-1], edges[1:]))
+        _wait(device)
+        seconds = time.perf_counter() - began
+        return (*sk.read_ledger(self._data), seconds)
+
+
+def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int) -> BenchResult:
     usual = CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count()
     photons = case.photons or photons or usual
-    scene = Scene.from_dict(case.scene)
     memory = _Memory(device)
-    began = time.perf_counter()
-    mesh = build_mesh(scene)
-    blind = case.estimator == "none"
-    model = build_model(scene, device, mesh, camera=not blind)
-    data = sk.make_data(model)
-    spec = transport_spec(scene, mesh, **({} if case.estimator is None else {"estimator": case.estimator}))
-    _wait(device)
-    ready = time.perf_counter()
-    sk.load_transport_kernel(spec, device)
-    compiled = time.perf_counter()
-
-    _walk(spec, model, data, first=0, photons=min(photons, 1 << 20))
+    walk = TransportRun(case, device)
+    walk.run(min(photons, 1 << 20))
     seconds: list[float] = []
     counts: list[dict[str, int]] = []
-    for repeat in range(repeats):
-        data.ledger.zero_()
-        _wait(device)
-        started = time.perf_counter()
-        _walk(spec, model, data, first=repeat * photons, photons=photons)
-        seconds.append(time.perf_counter() - started)
-        counts.append(sk.read_ledger(data)[1])
-    fastest = min(range(repeats), key=seconds.__getitem__)
+    while len(seconds) < repeats and sum(seconds) < case.enough:
+        _, counters, took = walk.run(photons, first=len(seconds) * photons)
+        seconds.append(took)
+        counts.append(counters)
+    fastest = min(range(len(seconds)), key=seconds.__getitem__)
     did = counts[fastest]
     rates = {
         "photons": photons / seconds[fastest],
@@ -339,41 +386,25 @@ def _transport(case: Case, device: wp.Device, photons: int | None, repeats: int)
         "queries": (did["surface_queries"] + did["shadow_queries"]) / seconds[fastest],
     }
     held = memory.peak()
-    tally_bytes = None if blind else 8 * model.tally_size
-    del data, model
+    setup, compiled, faces, tally_bytes = walk.setup, walk.compile, walk.faces, walk.tally_bytes
+    del walk  # and its histograms, before the next run makes its own
+    scene = Scene.from_dict(case.scene)
+    error = case.error and case.estimator != "none"
     return BenchResult(
         case=case.name,
         device=device.alias,
         threads=None if device.is_cuda else core_count(),
-        faces=0 if mesh is None else mesh.face_count,
+        faces=faces,
         size={"photons": photons},
-        setup=ready - began,
-        compile=compiled - ready,
+        setup=setup,
+        compile=compiled,
         seconds=tuple(seconds),
         rates=rates,
         memory=held,
         tally_bytes=tally_bytes,
-        error_per_root_second=None if blind else _error(scene, device, min(photons, usual), rates["photons"]),
+        error_per_root_second=_error(scene, device, min(photons, usual), rates["photons"]) if error else None,
         check=None if case.absorbed is None else _absorbed(scene, device, photons, *case.absorbed),
     )
-
-
-def _walk(spec: Any, model: Model, data: Data, *, first: int, photons: int) -> None:
-    """Walks photons, on a CPU with a thread for each core; back when the device has finished."""
-    import spadwarp_kernels as sk
-
-    def launch(start: int, stop: int) -> None:
-        for at in range(start, stop, _PASS):
-            sk.launch_transport(spec, model, data, seed=0, first_id=at, photon_count=min(_PASS, stop - at))
-
-    workers = 1 if model.device.is_cuda else min(core_count(), photons)
-    edges = [first + photons * i // workers for i in range(workers + 1)]
-    if workers == 1:
-        launch(first, first + photons)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(launch, edges[:-1], edges[1:]))
-    _wait(model.device)
 
 
 def _wait(device: wp.Device) -> None:

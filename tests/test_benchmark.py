@@ -125,10 +125,34 @@ def test_command_writes_and_compares(kept, tmp_path):
 
 def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
     check = {"name": "absorbed fraction", "value": 0.2, "standard_error": 1e-3, "reference": 0.1769, "passed": False}
-    monkeypatch.setattr(spadwarp.benchmark, "bench", lambda *_, **__: [replace(staircase, case="cube60", check=check)])
+    cube60 = replace(staircase, case="cube60", check=check)
+    monkeypatch.setattr(spadwarp.benchmark, "bench", lambda *_, found, **__: found(cube60))
     result = run("cube60")
     assert result.exit_code == 1
     assert "cube60: a mean is not what it should be" in result.output
+
+
+def test_an_interrupted_command_keeps_what_was_measured(monkeypatch, staircase, tmp_path):
+    def interrupted(*_, found, **__):
+        found(staircase)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(spadwarp.benchmark, "bench", interrupted)
+    result = run("staircase_5m", "water", "--json", tmp_path / "part.json")
+    assert result.exit_code == 130
+    assert "staircase_5m" in result.stdout
+    assert [row["case"] for row in load_report(tmp_path / "part.json")["results"]] == ["staircase_5m"]
+
+
+def test_scaling_says_how_cost_grows(monkeypatch, staircase):
+    def grows(*_, found, **__):
+        for photons, rate in ((10**6, 4e8), (10**7, 8e8), (10**8, 8.8e8)):
+            name = f"photons_{photons}"
+            found(replace(staircase, case=name, size={"photons": photons}, rates={"photons": rate}, memory=1 << 30))
+
+    monkeypatch.setattr(spadwarp.benchmark, "bench", grows)
+    told = run("scaling").stdout
+    assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in told
 
 
 def test_unknown_case_is_named():
@@ -171,6 +195,15 @@ def test_scaling_spans_what_it_is_meant_to_show():
         assert 12 * 4 ** last.scene["targets"][0]["subdivisions"] == pytest.approx(1e6, rel=0.25)
         for case in cases:
             Scene.from_dict(case.scene)
+            assert not case.error  # nor batches in an image that barely fits
+
+
+def test_runs_are_repeated_until_enough():
+    case = replace(CASES["water"], error=False, enough=1e-9)
+    device = spadwarp.hardware.pick_device("cpu")
+    result = spadwarp.benchmark._transport(case, device, 1000, 5)
+    assert len(result.seconds) == 1
+    assert result.error_per_root_second is None
 
 
 def test_cases_are_listed():

@@ -1,19 +1,25 @@
-"""What the peers' scripts share: options, our figure of the same run, and how a ratio is told."""
+"""What the peers' scripts share: options, runs of theirs and ours in turn, and how a ratio is told."""
 
 import argparse
+import ctypes
 import importlib
+import os
 import sys
+import tempfile
 import time
-from collections.abc import Callable
-from types import ModuleType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from types import ModuleType, SimpleNamespace
 
 
 def options(about: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None) -> argparse.Namespace:
     """What every script takes, and integers of its own: name -> (default, help)."""
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--device", help='ours: "cpu", "cuda:0", ...; by default the first GPU, else the CPU')
+    parser.add_argument("--device", help='both: "cpu", "cuda:0", ...; by default the first GPU, else the CPU')
     parser.add_argument("--photons", type=lambda text: int(float(text)), default=photons, help="of one run, each")
-    parser.add_argument("--repeats", type=int, default=3, help="runs, the fastest of which counts")
+    parser.add_argument("--repeats", type=int, default=5, help="runs of each in turn, whose median counts")
     for name, (default, text) in (more or {}).items():
         parser.add_argument(f"--{name}", type=int, default=default, help=text)
     return parser.parse_args()
@@ -22,8 +28,12 @@ def options(about: str, *, photons: int, more: dict[str, tuple[int, str]] | None
 def peer(name: str, hint: str) -> ModuleType:
     """The installed package, or the end of the script: a peer that is not there is no failure."""
     try:
+        if sys.platform == "linux":
+            # The wheels of MCX and MMC carry a C++ library of their own; loaded first, its symbols would take the place
+            # of those that PoCL needs, which then forgets options of its compiler.
+            ctypes.CDLL("libstdc++.so.6", mode=ctypes.RTLD_GLOBAL)
         return importlib.import_module(name)
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         skip(f"{name} cannot be imported ({error}); {hint}")
 
 
@@ -32,27 +42,79 @@ def skip(reason: str) -> None:
     sys.exit(0)
 
 
-def fastest(run: Callable[[], object], repeats: int) -> tuple[float, object]:
-    """Seconds of the fastest of several runs, after one that loads what has to be loaded, and what it returned."""
-    run()
-    best, outcome = float("inf"), None
-    for _ in range(repeats):
-        began = time.perf_counter()
-        got = run()
-        seconds = time.perf_counter() - began
-        if seconds < best:
-            best, outcome = seconds, got
-    return best, outcome
+@contextmanager
+def told() -> Iterator[SimpleNamespace]:
+    """What C code prints to standard output meanwhile, as `text` afterwards."""
+    got = SimpleNamespace(text="")
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 1)
+        try:
+            yield got
+        finally:
+            sys.stdout.flush()
+            ctypes.CDLL(None).fflush(None)
+            os.dup2(kept, 1)
+            os.close(kept)
+            file.seek(0)
+            got.text = file.read().decode(errors="replace")
 
 
-def compare(case: str, theirs: float, *, name: str, unit: str, args: argparse.Namespace) -> None:
-    """Runs our case now, on this machine, and prints both rates and their ratio."""
-    import spadwarp
+def processor() -> str:
+    """What the CPU calls itself, where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), "CPU")
 
-    (ours,) = spadwarp.bench([case], device=args.device, photons=args.photons, repeats=args.repeats)
-    rate = ours.rates["photons"]
-    print(f"{name:<12} {theirs:.4g} {unit}/s")
-    print(f"{'spadwarp':<12} {rate:.4g} photons/s on {ours.device}")
-    if ours.check is not None:
-        print(f"{'spadwarp':<12} {ours.check['name']} {ours.check['value']:.5f} ± {ours.check['standard_error']:.5f}")
-    print(f"ratio        {rate / theirs:.3g}")
+
+def compare(
+    case: str, theirs: Callable[[], float | None], *, name: str, unit: str, work: int, args: argparse.Namespace
+) -> float:
+    """Runs theirs and ours in turn, on this machine, and prints both rates and their ratio.
+
+    Args:
+        case: Of `spadwarp bench`.
+        theirs: One run; returns its seconds by its own clock if it has one that leaves out the setup, else None.
+        name, unit: Of the peer and of what it counts.
+        work: How many of them one run does.
+        args: From `options`.
+
+    Returns:
+        Our absorbed fraction of the light.
+    """
+    from spadwarp.benchmark import CASES, TransportRun
+    from spadwarp.hardware import core_count, pick_device
+
+    device = pick_device(args.device)
+    run = TransportRun(CASES[case], device)
+    theirs()
+    run.run(args.photons)
+    wall: dict[str, list[float]] = {name: [], "spadwarp": []}
+    cpu: dict[str, list[float]] = {name: [], "spadwarp": []}
+    taken = 0
+    for repeat in range(args.repeats):
+        began, spent = time.perf_counter(), time.process_time()
+        own = theirs()
+        cpu[name].append(time.process_time() - spent)
+        wall[name].append(time.perf_counter() - began if own is None else own)
+        spent = time.process_time()
+        ledger, _, seconds = run.run(args.photons, first=repeat * args.photons)
+        cpu["spadwarp"].append(time.process_time() - spent)
+        wall["spadwarp"].append(seconds)
+        taken += ledger["absorbed_water"]
+    clocks = {"": wall}
+    if device.is_cuda:
+        print(f"{'':<12} median of {args.repeats} runs in turn on {device.name}")
+    else:
+        # Other processes on the machine stretch the wall clock's time, but not the processor's.
+        clocks = {"": wall, " of processor time": cpu}
+        print(f"{'':<12} median of {args.repeats} runs in turn on {core_count()} core(s) of {processor()}")
+    for clock, seconds_of in clocks.items():
+        them, us = work / median(seconds_of[name]), args.photons / median(seconds_of["spadwarp"])
+        print(f"{name:<12} {them:.4g} {unit}/s{clock}")
+        print(f"{'spadwarp':<12} {us:.4g} photons/s{clock}")
+        print(f"ratio        {us / them:.3g}{clock}")
+    return taken * 2.0**-22 / (args.photons * args.repeats)

@@ -1,10 +1,14 @@
-"""cube60 for MCX and MCX-CL, which take the same settings: a volume of 1 mm voxels, lengths in mm."""
+"""cube60 for MCX, MCX-CL and MMC, which print what was absorbed; lengths in mm."""
 
+import argparse
+import math
+import re
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from _common import compare, fastest, options, skip
+from _common import compare, skip, told
 
 
 def settings(photons: int) -> dict[str, Any]:
@@ -24,20 +28,54 @@ def settings(photons: int) -> dict[str, Any]:
         "issavedet": 0,
         "seed": 29012392,
         "autopilot": 1,
-        "gpuid": 1,
     }
 
 
-def measure(package: ModuleType, name: str, photons: int) -> None:
-    args = options(f"cube60 on {name} and on spadwarp", photons=photons)
+def device_of(found: Sequence[dict[str, Any]], cpu: bool) -> int:
+    """1-based number of the first OpenCL device that is, or is not, a CPU."""
+    for i, device in enumerate(found):
+        # PoCL's names begin with how it runs threads, those of Intel's and AMD's CPU drivers have the word.
+        if (device["name"].startswith("pthread") or "CPU" in device["name"]) == cpu:
+            return i + 1
+    skip(f"there is no OpenCL {'CPU' if cpu else 'GPU'} among {', '.join(device['name'] for device in found)}")
+
+
+def number(label: str, text: str) -> float:
+    """What MCX and MMC print after a label; NaN where they do not."""
+    found = re.search(rf"{label}:\s*([0-9.]+)", text)
+    return float(found[1]) if found else math.nan
+
+
+def measure(package: ModuleType, name: str, args: argparse.Namespace, settings: dict[str, Any]) -> None:
+    """Times `package.run(settings)` against our cube60, and compares what is absorbed."""
+    fractions: list[float] = []
+
+    def run() -> float | None:
+        """Seconds by MCX's own clock, which leaves out its setup as ours does; MMC, whose setup is short, returns
+        none."""
+        with told() as said:
+            got = package.run(settings)
+        if got.get("stat"):
+            fractions.append(got["stat"]["energyabs"] / got["stat"]["energytot"])
+            return 1e-3 * float(got["stat"]["runtime"])
+        if "flux" in got:  # fluence rate [1/(mm^2 s)] in voxels of 1 mm; times absorption [1/mm] and time [s]
+            fractions.append(float(got["flux"].sum()) * settings["prop"][1][0] * settings["tend"])
+            return None
+        fractions.append(number("absorbed", said.text) / 100.0)
+        return 1e-3 * args.photons / number("simulation speed", said.text)
+
     try:
-        seconds, got = fastest(lambda: package.run(settings(args.photons)), args.repeats)
+        run()
     except RuntimeError as error:
         skip(f"{name} cannot run on this machine's devices ({' '.join(str(error).split())})")
-    stat = got.get("stat", {}) if isinstance(got, dict) else {}
-    # MCX's own clock leaves out its setup, as ours does.
-    own = float(stat.get("runtime", 0.0)) * 1e-3
-    print(f"{name:<12} {seconds:.3g} s a run, {own:.3g} s by its own clock")
-    if stat.get("energytot"):
-        print(f"{name:<12} absorbed fraction {stat['energyabs'] / stat['energytot']:.5f}")
-    compare("cube60", args.photons / (own or seconds), name=name, unit="photons", args=args)
+    ours = compare("cube60", run, name=name, unit="photons", work=args.photons, args=args)
+
+    # One seed, since MCX compiles it in: its runs repeat each other, ours do not.
+    import spadwarp
+    from spadwarp.benchmark import CASES
+
+    scene = spadwarp.Scene.from_dict(CASES["cube60"].scene)
+    spread = float(spadwarp.trace(scene, photons=50_000, device=args.device).weight.std())
+    error = spread * math.sqrt((1.0 + 1.0 / args.repeats) / args.photons)
+    theirs = fractions[-1]
+    print(f"absorbed     {theirs:.5f}, ours {ours:.5f}: {(ours - theirs) / error:+.2f} combined standard errors apart")

@@ -57,17 +57,35 @@ def bench(
     before = None if compare is None else load_report(compare)
     if json_path is not None:
         check_writable(json_path.parent)
-    results = spadwarp.bench(
-        cases or None,
-        device=device,
-        photons=photons,
-        repeats=repeats,
-        progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
-    )
+    results: list[BenchResult] = []
+
+    def found(result: BenchResult) -> None:
+        if not quiet and not results:
+            say(_HEAD)
+        results.append(result)
+        if not quiet:
+            say(_row(result))
+
+    try:
+        spadwarp.bench(
+            cases or None,
+            device=device,
+            photons=photons,
+            repeats=repeats,
+            progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
+            found=found,
+        )
+    finally:  # Ctrl-C and a device that is too small leave what was measured until then
+        if results:
+            write_json(report(results), json_path)
     summary = report(results)
     if not quiet:
         made = summary["provenance"]
-        _show(_table(results), f"{made['device_name']} ({made['device']}), {made['date']}")
+        if any(result.memory is None and result.tally_bytes for result in results):
+            say("* histograms alone; Warp does not count memory on the CPU")
+        say(f"{made['device_name']} ({made['device']}), {made['date']}")
+        for line in _growth(results):
+            say(line)
         for result in results:
             if result.check is not None:
                 say(_checked(result.case, result.check))
@@ -83,32 +101,63 @@ def bench(
         fail(f"{', '.join(missed)}: a mean is not what it should be")
 
 
-def _table(results: Sequence[BenchResult]) -> Table:
-    from rich import box
-    from rich.table import Table
+_COLUMNS = (
+    ("case", -20),
+    ("faces", 7),
+    ("setup", 8),
+    ("compile", 8),
+    ("run", 8),
+    ("per second", 15),
+    ("collisions/s", 13),
+    ("queries/s", 10),
+    ("memory", 10),
+    ("error", 8),
+)
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("case", no_wrap=True)
-    for title in ("faces", "setup", "compile", "run", "per second", "collisions/s", "queries/s", "memory", "error"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for result in results:
-        unit, rate = next(iter(result.rates.items()))
-        memory = result.tally_bytes if result.memory is None else result.memory
-        table.add_row(
+
+def _line(cells: Sequence[str]) -> str:
+    """One row, columns as wide as they are known to get: rows come one by one."""
+    return " ".join(
+        cell.ljust(-width) if width < 0 else cell.rjust(width) for cell, (_, width) in zip(cells, _COLUMNS, strict=True)
+    ).rstrip()
+
+
+_HEAD = _line([title for title, _ in _COLUMNS])
+
+
+def _row(result: BenchResult) -> str:
+    unit, rate = next(iter(result.rates.items()))
+    memory = result.tally_bytes if result.memory is None else result.memory
+    return _line(
+        [
             result.case,
             str(result.faces or "-"),
-            f"{result.setup:.3g} s",
-            f"{result.compile:.3g} s",
-            f"{min(result.seconds):.3g} s",
+            _seconds(result.setup),
+            _seconds(result.compile),
+            _seconds(min(result.seconds)),
             f"{rate:.3g} {unit}",
             _rate(result.rates.get("collisions")),
             _rate(result.rates.get("queries")),
             "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
             "-" if result.error_per_root_second is None else f"{100 * result.error_per_root_second:.3g} %",
-        )
-    if any(result.memory is None and result.tally_bytes for result in results):
-        table.caption = "* histograms alone; Warp does not count memory on the CPU"
-    return table
+        ]
+    )
+
+
+def _growth(results: Sequence[BenchResult]) -> list[str]:
+    """What "scaling" shows: time and memory of the largest case over those of a smaller one."""
+    lines = []
+    for kind, base in (("photons_", -2), ("faces_", 0), ("bins_", 0)):
+        cases = [result for result in results if result.case.startswith(kind)]
+        if len(cases) < 2:
+            continue
+        small, large = cases[base], cases[-1]
+        time = large.rates["photons"] and small.rates["photons"] / large.rates["photons"]
+        line = f"{small.case} -> {large.case}: {time:.3g} times the time of a photon"
+        if small.memory and large.memory:
+            line += f", {large.memory / small.memory:.3g} times the memory"
+        lines.append(line)
+    return lines
 
 
 def _ratio_table(faster: Mapping[str, Mapping[str, float]]) -> Table:
@@ -133,6 +182,10 @@ def _show(table: Table, title: str) -> None:
         console = Console(highlight=False, width=160)
     say(title)
     console.print(table)
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3g} s" if value >= 1e-3 else "0 s"
 
 
 def _rate(value: float | None) -> str:
