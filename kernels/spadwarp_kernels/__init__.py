@@ -47,6 +47,7 @@ from .phase_densities import (
     two_term_henyey_greenstein_density,
 )
 from .philox import philox4x32, random_block, u01, u01_fine
+from .score import COMPONENTS, next_event_value
 from .shadow import near_depth_map
 from .surface import (
     SurfaceHit,
@@ -62,13 +63,11 @@ from .surface import (
 from .tabulated import TABULATED, make_phase_tables
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
 from .transport import (
-    COMPONENTS,
     ESTIMATORS,
     FEW_FACES,
     Records,
     TransportSpec,
     make_transport_kernel,
-    next_event_value,
 )
 from .truth import truth_kernel
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
+from .bvh import pack_bvh
 from .camera import Camera
 from .domain import Limits
 from .gate import Gate
@@ -13,10 +14,11 @@ from .guided import Guiding
 from .laser import Laser, Scan
 from .layers import Layers
 from .medium import Medium
+from .score import COMPONENTS
 from .shadow import near_depth_map
-from .surface import Surfaces, Textures, face_planes
+from .surface import Surfaces, Textures
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
-from .transport import COMPONENTS, FEW_FACES, Records, TransportSpec, make_transport_kernel
+from .transport import FEW_FACES, Records, TransportSpec, make_transport_kernel
 from .warp_lanes import BLOCK_SIZE
 
 
@@ -60,11 +62,13 @@ class Data:
         tally: int64 [component * height * width * bin], fixed point.
         ledger: int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`.
         records: Terminal states of the last launch's photons.
+        cursor: int32 [1]: how many photons of the launch have been handed out.
     """
 
     tally: wp.array
     ledger: wp.array
     records: Records
+    cursor: wp.array
 
 
 def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
@@ -81,6 +85,7 @@ def make_data(model: Model, *, tally: wp.array | None = None, record_count: int 
         tally=tally,
         ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
         records=make_records(record_count, device=model.device),
+        cursor=wp.zeros(1, dtype=int, device=model.device),
     )
 
 
@@ -168,7 +173,9 @@ def make_surfaces(
     surfaces.specular = by_face("specular", specular, float)
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.planes = wp.zeros(0, dtype=wp.vec4, device=device)
+    surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
+    surfaces.faces = wp.zeros(0, dtype=wp.vec4, device=device)
+    surfaces.order = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
         return surfaces
@@ -178,8 +185,7 @@ def make_surfaces(
     lower, upper = points.min(axis=0), points.max(axis=0)
     padding = 1e-6 * abs(points).max() + 1e-6
     surfaces.mesh = mesh.id
-    if face_count <= FEW_FACES:
-        surfaces.planes = face_planes(mesh)
+    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
@@ -224,8 +230,7 @@ def make_textures(
     return textures
 
 
-# Threads of a CUDA launch: enough to fill any GPU, few enough that each walks many photons and flushes its tallies
-# seldom.
+# Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing.
 CUDA_THREADS = 1 << 19
 
 
@@ -252,7 +257,7 @@ def launch_transport(
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    if spec.few_faces and model.surfaces.planes.size == 0:
+    if spec.few_faces and not 0 < model.surfaces.order.size <= FEW_FACES:
         raise ValueError(f"spec.few_faces = True is for meshes of 1 to {FEW_FACES} faces")
     for name, needed in surface_choices(model.surfaces).items():
         if spec.mesh and getattr(spec, name) != needed:
@@ -260,6 +265,7 @@ def launch_transport(
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
     threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
+    data.cursor.zero_()
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
         dim=threads,
@@ -276,10 +282,9 @@ def launch_transport(
             seed,
             first_id,
             photon_count,
-            threads,
             model.scale,
         ],
-        outputs=[data.tally, data.ledger, data.records],
+        outputs=[data.tally, data.ledger, data.records, data.cursor],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .cpu_bvh import mesh_query_ray_cpu
+from .bvh import face_distance, face_in, face_normal
 
 _INV_PI = wp.constant(0.3183098861837907)
 
@@ -31,7 +31,7 @@ class Surfaces:
     Attributes:
         mesh: Id of a `wp.Mesh`.
         lower, upper: Its bounding box [m], padded against rounding.
-        planes: Of each face, if they are few, see `face_planes`; else empty.
+        nodes, faces, order: The mesh's tree, see `bvh`.
         reflectance: Of each face, in [0, 1].
         near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
         corner_reflectance: At the three corners of each face, in place of `reflectance`; empty unless it varies.
@@ -43,7 +43,9 @@ class Surfaces:
     mesh: wp.uint64
     lower: wp.vec3
     upper: wp.vec3
-    planes: wp.array(dtype=wp.vec4)
+    nodes: wp.array(dtype=wp.vec4)
+    faces: wp.array(dtype=wp.vec4)
+    order: wp.array(dtype=int)
     reflectance: wp.array(dtype=float)
     near_depth: wp.array2d(dtype=float)
     corner_reflectance: wp.array(dtype=wp.vec3)
@@ -54,12 +56,19 @@ class Surfaces:
 
 @wp.struct
 class SurfaceHit:
-    """Nearest surface along a ray: distance [m], the unit normal on the ray's side, the face's index; `face` is -1 for
-    a miss."""
+    """Nearest surface along a ray.
+
+    Attributes:
+        distance: [m].
+        normal: Unit vector on the ray's side.
+        face: Its index; -1 for a miss.
+        slot: Its place in the order of the mesh's tree, where that was walked.
+    """
 
     distance: float
     normal: wp.vec3
     face: int
+    slot: int
 
 
 @wp.func
@@ -77,74 +86,21 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 
 
 @wp.func
-def intersect_mesh_cpu(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float, any: bool) -> SurfaceHit:
-    """`intersect_mesh` on the CPU; `any` is content with the first face that is found, which need not be the
-    nearest."""
+def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
+    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them."""
     hit = SurfaceHit()
     hit.face = -1
     hit.distance = max_distance
-    found = mesh_query_ray_cpu(mesh, x, u, max_distance, any)
-    if found[0] >= wp.float64(0.0):
-        hit.face = int(found[0])
-        hit.distance = float(found[1])
-        normal = wp.mesh_eval_face_normal(mesh, hit.face)
-        hit.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-    return hit
-
-
-@wp.kernel(enable_backward=False)
-def _face_planes_kernel(mesh: wp.uint64, planes: wp.array(dtype=wp.vec4)):
-    """Launch: faces."""
-    face = wp.tid()
-    m = wp.mesh_get(mesh)
-    p = m.points[m.indices[3 * face]]
-    e1 = m.points[m.indices[3 * face + 1]] - p
-    e2 = m.points[m.indices[3 * face + 2]] - p
-    n = wp.cross(e1, e2)
-    inverse = 1.0 / wp.dot(n, n)  # infinite for a face without area, which no ray then hits
-    a = inverse * wp.cross(e2, n)
-    b = inverse * wp.cross(n, e1)
-    n = wp.normalize(n)
-    planes[3 * face] = wp.vec4(a[0], a[1], a[2], p[0])
-    planes[3 * face + 1] = wp.vec4(b[0], b[1], b[2], p[1])
-    planes[3 * face + 2] = wp.vec4(n[0], n[1], n[2], p[2])
-
-
-def face_planes(mesh: wp.Mesh) -> wp.array:
-    """The faces of a mesh as `intersect_faces` takes them: vec4 [3 * faces].
-
-    Of each face, with first corner p: the gradients of its two barycentric coordinates and its unit normal, and in the
-    fourth components p.
-    """
-    count = mesh.indices.size // 3
-    planes = wp.empty(3 * count, dtype=wp.vec4, device=mesh.device)
-    wp.launch(_face_planes_kernel, count, [mesh.id], outputs=[planes], device=mesh.device)
-    return planes
-
-
-@wp.func
-def intersect_faces(planes: wp.array(dtype=wp.vec4), x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """As `intersect_mesh`, by trying every face of `face_planes`: faster than a BVH for a handful of them."""
-    hit = SurfaceHit()
-    hit.face = -1
-    hit.distance = max_distance
-    for face in range(planes.shape[0] // 3):
-        a = planes[3 * face]
-        b = planes[3 * face + 1]
-        n = planes[3 * face + 2]
-        normal = wp.vec3(n[0], n[1], n[2])
-        to_x = x - wp.vec3(a[3], b[3], n[3])
-        rate = wp.dot(normal, u)
-        distance = -wp.dot(normal, to_x) / rate  # infinite or not a number for a ray in the plane, which fails below
-        y = to_x + distance * u
-        first = a[0] * y[0] + a[1] * y[1] + a[2] * y[2]
-        second = b[0] * y[0] + b[1] * y[1] + b[2] * y[2]
-        # A hair more than the triangle, so that no ray slips between two.
-        inside = first >= -1.0e-6 and second >= -1.0e-6 and first + second <= 1.000001
-        if inside and distance >= 0.0 and distance < hit.distance:
-            hit.face = face
+    nearest = int(-1)
+    for slot in range(surfaces.order.shape[0]):
+        distance = face_distance(surfaces.faces, slot, x, u)
+        if distance >= 0.0 and distance < hit.distance:
             hit.distance = distance
-            hit.normal = wp.where(rate > 0.0, -normal, normal)
+            nearest = slot
+    if nearest >= 0:
+        hit.slot = nearest
+        hit.face = face_in(surfaces.order, nearest)
+        hit.normal = face_normal(surfaces.faces, nearest, u)
     return hit
 
 

@@ -2,7 +2,7 @@
 
 One kernel, specialised by a hashable `TransportSpec`. A thread walks photon after photon through a small state machine
 
-    FLIGHT -> [FLIGHT_SAMPLE ->] EVENT -> SCATTER -> FLIGHT -> ... -> END
+    FLIGHT -> EVENT -> SCATTER -> FLIGHT -> ... -> END
 
 and leaves the inner loop only when it has a ray to trace, so that the BVH is walked by all threads of a warp at once.
 A warp emits 32 photons at a time and stocks them; a thread whose photon has ended takes the next.
@@ -13,6 +13,15 @@ from typing import NamedTuple
 
 import warp as wp
 
+from .bvh import (
+    FINISHED,
+    Stack,
+    face_distance,
+    face_in,
+    face_normal,
+    inverse_direction,
+    walk_node,
+)
 from .camera import Camera, lens_point
 from .direction import one_minus_cosine, rotate_direction, sample_cosine_law, snap_direction
 from .domain import (
@@ -24,13 +33,13 @@ from .domain import (
     is_outside,
     is_outside_turned,
 )
-from .gate import Gate, gate_bin
-from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_to_gate, make_sample_flight
+from .gate import Gate
+from .guided import HENYEY_GREENSTEIN_GUIDE, Guiding, clip_to_gate
 from .laser import Laser, Scan, emit_along, emit_measured
 from .layers import HOMOGENEOUS, LAYERED, Layers
 from .lens import PINHOLE, Lens
 from .medium import Medium
-from .microfacet import ggx_brdf, reflection_pdf, sample_reflection, unshadowed
+from .microfacet import reflection_pdf, sample_reflection, unshadowed
 from .phase import HENYEY_GREENSTEIN, PhaseFunction, henyey_greenstein_pdf, sample_henyey_greenstein
 from .philox import (
     STREAM_FLIGHT_SAMPLE,
@@ -40,17 +49,21 @@ from .philox import (
     random_block,
     u01,
     u01_fine,
-    u01_high,
     u01_last,
-    u01_low,
+)
+from .score import (
+    BACKSCATTER,
+    BALLISTIC,
+    FORWARD_SCATTERED,
+    Request,
+    make_gathering,
+    make_score,
+    tally_index,
 )
 from .surface import (
     Surfaces,
     face_reflectance,
     intersect_faces,
-    intersect_mesh,
-    intersect_mesh_cpu,
-    lambert_brdf,
     offset_from_surface,
     pattern_reflectance,
     segment_meets_box,
@@ -73,21 +86,20 @@ from .tally import (
     deposit,
     to_ledger,
 )
-from .warp_lanes import count_lanes, count_lanes_before, exchange
+from .warp_lanes import count_lanes, count_lanes_before, exchange, meet_lanes, take_photons
 
 ESTIMATORS = ("none", "analog", "next_event", "guided")
 
-# What a history's events make of its light: the first axis of the tally.
-COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
-BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
-
-_FLIGHT, _FLIGHT_SAMPLE, _EVENT, _SCATTER, _START, _END, _DONE = (wp.constant(i) for i in range(7))
+_FLIGHT, _EVENT, _SCATTER, _START, _END, _DONE = (wp.constant(i) for i in range(6))
 _NO_RAY, _SURFACE_RAY, _SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
 # in the water.
 RAY_LANES = 20
+
+# It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
+WALKING_LANES = 8
 
 # It takes new photons when this many lanes have ended.
 START_LANES = 3
@@ -96,7 +108,7 @@ START_LANES = 3
 FEW_FACES = 12
 
 # Registers a thread, without and with a BVH: fewer spill, more leave too few warps to hide latency.
-MAX_REGISTERS = {"none": (56, 80), "analog": (64, 96), "next_event": (64, 96), "guided": (96, 96)}
+MAX_REGISTERS = {"none": (56, 64), "analog": (64, 64), "next_event": (64, 64), "guided": (96, 72)}
 
 
 class TransportSpec(NamedTuple):
@@ -158,27 +170,6 @@ class Records:
     reason: wp.array(dtype=int)
 
 
-@wp.func
-def next_event_value(
-    camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
-) -> float:
-    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
-    unit vector."""
-    cos_lens = wp.max(-to_lens[2], 0.0)
-    return (
-        weight * scattering * wp.exp(-extinction * distance) * camera.aperture_area * cos_lens / (distance * distance)
-    )
-
-
-@wp.func
-def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
-    """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
-    k = gate_bin(gate, path)
-    if k < 0:
-        return k
-    return (component * camera.width * camera.height + pixel) * gate.bins + k
-
-
 @wp.struct
 class _Walk:
     """State of a thread between the stages.
@@ -209,11 +200,16 @@ class _Walk:
     sample_block: wp.vec4ui
     distance: float  # to the end of the flight
     face: int  # hit there; -1 in the water
+    slot: int  # of that face
     normal: wp.vec3
     albedo: float
     # The ray to trace, and the contribution that waits for it:
     ray: int
     reach: float
+    node: int  # of its walk down the tree; FINISHED if it has none
+    depth: int
+    nearest: float
+    found: int  # slot of the nearest face
     interval: wp.vec2  # of the flight that the camera sees
     origin: wp.vec3  # the point that is scored
     lens: wp.vec3
@@ -234,10 +230,9 @@ class _Walk:
 
 @functools.cache
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
-    """The transport kernel for a spec; launch grid: `thread_count` threads, photon i is walked by thread i mod
-    thread_count.
+    """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA `thread_count` must be a multiple of the block size, since whole warps vote.
+    On CUDA they must be a multiple of the block size, since whole warps vote.
     """
     if spec.estimator not in ESTIMATORS:
         raise ValueError(f"estimator = {spec.estimator!r} is not one of {', '.join(ESTIMATORS)}")
@@ -247,7 +242,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:8]
     layered, pattern, specular = spec.layered, spec.pattern, spec.specular
     local_albedo = layered and not paper_albedo
-    water_free_path, water_extinction, water_at = LAYERED if layered else HOMOGENEOUS
+    water_free_path, _, water_at = LAYERED if layered else HOMOGENEOUS
     confocal = spec.confocal
     pinhole = spec.lens.name == PINHOLE.name
     if confocal and pinhole:
@@ -267,9 +262,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     reflectance_at = pattern_reflectance if pattern else face_reflectance
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     aimed = spec.phase.guide is not None
-    sample_flight, lobe_pdf, lobe_sample = make_sample_flight(guide), guide.lobe_pdf, guide.lobe_sample
+    lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     ray_lanes = RAY_LANES if has_bvh else 32
+    walking_lanes = WALKING_LANES if cuda else 1
     scores = next_event or guided
+    gathers = scores and cuda and not has_bvh
+    score = make_score(spec) if scores else None
+    shelve, fetch = make_gathering(spec.estimator)
 
     @wp.kernel(
         module="unique",
@@ -292,12 +291,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         seed: wp.uint64,
         first_id: wp.uint64,
         photon_count: int,
-        thread_count: int,
         # Data out:
         scale: float,
         tally: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         out: Records,
+        cursor: wp.array(dtype=int),
     ):
         thread = wp.tid()
         s = _Walk()
@@ -305,13 +304,19 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         s.albedo = medium.albedo
         s.view = camera.view
         s.target = -1
+        s.node = FINISHED
+        if wp.static(has_bvh):
+            stack = Stack()
+            stack[0] = FINISHED
         # On the CPU one thread walks all photons.
         lane = thread % wp.static(32 if cuda else 1)
-        s.first = thread - lane - wp.where(wp.static(cuda), thread_count, 1)
+        s.first = -1
         s.taken = 32
         if wp.static(not cuda):
             # Launches on several cores write to slots of the ledger that lie in cache lines of their own.
             thread = 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
+        gathered = int(0)
+        done = int(0)
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp wait for a ray
@@ -335,200 +340,181 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             limit = wp.min(limit, to_exit(limits, s.x, s.u))
                         s.interval = clip_to_view(camera, s.view, s.x, s.u, s.lens, limit)
                         s.interval = clip_to_gate(gate, s.x, s.u, s.path, s.lens, s.interval)
-                        if s.interval[0] < s.interval[1] and (wp.static(layered) or medium.extinction > 0.0):
-                            s.stage = _FLIGHT_SAMPLE
+                        if not (wp.static(layered) or medium.extinction > 0.0):
+                            s.interval = wp.vec2(0.0, 0.0)
+                        if s.interval[0] < s.interval[1]:
                             s.reach = wp.max(s.reach, s.interval[1])
                     if wp.static(has_mesh):
                         if wp.static(has_bvh):
                             if segment_meets_box(s.x, s.u, s.reach, surfaces.lower, surfaces.upper):
                                 s.ray = _SURFACE_RAY
                         else:
-                            hit = intersect_faces(surfaces.planes, s.x, s.u, s.reach)
+                            hit = intersect_faces(surfaces, s.x, s.u, s.reach)
                             s.surface_queries += 1
                             if hit.face >= 0:
                                 s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
                                 if hit.distance < s.distance:
                                     s.distance = hit.distance
                                     s.face = hit.face
+                                    s.slot = hit.slot
                                     s.normal = hit.normal
 
-                if wp.static(guided):
-                    if s.stage == _FLIGHT_SAMPLE and s.ray == _NO_RAY:
-                        s.stage = _EVENT
-                        if s.interval[0] < s.interval[1]:
-                            # Layers: a density with the mean extinction; what is scored weighs with the exact one.
-                            flight = sample_flight(
-                                s.x - s.lens,
-                                s.u,
-                                s.interval,
-                                water_extinction(
-                                    medium,
-                                    layers,
-                                    s.x + s.interval[0] * s.u,
-                                    s.u,
-                                    s.interval[1] - s.interval[0],
-                                ),
-                                medium,
-                                u01(s.sample_block[0]),
-                                u01_fine(s.sample_block[1]),
-                            )
-                            y = s.x + flight.s * s.u
-                            s.origin = y
-                            pixel = project(camera, s.view, s.target, y, s.lens)
-                            if pixel >= 0 and flight.density > 0.0:
-                                to_lens = (s.lens - y) / flight.r
-                                t = one_minus_cosine(snap_direction(s.u, medium.axis_threshold), to_lens)
-                                there = water_at(medium, layers, y)
-                                if wp.static(local_albedo):
-                                    s.albedo = there.albedo
-                                weight_there = (
-                                    s.weight
-                                    * s.albedo
-                                    * there.extinction
-                                    * wp.exp(-water_extinction(medium, layers, s.x, s.u, flight.s) * flight.s)
-                                )
-                                s.pending_value = (
-                                    next_event_value(
-                                        camera,
-                                        water_extinction(medium, layers, y, to_lens, flight.r),
-                                        weight_there,
-                                        phase_pdf(t, there),
-                                        to_lens,
-                                        flight.r,
+                # Guided scores the flight first, both score where it ends.
+                round = int(wp.static(0 if guided else 1))
+                while round < 2:
+                    wanted = False
+                    q = Request()
+                    if wp.static(guided):
+                        if round == 0 and s.stage == _EVENT and s.ray == _NO_RAY and s.interval[0] < s.interval[1]:
+                            wanted = True
+                            q.x = s.x
+                            q.u = s.u
+                            q.weight = wp.where(wp.static(local_albedo), s.weight, s.weight * s.albedo)
+                            q.path = s.path
+                            q.lens = s.lens
+                            q.interval = s.interval
+                            q.first = s.sample_block[0]
+                            q.second = s.sample_block[1]
+                            q.dither = s.sample_block[2]
+                            q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                            q.slot = -1
+                            q.target = s.target
+                            s.interval = wp.vec2(0.0, 0.0)
+                    # What guided has sampled may wait for its shadow ray: without a surface nothing more is scored.
+                    if (
+                        round == 1
+                        and s.stage == _EVENT
+                        and (s.ray == _NO_RAY or (wp.static(guided) and s.ray == _SHADOW_RAY and s.face < 0))
+                    ):
+                        s.reason = -1
+                        limit = limits.max_path - s.path
+                        if wp.static(analog):
+                            # Does the flight pass through the aperture, before anything else happens to it?
+                            if s.u[2] < 0.0 and s.collisions > 0:
+                                crossing = -s.x[2] / s.u[2]
+                                on_lens = s.x + crossing * s.u
+                                pixel = project(camera, s.view, s.target, s.x, on_lens)
+                                radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
+                                inside = radius2 <= camera.aperture_radius * camera.aperture_radius
+                                if pixel >= 0 and inside and crossing <= wp.min(s.distance, limit):
+                                    component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                                    if s.surface_count == 1 and s.collisions == 1:
+                                        component = BALLISTIC
+                                    s.contributions += 1
+                                    s.late = deposit(
+                                        tally,
+                                        ledger,
+                                        s.late,
+                                        thread,
+                                        tally_index(camera, gate, pixel, s.path + crossing, component),
+                                        s.weight,
+                                        scale,
+                                        u01_last(s.block[0]),
                                     )
-                                    / flight.density
-                                )
-                                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                                s.pending_index = tally_index(
-                                    camera, gate, pixel, s.path + flight.s + flight.r, component
-                                )
-                                s.dither = u01_last(s.sample_block[2])
-                                s.contributions += 1
-                                s.ray = _SHADOW_RAY
-                # What guided has sampled may wait for its shadow ray: without a surface nothing more is scored here.
-                if s.stage == _EVENT and (
-                    s.ray == _NO_RAY or (wp.static(guided) and s.ray == _SHADOW_RAY and s.face < 0)
-                ):
-                    s.reason = -1
-                    limit = limits.max_path - s.path
-                    if wp.static(analog):
-                        # Does the flight pass through the aperture, before anything else happens to it?
-                        if s.u[2] < 0.0 and s.collisions > 0:
-                            crossing = -s.x[2] / s.u[2]
-                            on_lens = s.x + crossing * s.u
-                            pixel = project(camera, s.view, s.target, s.x, on_lens)
-                            radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
-                            inside = radius2 <= camera.aperture_radius * camera.aperture_radius
-                            if pixel >= 0 and inside and crossing <= wp.min(s.distance, limit):
-                                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                                if s.surface_count == 1 and s.collisions == 1:
-                                    component = BALLISTIC
-                                s.contributions += 1
-                                s.late = deposit(
-                                    tally,
-                                    ledger,
-                                    s.late,
-                                    thread,
-                                    tally_index(camera, gate, pixel, s.path + crossing, component),
-                                    s.weight,
-                                    scale,
-                                    u01_last(s.block[0]),
-                                )
-                    if s.distance > limit:
-                        s.reason = MAX_PATH
-                        s.distance = limit
-                    if wp.static(bounded):
-                        if outside(limits, s.x + s.distance * s.u):
-                            s.reason = face_of_exit(limits, s.x, s.u)
-                            s.distance = wp.min(s.distance, to_exit(limits, s.x, s.u))
-                    s.x = s.x + s.distance * s.u
-                    s.path += s.distance
-                    s.stage = _END
-                    if s.reason < 0:
-                        s.stage = _SCATTER
-                        s.collisions += 1
-                        if wp.static(local_albedo):
-                            s.albedo = water_at(medium, layers, s.x).albedo
-                        if wp.static(has_mesh):
-                            if s.face >= 0:
-                                s.x = offset_from_surface(s.x, s.normal, s.distance)
-                        if wp.static(scores):
-                            # Water collisions are scored here by next_event alone: guided has scored the flight.
-                            if wp.static(next_event) or s.face >= 0:
-                                pixel = int(0)
-                                if wp.static(pinhole):
-                                    # Whatever the lens point; the others need it.
-                                    pixel = project(camera, s.view, s.target, s.x, s.x)
-                                if pixel >= 0:
-                                    # Bits that the flight left.
-                                    s.dither = u01_last(s.block[0])
-                                    # guided keeps the flight's point of the lens; else the word that it alone needs.
-                                    if wp.static(next_event):
-                                        s.lens = lens_point(camera, u01_high(s.block[3]), u01_low(s.block[3]))
-                                    if wp.static(not pinhole):
-                                        pixel = project(camera, s.view, s.target, s.x, s.lens)
-                                    to_lens = s.lens - s.x
-                                    r = wp.length(to_lens)
-                                    to_lens = to_lens / r
-                                    scattering = float(0.0)
-                                    component = int(FORWARD_SCATTERED)
-                                    if s.face >= 0:
-                                        cos_out = wp.max(wp.dot(to_lens, s.normal), 0.0)
-                                        scattering = lambert_brdf(reflectance_at(surfaces, s.face, s.x)) * cos_out
-                                        if wp.static(specular):
-                                            scattering += (
-                                                surfaces.specular[s.face]
-                                                * ggx_brdf(s.u, to_lens, s.normal, surfaces.roughness[s.face])
-                                                * cos_out
-                                            )
-                                        if s.collisions == 1:
-                                            component = BALLISTIC
-                                    else:
-                                        snapped = snap_direction(s.u, medium.axis_threshold)
-                                        scattering = s.albedo * phase_pdf(
-                                            one_minus_cosine(snapped, to_lens), water_at(medium, layers, s.x)
-                                        )
-                                        if s.surface_count == 0:
-                                            component = BACKSCATTER
-                                    if scattering > 0.0 and pixel >= 0:
+                        if s.distance > limit:
+                            s.reason = MAX_PATH
+                            s.distance = limit
+                        if wp.static(bounded):
+                            if outside(limits, s.x + s.distance * s.u):
+                                s.reason = face_of_exit(limits, s.x, s.u)
+                                s.distance = wp.min(s.distance, to_exit(limits, s.x, s.u))
+                        s.x = s.x + s.distance * s.u
+                        s.path += s.distance
+                        s.stage = _END
+                        if s.reason < 0:
+                            s.stage = _SCATTER
+                            s.collisions += 1
+                            if wp.static(local_albedo):
+                                s.albedo = water_at(medium, layers, s.x).albedo
+                            if wp.static(has_mesh):
+                                if s.face >= 0:
+                                    s.x = offset_from_surface(s.x, s.normal, s.distance)
+                            if wp.static(scores):
+                                # Water collisions are scored here by next_event alone: guided has scored the flight.
+                                if wp.static(next_event) or s.face >= 0:
+                                    pixel = int(0)
+                                    if wp.static(pinhole):
+                                        # Whatever the lens point; the others need it.
+                                        pixel = project(camera, s.view, s.target, s.x, s.x)
+                                    if pixel >= 0:
+                                        wanted = True
+                                        q.x = s.x
+                                        q.u = s.u
+                                        q.weight = s.weight
+                                        q.path = s.path
+                                        # guided keeps the flight's point of the lens; else the word that it alone
+                                        # needs.
                                         if wp.static(guided):
-                                            s.origin = s.x
-                                        s.pending_value = next_event_value(
-                                            camera,
-                                            water_extinction(medium, layers, s.x, to_lens, r),
-                                            s.weight,
-                                            scattering,
-                                            to_lens,
-                                            r,
-                                        )
-                                        s.pending_index = tally_index(camera, gate, pixel, s.path + r, component)
-                                        s.contributions += 1
-                                        s.ray = _SHADOW_RAY
+                                            q.lens = s.lens
+                                        q.interval = wp.vec2(0.0, 0.0)
+                                        q.first = s.block[3]
+                                        q.dither = s.block[0]  # bits that the flight left
+                                        q.slot = -1
+                                        q.target = s.target
+                                        q.component = FORWARD_SCATTERED
+                                        if s.face >= 0:
+                                            q.slot = s.slot
+                                            if s.collisions == 1:
+                                                q.component = BALLISTIC
+                                        else:
+                                            q.weight *= s.albedo
+                                            if s.surface_count == 0:
+                                                q.component = BACKSCATTER
+                    round += 1
 
-                if wp.static(scores):
-                    if s.ray == _SHADOW_RAY:
-                        origin = s.x
-                        if wp.static(guided):
-                            origin = s.origin
-                        seen = True
-                        if wp.static(has_mesh):
-                            if may_be_hidden(camera, surfaces.near_depth, origin):
-                                seen = not segment_meets_box(
-                                    origin, s.lens - origin, 1.0, surfaces.lower, surfaces.upper
-                                )
-                        if wp.static(few_faces):
-                            if not seen:
-                                s.shadow_queries += 1
-                                to = s.lens - origin
-                                length = wp.length(to)
-                                seen = intersect_faces(surfaces.planes, origin, to / length, length).face < 0
-                                if not seen:
-                                    s.ray = _NO_RAY
-                        if seen:
-                            s.late = deposit(
-                                tally, ledger, s.late, thread, s.pending_index, s.pending_value, scale, s.dither
-                            )
-                            s.ray = _NO_RAY
+                    # ---- Scores: each lane its own or, where a warp gathers them, 32 together
+                    if wp.static(scores):
+                        first = int(0)
+                        ready = wanted
+                        if wp.static(gathers):
+                            entry = gathered + count_lanes_before(wanted)
+                            if wanted:
+                                shelve(entry, q)
+                            gathered += count_lanes(wanted)
+                            ready = gathered >= 32 or done == 32
+                            first = wp.max(gathered - 32, 0)
+                        if ready:
+                            request = q
+                            wanted = True
+                            if wp.static(gathers):
+                                meet_lanes()
+                                wanted = first + lane < gathered
+                                request = fetch(first + lane)
+                                gathered = first
+                                meet_lanes()
+                            found = score(request, medium, layers, camera, gate, surfaces, scan)
+                            if wanted and not found.value <= 0.0:  # what is not a number is counted as such
+                                s.contributions += 1
+                                seen = True
+                                if wp.static(has_mesh):
+                                    if may_be_hidden(camera, surfaces.near_depth, found.origin):
+                                        seen = not segment_meets_box(
+                                            found.origin,
+                                            found.lens - found.origin,
+                                            1.0,
+                                            surfaces.lower,
+                                            surfaces.upper,
+                                        )
+                                        if wp.static(few_faces):
+                                            if not seen:
+                                                s.shadow_queries += 1
+                                                to = found.lens - found.origin
+                                                length = wp.length(to)
+                                                hit = intersect_faces(surfaces, found.origin, to / length, length)
+                                                found.value = wp.where(hit.face < 0, found.value, 0.0)
+                                                seen = True
+                                if seen:
+                                    if not found.value <= 0.0:
+                                        s.late = deposit(
+                                            tally, ledger, s.late, thread, found.index, found.value, scale, found.dither
+                                        )
+                                else:
+                                    s.ray = _SHADOW_RAY
+                                    s.origin = found.origin
+                                    s.lens = found.lens
+                                    s.pending_index = found.index
+                                    s.pending_value = found.value
+                                    s.dither = found.dither
 
                 if s.stage == _SCATTER and s.ray == _NO_RAY:
                     # The score took the photon as it arrived; now its weight, its end or its new direction.
@@ -684,7 +670,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if wp.static(cuda):
                         # All lanes emit a photon each, which those that have ended take one by one.
                         if s.taken >= 32:
-                            s.first += thread_count
+                            s.first = take_photons(cursor)
                             s.taken = 0
                             id = first_id + wp.uint64(s.first + lane)
                             axis = laser.axis
@@ -726,36 +712,71 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != _NO_RAY or s.stage >= _START)
                 else:
-                    waiting = count_lanes(s.stage == _DONE)
+                    done = count_lanes(s.stage == _DONE)
+                    waiting = wp.where(gathered > 0, 0, done)
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_bvh):
-                if s.ray != _NO_RAY:
-                    origin = s.x
-                    to = s.u
-                    length = s.reach
+                origin = s.x
+                to = s.u
+                if wp.static(scores):
+                    if s.ray == _SHADOW_RAY:
+                        origin = s.origin
+                        to = wp.normalize(s.lens - origin)
+                inverse = inverse_direction(to)
+                shift = wp.cw_mul(origin, inverse)
+                if s.ray != _NO_RAY and s.node == FINISHED:
+                    s.node = 0
+                    s.depth = 1  # below everything stands FINISHED
+                    s.found = -1
+                    s.nearest = s.reach
                     if wp.static(scores):
                         if s.ray == _SHADOW_RAY:
-                            if wp.static(guided):
-                                origin = s.origin
-                            to = s.lens - origin
-                            length = wp.length(to)
-                            to = to / length
-                    if wp.static(cuda):
-                        hit = intersect_mesh(surfaces.mesh, origin, to, length)
-                    else:
-                        hit = intersect_mesh_cpu(surfaces.mesh, origin, to, length, s.ray == _SHADOW_RAY)
+                            s.nearest = wp.length(s.lens - origin)
+                # Until so few walk on that new rays should join them; all take steps of one kind.
+                in_nodes = count_lanes(s.node > FINISHED)
+                at_faces = count_lanes(s.node < FINISHED)
+                company = int(1)
+                while in_nodes + at_faces >= company:
+                    company = wp.static(walking_lanes)
+                    if in_nodes >= at_faces:
+                        if s.node > FINISHED:
+                            near, far = walk_node(surfaces.nodes, s.node, inverse, shift, s.nearest)
+                            s.node = near
+                            if far != FINISHED:
+                                stack[s.depth] = far
+                                s.depth += 1
+                            if near == FINISHED:
+                                s.depth -= 1
+                                s.node = stack[s.depth]
+                    elif s.node < FINISHED:
+                        slot = -2 - s.node
+                        distance = face_distance(surfaces.faces, slot, origin, to)
+                        if surfaces.order[slot] >= 0:
+                            s.depth -= 1
+                            s.node = stack[s.depth]
+                        else:
+                            s.node -= 1  # the next face of the leaf
+                        if distance >= 0.0 and distance < s.nearest:
+                            s.nearest = distance
+                            s.found = slot
+                            if s.ray == _SHADOW_RAY:
+                                s.node = FINISHED
+                    in_nodes = count_lanes(s.node > FINISHED)
+                    at_faces = count_lanes(s.node < FINISHED)
+                if s.ray != _NO_RAY and s.node == FINISHED:
                     if s.ray == _SURFACE_RAY:
                         s.surface_queries += 1
-                        if hit.face >= 0:
-                            s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], hit.distance))
-                            if hit.distance < s.distance:
-                                s.distance = hit.distance
-                                s.face = hit.face
-                                s.normal = hit.normal
+                        if s.found >= 0:
+                            s.interval = wp.vec2(s.interval[0], wp.min(s.interval[1], s.nearest))
+                            if s.nearest < s.distance:
+                                s.distance = s.nearest
+                                s.slot = s.found
+                                s.face = face_in(surfaces.order, s.slot)
+                                s.normal = face_normal(surfaces.faces, s.slot, s.u)
                     else:
                         s.shadow_queries += 1
-                        if hit.face < 0:
+                        if s.found < 0:
                             s.late = deposit(
                                 tally, ledger, s.late, thread, s.pending_index, s.pending_value, scale, s.dither
                             )

@@ -51,3 +51,48 @@ def count_lanes_before(condition: bool) -> int:
 def exchange(put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
     """The warp's shelf of 32 vectors: every lane puts one, and later any lane takes any; CUDA alone."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    int first = 0;
+    if ((threadIdx.x & 31u) == 0u) first = atomicAdd(cursor.data, 32);
+    return __shfl_sync(0xffffffffu, first, 0);
+#else
+    return 0;
+#endif
+""")
+def take_photons(cursor: wp.array(dtype=int)) -> int:
+    """First of the next 32 photons, which are this warp's; every lane must take part. Warps come for more as they get
+    done, so that all end together; CUDA alone."""
+    ...
+
+
+# Requests that a warp can gather: 31 that wait and 32 that come.
+GATHERED = wp.constant(64)
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 shelf[4 * 64 * {BLOCK_SIZE // 32}];
+    float4* mine = shelf + 256u * (threadIdx.x >> 5u);
+    if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
+    const float4 held = mine[entry];
+    return wp::vec4(held.x, held.y, held.z, held.w);
+#else
+    return value;
+#endif
+""")
+def shelf(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
+    """The warp's shelf of 4 x GATHERED vectors: puts one there, or takes one; CUDA alone."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def meet_lanes():
+    """All lanes of the warp wait here for each other, and see what the others have put on shelves."""
+    ...
