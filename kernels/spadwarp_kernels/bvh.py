@@ -6,8 +6,8 @@ a kernel moves on by a step: all lanes that are in nodes together, or all that a
 old ones still walk (Aila & Laine, High-Performance Graphics 2009, on what the order of steps is worth).
 
 Nodes stand in pairs of four vec4: lower and upper corner of the first child, then of the second. The fourth component
-of a lower corner holds the bits of the child: the index of its own pair, or -2 - slot of its first face. Faces are three
-vec4 each, see `face_distance`, in the order of the leaves.
+of a lower corner holds the bits of the child: the index of its own pair, or -2 - slot of its first face. Faces are
+three vec4 each, see `face_distance`, in the order of the leaves.
 """
 
 import warp as wp
@@ -176,18 +176,44 @@ def inverse_direction(u: wp.vec3) -> wp.vec3:
     return wp.vec3(_inverse(u[0]), _inverse(u[1]), _inverse(u[2]))
 
 
-@wp.func
-def _span(lower: wp.vec4, upper: wp.vec4, inverse: wp.vec3, shift: wp.vec3, reach: float) -> wp.vec2:
-    """Where a ray enters and leaves a box, within [0, reach]; it misses where the first exceeds the second."""
-    a = lower[0] * inverse[0] - shift[0]
-    b = upper[0] * inverse[0] - shift[0]
-    c = lower[1] * inverse[1] - shift[1]
-    d = upper[1] * inverse[1] - shift[1]
-    e = lower[2] * inverse[2] - shift[2]
-    f = upper[2] * inverse[2] - shift[2]
-    near = wp.max(wp.max(wp.min(a, b), wp.min(c, d)), wp.max(wp.min(e, f), 0.0))
-    far = wp.min(wp.min(wp.max(a, b), wp.max(c, d)), wp.min(wp.max(e, f), reach))
-    return wp.vec2(near, far)
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4* box = reinterpret_cast<const float4*>(nodes.data) + 4 * node + 2 * child;
+    const float4 lower = __ldg(box), upper = __ldg(box + 1);
+    const float a = lower.x * inverse[0] - shift[0], b = upper.x * inverse[0] - shift[0];
+    const float c = lower.y * inverse[1] - shift[1], d = upper.y * inverse[1] - shift[1];
+    const float e = lower.z * inverse[2] - shift[2], f = upper.z * inverse[2] - shift[2];
+    return wp::vec3(
+        fmaxf(fmaxf(fminf(a, b), fminf(c, d)), fmaxf(fminf(e, f), 0.0f)),
+        fminf(fminf(fmaxf(a, b), fmaxf(c, d)), fminf(fmaxf(e, f), reach)),
+        lower.w);
+#else
+    // The three axes in a vector register; its fourth number is none to compute with.
+    typedef float vec __attribute__((ext_vector_type(4), aligned(4)));
+    typedef int32_t ivec __attribute__((ext_vector_type(4), aligned(4)));
+    const ivec* box = reinterpret_cast<const ivec*>(nodes.data) + 4 * node + 2 * child;
+    const ivec axes = {-1, -1, -1, 0};
+    const ivec lower = box[0], upper = box[1];
+    const vec factor = {inverse[0], inverse[1], inverse[2], 0.0f};
+    const vec offset = {shift[0], shift[1], shift[2], 0.0f};
+    const vec a = __builtin_bit_cast(vec, lower & axes) * factor - offset;
+    const vec b = __builtin_bit_cast(vec, upper & axes) * factor - offset;
+    const vec first = a < b ? a : b;
+    const vec last = a < b ? b : a;
+    const auto more = [](float p, float q) { return p > q ? p : q; };
+    const auto less = [](float p, float q) { return p < q ? p : q; };
+    return wp::vec3(
+        more(more(first[0], first[1]), more(first[2], 0.0f)),
+        less(less(last[0], last[1]), less(last[2], reach)),
+        reinterpret_cast<const float*>(box)[3]);
+#endif
+""")
+def _span(
+    nodes: wp.array(dtype=wp.vec4), node: int, child: int, inverse: wp.vec3, shift: wp.vec3, reach: float
+) -> wp.vec3:
+    """Where a ray enters and leaves the box of a child, within [0, reach], and the child's bits; it misses where the
+    first exceeds the second."""
+    ...
 
 
 @wp.func
@@ -201,12 +227,10 @@ def walk_node(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shift
         shift: The ray's origin times `inverse`, by components.
         reach: Distance of the nearest face so far, or the length of the ray [m].
     """
-    lower = load_vec4(nodes, 4 * node)
-    lower_2 = load_vec4(nodes, 4 * node + 2)
-    one = _span(lower, load_vec4(nodes, 4 * node + 1), inverse, shift, reach)
-    two = _span(lower_2, load_vec4(nodes, 4 * node + 3), inverse, shift, reach)
-    first = wp.where(one[0] <= one[1], bits_of(lower[3]), FINISHED)
-    second = wp.where(two[0] <= two[1], bits_of(lower_2[3]), FINISHED)
+    one = _span(nodes, node, 0, inverse, shift, reach)
+    two = _span(nodes, node, 1, inverse, shift, reach)
+    first = wp.where(one[0] <= one[1], bits_of(one[2]), FINISHED)
+    second = wp.where(two[0] <= two[1], bits_of(two[2]), FINISHED)
     swap = first == FINISHED or (second != FINISHED and two[0] < one[0])
     return wp.where(swap, second, first), wp.where(swap, first, second)
 
@@ -216,8 +240,8 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
     """Distance from x along the unit vector u at which the ray meets a face, >= 0, or -1 for a miss.
 
     Of each face `faces` holds three planes, as normals and offsets: of its first two barycentric coordinates, and its
-    own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the ray,
-    so that none slips between two faces.
+    own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the
+    ray, so that none slips between two faces.
     """
     a = load_vec4(faces, 3 * slot)
     b = load_vec4(faces, 3 * slot + 1)

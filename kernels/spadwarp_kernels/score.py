@@ -131,28 +131,27 @@ def make_score(spec: Any) -> wp.Function:
             scores_flight = request.interval[0] < request.interval[1]
         else:
             found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
-        if wp.static(guided):
-            if scores_flight:
-                # Layers: a density with the mean extinction; what is scored weighs with the exact one.
-                s0 = request.interval[0]
-                flight = sample_flight(
-                    request.x - request.lens,
-                    request.u,
-                    request.interval,
-                    water_extinction(medium, layers, request.x + s0 * request.u, request.u, request.interval[1] - s0),
-                    medium,
-                    u01(request.first),
-                    u01_fine(request.second),
-                )
-                y = request.x + flight.s * request.u
-                path += flight.s
-                there = water_at(medium, layers, y)
-                weight *= there.extinction * wp.exp(
-                    -water_extinction(medium, layers, request.x, request.u, flight.s) * flight.s
-                )
-                if wp.static(local_albedo):
-                    weight *= there.albedo
-                weight = wp.where(flight.density > 0.0, weight / flight.density, 0.0)
+        if wp.static(guided) and scores_flight:
+            # Layers: a density with the mean extinction; what is scored weighs with the exact one.
+            s0 = request.interval[0]
+            flight = sample_flight(
+                request.x - request.lens,
+                request.u,
+                request.interval,
+                water_extinction(medium, layers, request.x + s0 * request.u, request.u, request.interval[1] - s0),
+                medium,
+                u01(request.first),
+                u01_fine(request.second),
+            )
+            y = request.x + flight.s * request.u
+            path += flight.s
+            there = water_at(medium, layers, y)
+            weight *= there.extinction * wp.exp(
+                -water_extinction(medium, layers, request.x, request.u, flight.s) * flight.s
+            )
+            if wp.static(local_albedo):
+                weight *= there.albedo
+            weight = wp.where(flight.density > 0.0, weight / flight.density, 0.0)
         found.origin = y
         view = camera.view
         if wp.static(confocal):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .bvh import face_distance, face_in, face_normal
+from .bvh import FINISHED, Stack, face_distance, face_in, face_normal, inverse_direction, walk_node
 
 _INV_PI = wp.constant(0.3183098861837907)
 
@@ -62,7 +62,7 @@ class SurfaceHit:
         distance: [m].
         normal: Unit vector on the ray's side.
         face: Its index; -1 for a miss.
-        slot: Its place in the order of the mesh's tree, where that was walked.
+        slot: Its place in the order of the mesh's tree, where that was walked; -1 for a miss.
     """
 
     distance: float
@@ -105,18 +105,46 @@ def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: fl
 
 
 @wp.func
-def intersect_mesh_aimed(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """`intersect_mesh` for rays that may be aimed exactly at vertices or edges: a miss is tried again with u nudged by
-    1e-5.
+def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any: bool) -> SurfaceHit:
+    """As `intersect_mesh`, with the tree of `make_surfaces`; `any` is content with the first face that is found.
 
-    The slab test of the BVH walk is not conservative, so that a ray in the plane of a flat bounding box can slip
-    through.
-    Sampled rays meet such a plane with negligible probability and do without the second query.
+    Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
     """
-    hit = intersect_mesh(mesh, x, u, max_distance)
-    if hit.face < 0:
-        nudged = wp.normalize(u + wp.vec3(0.9e-5, -0.6e-5, 0.7e-5))
-        hit = intersect_mesh(mesh, x, nudged, max_distance)
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.slot = -1
+    distance = float(max_distance)
+    found = int(-1)
+    stack = Stack()
+    stack[0] = FINISHED
+    depth = int(1)
+    node = int(0)
+    inverse = inverse_direction(u)
+    shift = wp.cw_mul(x, inverse)
+    while node != FINISHED:
+        if node > FINISHED:
+            near, far = walk_node(surfaces.nodes, node, inverse, shift, distance)
+            node = near
+            if far != FINISHED:
+                stack[depth] = far
+                depth += 1
+        else:
+            slot = -2 - node
+            struck = face_distance(surfaces.faces, slot, x, u)
+            if struck >= 0.0 and struck < distance:
+                distance = struck
+                found = slot
+                if any:
+                    depth = 1
+            node = wp.where(surfaces.order[slot] < 0, node - 1, FINISHED)  # the next face of the leaf
+        if node == FINISHED and depth > 0:
+            depth -= 1
+            node = stack[depth]
+    hit.distance = distance
+    if found >= 0:
+        hit.slot = found
+        hit.face = face_in(surfaces.order, found)
+        hit.normal = face_normal(surfaces.faces, found, u)
     return hit
 
 

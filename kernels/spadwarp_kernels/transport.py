@@ -64,6 +64,7 @@ from .surface import (
     Surfaces,
     face_reflectance,
     intersect_faces,
+    intersect_surfaces,
     offset_from_surface,
     pattern_reflectance,
     segment_meets_box,
@@ -264,7 +265,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     aimed = spec.phase.guide is not None
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     ray_lanes = RAY_LANES if has_bvh else 32
-    walking_lanes = WALKING_LANES if cuda else 1
     scores = next_event or guided
     gathers = scores and cuda and not has_bvh
     score = make_score(spec) if scores else None
@@ -723,47 +723,53 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if s.ray == _SHADOW_RAY:
                         origin = s.origin
                         to = wp.normalize(s.lens - origin)
-                inverse = inverse_direction(to)
-                shift = wp.cw_mul(origin, inverse)
                 if s.ray != _NO_RAY and s.node == FINISHED:
-                    s.node = 0
-                    s.depth = 1  # below everything stands FINISHED
                     s.found = -1
                     s.nearest = s.reach
                     if wp.static(scores):
                         if s.ray == _SHADOW_RAY:
                             s.nearest = wp.length(s.lens - origin)
-                # Until so few walk on that new rays should join them; all take steps of one kind.
-                in_nodes = count_lanes(s.node > FINISHED)
-                at_faces = count_lanes(s.node < FINISHED)
-                company = int(1)
-                while in_nodes + at_faces >= company:
-                    company = wp.static(walking_lanes)
-                    if in_nodes >= at_faces:
-                        if s.node > FINISHED:
-                            near, far = walk_node(surfaces.nodes, s.node, inverse, shift, s.nearest)
-                            s.node = near
-                            if far != FINISHED:
-                                stack[s.depth] = far
-                                s.depth += 1
-                            if near == FINISHED:
-                                s.depth -= 1
-                                s.node = stack[s.depth]
-                    elif s.node < FINISHED:
-                        slot = -2 - s.node
-                        distance = face_distance(surfaces.faces, slot, origin, to)
-                        if surfaces.order[slot] >= 0:
-                            s.depth -= 1
-                            s.node = stack[s.depth]
-                        else:
-                            s.node -= 1  # the next face of the leaf
-                        if distance >= 0.0 and distance < s.nearest:
-                            s.nearest = distance
-                            s.found = slot
-                            if s.ray == _SHADOW_RAY:
-                                s.node = FINISHED
+                    if wp.static(cuda):
+                        s.node = 0
+                        s.depth = 1  # below everything stands FINISHED
+                    else:
+                        hit = intersect_surfaces(surfaces, origin, to, s.nearest, s.ray == _SHADOW_RAY)
+                        s.found = hit.slot
+                        s.nearest = hit.distance
+                if wp.static(cuda):
+                    inverse = inverse_direction(to)
+                    shift = wp.cw_mul(origin, inverse)
+                    # Until so few walk on that new rays should join them; all take steps of one kind.
                     in_nodes = count_lanes(s.node > FINISHED)
                     at_faces = count_lanes(s.node < FINISHED)
+                    company = int(1)
+                    while in_nodes + at_faces >= company:
+                        company = wp.static(WALKING_LANES)
+                        if in_nodes >= at_faces:
+                            if s.node > FINISHED:
+                                near, far = walk_node(surfaces.nodes, s.node, inverse, shift, s.nearest)
+                                s.node = near
+                                if far != FINISHED:
+                                    stack[s.depth] = far
+                                    s.depth += 1
+                                if near == FINISHED:
+                                    s.depth -= 1
+                                    s.node = stack[s.depth]
+                        elif s.node < FINISHED:
+                            slot = -2 - s.node
+                            distance = face_distance(surfaces.faces, slot, origin, to)
+                            if surfaces.order[slot] >= 0:
+                                s.depth -= 1
+                                s.node = stack[s.depth]
+                            else:
+                                s.node -= 1  # the next face of the leaf
+                            if distance >= 0.0 and distance < s.nearest:
+                                s.nearest = distance
+                                s.found = slot
+                                if s.ray == _SHADOW_RAY:
+                                    s.node = FINISHED
+                        in_nodes = count_lanes(s.node > FINISHED)
+                        at_faces = count_lanes(s.node < FINISHED)
                 if s.ray != _NO_RAY and s.node == FINISHED:
                     if s.ray == _SURFACE_RAY:
                         s.surface_queries += 1

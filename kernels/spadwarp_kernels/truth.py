@@ -3,7 +3,7 @@
 import warp as wp
 
 from .camera import Camera, pixel_direction
-from .surface import Surfaces, intersect_mesh_aimed, reflectance_at
+from .surface import Surfaces, intersect_surfaces, reflectance_at
 
 
 @wp.kernel(enable_backward=False)
@@ -27,7 +27,7 @@ def truth_kernel(
     u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
     if directions.shape[0] > 0:
         u = directions[row, column]
-    hit = intersect_mesh_aimed(surfaces.mesh, wp.vec3(0.0), u, 1.0e30)
+    hit = intersect_surfaces(surfaces, wp.vec3(0.0), u, 1.0e29, False)
     if hit.face >= 0:
         depth[row, column] = hit.distance * u[2]
         range[row, column] = hit.distance
