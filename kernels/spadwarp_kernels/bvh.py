@@ -53,7 +53,10 @@ def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
 
 @wp.func_native("""
     const wp::Mesh m = wp::mesh_get(mesh);
-    return node < m.bvh.num_nodes ? (m.bvh.node_lowers[node].b ? 1 : 0) : -1;
+    // The linear builder fills all nodes that there are room for, the others count theirs.
+    const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
+    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
+    return m.bvh.node_lowers[node].b ? 1 : 0;
 """)
 def _tree_kind(mesh: wp.uint64, node: int) -> int:
     """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
@@ -80,6 +83,13 @@ def _count_kernel(mesh: wp.uint64, has_children: wp.array(dtype=int)):
     has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
 
 
+@wp.func
+def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array(dtype=int)):
+    for slot in range(start, stop):
+        face = _tree_face(mesh, slot)
+        order[slot] = wp.where(slot + 1 < stop, ~face, face)
+
+
 @wp.kernel(enable_backward=False)
 def _pack_kernel(
     mesh: wp.uint64,
@@ -93,24 +103,25 @@ def _pack_kernel(
     kind = _tree_kind(mesh, node)
     root = _tree_root(mesh)
     pad = wp.vec3(padding)
-    lower = _tree_node(mesh, node, False)
-    upper = _tree_node(mesh, node, True)
-    if kind == 1:
-        for slot in range(bits_of(lower[3]), bits_of(upper[3])):
-            face = _tree_face(mesh, slot)
-            order[slot] = wp.where(slot + 1 < bits_of(upper[3]), ~face, face)
-        if node == root:  # a tree of one leaf
-            nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
-            nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
-            nodes[2] = _with_bits(wp.vec3(_NOWHERE), 0)
-            nodes[3] = _with_bits(wp.vec3(_NOWHERE), 0)
+    if kind == 1 and node == root:  # a tree of one leaf
+        lower = _tree_node(mesh, node, False)
+        upper = _tree_node(mesh, node, True)
+        _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
+        nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
+        nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
+        nodes[2] = _with_bits(wp.vec3(_NOWHERE), 0)
+        nodes[3] = _with_bits(wp.vec3(_NOWHERE), 0)
     if kind == 0:
+        # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
         place = wp.where(node == root, 0, before[node] + 1)
         for k in range(2):
-            child = bits_of(wp.where(k == 0, lower[3], upper[3]))
+            child = bits_of(_tree_node(mesh, node, k == 1)[3])
             low = _tree_node(mesh, child, False)
             high = _tree_node(mesh, child, True)
-            entry = wp.where(_tree_kind(mesh, child) == 1, -2 - bits_of(low[3]), before[child] + 1)
+            entry = before[child] + 1
+            if _tree_kind(mesh, child) == 1:
+                entry = -2 - bits_of(low[3])
+                _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
             nodes[4 * place + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
             nodes[4 * place + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
 

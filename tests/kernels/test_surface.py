@@ -18,11 +18,12 @@ from spadwarp_kernels import (
 from statistics_of_samples import DEVICES
 
 
-def _mesh(shape, device, leaf_size=1):
+def _mesh(shape, device, *, builder=None, leaf_size=1):
     """The mesh, which has to outlive its surfaces, and these."""
     mesh = wp.Mesh(
         wp.array(np.asarray(shape.vertices, np.float32), dtype=wp.vec3, device=device),
         wp.array(np.asarray(shape.faces, np.int32).ravel(), dtype=int, device=device),
+        bvh_constructor=builder,
         bvh_leaf_size=leaf_size,
     )
     return mesh, sk.make_surfaces(mesh)
@@ -108,8 +109,8 @@ def test_random_rays_do_not_leak(name, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("leaf_size", [1, 4])
-def test_our_walk_hits_what_warp_hits(leaf_size, device):
+@pytest.mark.parametrize(("builder", "leaf_size"), [(None, 1), (None, 4), ("sah", 4), ("median", 3), ("cubql", 1)])
+def test_our_walk_hits_what_warp_hits(builder, leaf_size, device):
     """In a soup of triangles of all sizes, from outside and inside, along the axes too; and in the shapes above."""
     rng = np.random.default_rng(5)
     corners = rng.normal(size=(3000, 1, 3)) + rng.lognormal(-2.0, 1.0, (3000, 1, 1)) * rng.normal(size=(3000, 3, 3))
@@ -120,7 +121,7 @@ def test_our_walk_hits_what_warp_hits(leaf_size, device):
     u[2500:7500, 1] = 0.0
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     for shape in (soup, *(shape for shape, _ in SHAPES.values())):
-        _kept, surfaces = _mesh(shape, device, leaf_size)
+        _kept, surfaces = _mesh(shape, device, builder=builder, leaf_size=leaf_size)
         arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (x, u)]
         face = wp.zeros((len(x), 3), dtype=int, device=device)
         distance = wp.zeros((len(x), 3), dtype=float, device=device)
