@@ -160,6 +160,12 @@ def test_what_cannot_be_read(tmp_path):
     (tmp_path / "bad.npy").write_bytes(b"junk")
     with pytest.raises(FileError, match="damaged"):
         depth_files.read_depth(tmp_path / "bad.npy")
+    np.save(tmp_path / "complex.npy", np.full((16, 16), 15.0 + 1.0j))
+    with pytest.raises(FileError, match=r"complex128 \(16, 16\); depth is real numbers"):
+        depth_files.read_depth(tmp_path / "complex.npy")
+    np.save(tmp_path / "marked.npy", np.where(np.eye(16) > 0, -1.0, 15.0))
+    marked = depth_files.read_depth(tmp_path / "marked.npy")
+    assert "16 values below 0" in marked.source and np.isnan(marked.depth).sum() == 16
     (tmp_path / "text.txt").write_text("1")
     with pytest.raises(FileError, match=r"'.txt' is not one of"):
         depth_files.read_depth(tmp_path / "text.txt")

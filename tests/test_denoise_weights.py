@@ -59,6 +59,48 @@ def test_a_large_frame():
     assert abs(np.nanmedian(found) - 15.0) < 0.01
 
 
+@pytest.mark.parametrize("missing", [0.5, 0.9])
+@pytest.mark.parametrize("model", MODELS)
+def test_frames_with_few_reports(model, missing):
+    """Nine of ten pixels may be missing: half of all are within 1.5 times what they are when all report."""
+    clean = np.nan_to_num(scene(96, 128), nan=15.0)
+    noisy = noisy_frame(clean, 0.05)
+    few = np.where(np.random.default_rng(5).random(noisy.shape) < missing, np.nan, noisy)
+    errors = []
+    for depth in (noisy, few):
+        frames = depth_frames(depth, gate=GATE)
+        found, seen = inference.denoise_frames(frames, model=model, device="cpu")
+        if model == "pyramid":
+            assert seen.mean() > 0.97
+        errors.append(np.median(np.abs(found[0] - clean)))
+    assert errors[1] < 1.5 * errors[0] + 0.001
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("decay", [0.0, 5.0])
+def test_backscatter_alone_is_no_target(share, decay):
+    """A frame of open water, where few pixels report and none of them a target, stays empty."""
+    generator = np.random.default_rng(6)
+    profile = np.exp(-decay * np.arange(64) / 64)
+    place = generator.choice(64, size=(96, 128), p=profile / profile.sum()) + generator.random((96, 128))
+    depth = GATE[0] + (GATE[1] - GATE[0]) * place / 64
+    depth[generator.random(depth.shape) >= share] = np.nan
+    found = spadwarp.denoise(depth, gate=GATE, profile=profile, device="cpu")
+    assert np.isfinite(found).mean() < 0.01
+
+
+def test_nothing_stands_for_what_lies_beside_a_target():
+    """The nearest report stands for a pixel missing inside a disc, none for the pixels about the disc."""
+    y, x = np.mgrid[:96, :128]
+    inside = np.hypot(y - 48, x - 64) < 30
+    depth = np.where(inside & (np.random.default_rng(7).random(inside.shape) > 0.2), 15.0, np.nan)
+    told = depth_frames(depth, gate=GATE).network_input()[0, 1] > 0
+    distance = np.hypot(y - 48, x - 64)
+    assert told[distance < 26].all() and not told[distance > 33].any()
+    whole = depth_frames(np.where(inside, 15.0, np.nan), gate=GATE).network_input()[0, 1] > 0
+    assert np.count_nonzero(whole & ~inside) < 0.05 * np.count_nonzero(inside)
+
+
 @pytest.mark.parametrize("model", [*MODELS, "median", "gating"])
 def test_an_empty_frame_stays_empty(model):
     assert np.isnan(spadwarp.denoise(np.full((32, 40), np.nan), gate=GATE, model=model)).all()

@@ -117,6 +117,9 @@ def denoise_file(
             device=device,
         )
     notes += [str(one.message) for one in caught]
+    empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
+    if empty:
+        notes.append(f"{empty} of {len(depth)} frames stay empty: nothing was reported, or no target is seen")
     with atomic_path(folder / f"{name}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, depth if read.frames else depth[0])
     about = {"content": "denoised depth", "method": model, "frame": "+x right, +y down, +z forward"}
@@ -176,10 +179,14 @@ def read_depth(
         array = _array(place, variable)
         stored = array if array.ndim == 2 or (as_depth and array.ndim == 3) else None
     if stored is not None:
+        if stored.dtype.kind not in "iuf":
+            raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
         depth = stored.astype(np.float32)
+        below = np.count_nonzero(depth < 0)
         depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
         frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
-        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source="depth as it is")
+        source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
+        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = read_histograms(place, variable=variable)
     changes: dict[str, Any] = {}
     if histograms.scene is None:
@@ -230,6 +237,9 @@ def _array(path: Path, variable: str | None) -> NDArray[Any]:
     """The array of a `.npy`, or of a `.mat` if it is depth; shape alone tells depth and histograms apart."""
     try:
         if path.suffix.lower() == ".npy":
+            with path.open("rb") as file:
+                if file.read(6) != b"\x93NUMPY":
+                    raise ValueError("it does not begin as NumPy's files do")
             return np.load(path, allow_pickle=False)
         from scipy.io import loadmat
 

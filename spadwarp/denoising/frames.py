@@ -49,11 +49,20 @@ class DepthFrames:
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
     def network_input(self) -> NDArray[np.float32]:
-        """`[N, 3, H, W]` as `spadwarp.denoising.networks` describes it."""
-        scaled = self.scaled
+        """`[N, 3, H, W]` as `spadwarp.denoising.networks` describes it.
+
+        A pixel that reported nothing stands for its nearest that did, where pixels about it report nearly as often as
+        elsewhere: networks learn from frames in which few are missing.
+        """
+        scaled, density = self.scaled, self.density
+        if np.isnan(scaled).any():
+            density = density.copy()
+            for depth, likely in zip(scaled, density, strict=True):
+                places = _stand_ins(depth, likely)
+                depth[:], likely[:] = depth[places], likely[places]
         reported = ~np.isnan(scaled)
         limit = LOG_DENSITY_LIMIT
-        log_density = np.log(np.clip(self.density, math.exp(-limit), math.exp(limit)))
+        log_density = np.log(np.clip(density, math.exp(-limit), math.exp(limit)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
         return np.stack([one.astype(np.float32) for one in channels], axis=1)
 
@@ -117,6 +126,34 @@ def depth_frames(
         place = np.nan_to_num((values - start) / (stop - start)) * bins.size
         relative = (bins / bins.mean())[np.clip(place.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
     return DepthFrames(depth=values, gate=(start, stop), density=relative)
+
+
+def _stand_ins(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns `[H, W]` of the pixels that stand for each: itself, or the nearest that reported something.
+
+    Where there is no target pixels report less often than on one, backscatter alone, and nothing should stand for them.
+    So a missing pixel stands for itself where, of the 15 × 15 pixels about it or as many as hold 64 reports, fewer than
+    half as many report as in the window that holds the most; and so do all, unless depths that follow each other agree
+    more often than backscatter would.
+
+    Args:
+        depth: Over the gate, NaN where nothing was reported, `[H, W]`.
+        density: Of backscatter at these depths, relative to a flat one, `[H, W]`.
+    """
+    from scipy.ndimage import distance_transform_edt, uniform_filter
+
+    reported = ~np.isnan(depth)
+    places = np.indices(depth.shape)
+    agreeing = np.count_nonzero(np.abs(np.diff(depth[reported])) < 0.01)
+    by_chance = np.minimum(0.02 * density[reported], 1.0).sum()
+    side = 2 * round(max(7.0, 4.0 / math.sqrt(max(reported.mean(), 1e-4)))) + 1
+    often = uniform_filter(reported.astype(np.float32), side, mode="constant")
+    inside = uniform_filter(np.ones_like(often), side, mode="constant")  # part of the window that lies in the image
+    missing = ~reported & (often >= 0.5 * often.max() * inside)
+    if missing.any() and agreeing > 1.3 * by_chance + 10:
+        nearest = distance_transform_edt(~reported, return_distances=False, return_indices=True)
+        places = np.where(missing, nearest, places)
+    return places[0], places[1]
 
 
 def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
