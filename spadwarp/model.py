@@ -104,9 +104,9 @@ def build_model(
         device_mesh = wp.Mesh(
             wp.array(mesh.vertices, dtype=wp.vec3, device=device),
             wp.array(mesh.faces.ravel(), dtype=int, device=device),
-            # The fastest to traverse of Warp's builders on CUDA; on the CPU its default.
+            # The fastest to traverse, by measurement.
             bvh_constructor="cubql" if device.is_cuda else None,
-            bvh_leaf_size=1 if device.is_cuda else None,
+            bvh_leaf_size=1 if device.is_cuda else 2,
         )
         surfaces = sk.make_surfaces(
             device_mesh,

@@ -87,7 +87,7 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 
 @wp.func
 def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them."""
+    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them on a GPU."""
     hit = SurfaceHit()
     hit.face = -1
     hit.distance = max_distance
