@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.config import Medium
@@ -232,6 +232,9 @@ def show_image(
 ) -> None:
     """An image with its colour bar below; grey where it is NaN, pointed ends where it goes beyond the bar."""
     _decorate(axis, title)
+    height, width = image.shape[:2]
+    if max(height, width) > 5 * min(height, width):  # two numbers have room along the short side
+        (axis.yaxis if height < width else axis.xaxis).set_major_locator(MaxNLocator(nbins=1, integer=True))
     cmap = matplotlib.colormaps[colours].with_extremes(bad=_MISSING)
     shown = axis.imshow(image, interpolation="nearest", cmap=cmap, norm=scale, clim=(low, high))
     below, above = bool((image < low).any()), bool((image > high).any())
@@ -242,7 +245,9 @@ def show_image(
         colour_bar.set_ticks(list(ticks), labels=list(ticks.values()))
         colour_bar.minorticks_off()
     else:
-        colour_bar.locator = MaxNLocator(nbins=4 if high >= 1e4 else 6)  # what is long needs room
+        longer = high >= 1e4 or 0 < high - low < 1e-3 * abs(high)
+        colour_bar.locator = MaxNLocator(nbins=4 if longer else 6)  # what is long needs room
+        colour_bar.formatter = ScalarFormatter(useOffset=False)
 
 
 def _log_ticks(low: float, high: float) -> dict[float, str]:
