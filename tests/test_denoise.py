@@ -127,6 +127,10 @@ def test_files_of_every_kind(tmp_path):
     )
     assert folder_of_both.exit_code == 0, folder_of_both.output
     assert {one.name for one in (tmp_path / "c").glob("*.npy")} == {"engine.npy", "one.npy"}
+    (folder / "bad.npy").write_bytes(b"junk")
+    rest = CliRunner().invoke(app, ["denoise", str(folder), "--model", "median", "--out", str(tmp_path / "d")])
+    assert rest.exit_code == 1 and "1 of 3 files could not be denoised" in rest.output
+    assert {one.name for one in (tmp_path / "d").glob("*.npy")} == {"engine.npy", "one.npy"}
 
 
 def test_histograms_become_depth_first(tmp_path):

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ConfigError, FileError
 
 from ._app import app, complain, say
 from ._options import (
@@ -106,26 +106,33 @@ def denoise(
     prepare_directory(out, overwrite=overwrite, needed=sum(one.stat().st_size for one in paths if one.is_file()))
     with arguments_checked():
         given = None if profile is None else np.load(profile, allow_pickle=False)
-    told, summary = {}, []
+    told, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
-        with arguments_checked():
-            done = denoise_file(
-                one,
-                out,
-                model=model,
-                gate=gate,
-                profile=given,
-                weights=weights,
-                device=device,
-                as_depth=depth,
-                channel=channel,
-                scale=scale,
-                variable=variable,
-                bin_width_ps=bin_width_ps,
-                gate_start_ns=gate_start_ns,
-                group_index=group_index,
-                irf_fwhm_ps=irf_fwhm_ps,
-            )
+        try:
+            with arguments_checked():
+                done = denoise_file(
+                    one,
+                    out,
+                    model=model,
+                    gate=gate,
+                    profile=given,
+                    weights=weights,
+                    device=device,
+                    as_depth=depth,
+                    channel=channel,
+                    scale=scale,
+                    variable=variable,
+                    bin_width_ps=bin_width_ps,
+                    gate_start_ns=gate_start_ns,
+                    group_index=group_index,
+                    irf_fwhm_ps=irf_fwhm_ps,
+                )
+        except FileError as error:
+            if len(paths) == 1:
+                raise
+            complain(f"error: {error}")
+            failed += 1
+            continue
         there = float(np.isfinite(done.depth).mean())
         frames = "1 frame" if len(done.depth) == 1 else f"{count(len(done.depth))} frames"
         told[one.name] = f"{frames}, {100 * there:.3g} % of the pixels have a depth"
@@ -136,8 +143,10 @@ def denoise(
             if len(paths) > 1:
                 complain(f"{number} of {len(paths)}")
     if not quiet:
-        say(rows({**told, "written": f"{3 * len(paths)} files in {out}"}))
+        say(rows({**told, "written": f"{3 * len(summary)} files in {out}"}))
     write_json({"model": model, "files": summary}, json_path)
+    if failed:
+        raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")
 
 
 @app.command()
