@@ -102,6 +102,12 @@ class InstrumentResponse:
         """Fraction of the detections of light at time `arrival` in each bin between `edges` [s]: `[edges - 1]`."""
         return np.diff(self.cumulative(np.asarray(edges, np.float64) - arrival))
 
+    def per_bin(self, bin_width: float) -> Floats:
+        """Fractions of a return in the bins about its own, `[2 r + 1]`, for returns spread evenly over a bin."""
+        reach = int(np.ceil(max(map(abs, self.support)) / bin_width)) + 2
+        edges = np.arange(-reach - 1, reach + 2) * bin_width
+        return np.diff(self.cumulative_integral(edges), 2) / bin_width
+
     # Its numbers
 
     @property

@@ -8,7 +8,8 @@ import torch
 from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
-from spadwarp.denoising import networks, noise
+from spadwarp.denoising import inference, networks, noise
+from spadwarp.denoising.clues import CLUES
 from spadwarp.denoising.noise import Batch, CleanScenes, draw_batch
 from spadwarp.denoising.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoising.training import fit, loss_of
@@ -34,6 +35,7 @@ PLAIN = {
     "own_profile": 1.0,
     "slanted_gate": 0.0,
     "counting": 0.0,
+    "scattered": 0.0,
     "dead": 0.0,
     "unknown_water": 0.0,
 }
@@ -49,8 +51,8 @@ def draw(plain, *, size=64, crop=64, seed=3, **options):
 def test_networks_keep_the_size(model, shape):
     network = networks.build_network(model).eval()
     with torch.inference_mode():
-        output = network(torch.rand(1, 3, *shape))
-    assert output.shape == (1, 3 if model == "pyramid" else 1, *shape)
+        output = network(torch.rand(1, 3 + CLUES * networks.reads_histograms(network), *shape))
+    assert output.shape == (1, {"pyramid": 3, "histograms": 4}.get(model, 1), *shape)
     assert torch.isfinite(output).all()
 
 
@@ -179,6 +181,14 @@ def test_crops_without_a_target_teach_no_depth():
     assert loss_of(output, Batch(frame, clean, hit), kind="mse") == pytest.approx(0.01, rel=1e-5)
 
 
+def test_depth_that_was_chosen_teaches_what_is_the_targets():
+    """Of histograms: a depth that is right may not be called wrong because the pixel's own is."""
+    hit = torch.ones(1, 1, 32, 32)
+    batch = Batch(torch.zeros(1, 3 + CLUES, 32, 32), 0.5 * hit, hit)
+    right, wrong = (torch.cat([0.5 * hit, 9 * hit, 9 * hit, chosen * hit], dim=1) for chosen in (0.5, 0.1))
+    assert loss_of(right, batch, kind="mse") < 1e-3 < 0.1 < loss_of(wrong, batch, kind="mse")
+
+
 RECIPE = {
     "model": "usdn",
     "data": "none",
@@ -207,6 +217,19 @@ def test_a_run_that_was_cut_short_ends_like_one_that_was_not(tmp_path):
     assert lines[-1]["mean_psnr"] == pytest.approx(whole.psnr, abs=1e-3)
 
 
+def test_histograms_are_learnt_from_the_weights_for_depth(tmp_path):
+    noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
+    recipe = TrainingRecipe.from_dict({**RECIPE, "model": "histograms", "start": "pyramid", "noise": noise})
+    done = fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
+    depth_alone, _ = inference.load_network("pyramid")
+    learnt = load_file(done.weights)
+    for name, values in depth_alone.state_dict().items():
+        assert torch.allclose(learnt[name].float(), values, atol=0.05), name  # six steps
+    assert "enter_clues.weight" in learnt
+    card = inference.weights_card("histograms", done.weights)
+    assert set(card["validation_psnr"]) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
+
+
 def test_a_folder_holds_one_recipe(tmp_path):
     recipe = TrainingRecipe.from_dict(RECIPE)
     fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
@@ -225,6 +248,8 @@ def test_a_folder_holds_one_recipe(tmp_path):
         ({"noise": {"backscatter": [0.5, 1.2]}}, r"noise.backscatter"),
         ({"noise": {"photons": [0.0, 3.0]}}, r"noise.photons"),
         ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
+        ({"model": "histograms"}, r"noise.counting"),
+        ({"start": "pyramid"}, r"start"),
     ],
 )
 def test_errors_in_a_recipe_name_the_field(tmp_path, change, said):

@@ -64,7 +64,13 @@ def test_arrows_point_one_way(place):
 
 
 # Themselves loaded when there are pictures to draw, or a network to run.
-LOADED_LATE = {"preview.py", "denoising/networks.py", "denoising/noise.py", "denoising/training.py"}
+LOADED_LATE = {
+    "preview.py",
+    "denoising/clues.py",
+    "denoising/networks.py",
+    "denoising/noise.py",
+    "denoising/training.py",
+}
 
 
 def test_heavy_packages_are_imported_where_they_are_used():

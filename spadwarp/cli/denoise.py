@@ -208,7 +208,16 @@ def evaluate(
     if report is not None:
         check_writable(report)
     if data.is_file() or (data / "result.h5").is_file():
-        _sweep(data, chosen, report, weights=weights, seed=seed, device=device, quiet=quiet, json_path=json_path)
+        _sweep(
+            data,
+            [*chosen, "histograms"] if models == "all" else chosen,
+            report,
+            weights=weights,
+            seed=seed,
+            device=device,
+            quiet=quiet,
+            json_path=json_path,
+        )
         return
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
         found = run(

@@ -19,7 +19,8 @@ from spadwarp.files import atomic_path, read_exr, write_exr
 from spadwarp.histogram_files import Histograms, read_histograms
 from spadwarp.reduction import depth_of
 
-from .inference import denoise
+from .frames import POOLED, depth_frames
+from .inference import clues_of, denoise_frames
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 
@@ -38,6 +39,7 @@ class DepthReading:
         gate: (start, stop) [m], as far as the file tells.
         profile: Backscatter over the gate, `[bins]`, as far as the file tells.
         source: How it came about, in words.
+        histograms: What the depth was estimated from, if that are counts of which the instrument response is known.
     """
 
     depth: NDArray[np.float32]
@@ -45,6 +47,7 @@ class DepthReading:
     gate: tuple[float, float] | None
     profile: NDArray[np.float64] | None
     source: str
+    histograms: Histograms | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,14 +111,13 @@ def denoise_file(
         notes.append(f"gate {gate[0]:.4g} to {gate[1]:.4g} m, from the nearest to the farthest depth of the file")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        depth = denoise(
-            read.depth,
-            gate=gate,
-            model=model,
-            profile=read.profile if profile is None else profile,
-            weights=weights,
-            device=device,
-        )
+        clues = None
+        if read.histograms is not None and model == "pyramid":
+            model = "histograms"
+            clues = _clues(read.histograms, group_index=reading.get("group_index"), device=device)
+        frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile, clues=clues)
+        found, seen = denoise_frames(frames, model=model, weights=weights, device=device)
+        depth = np.where(seen, found, np.float32(np.nan))
     notes += [str(one.message) for one in caught]
     empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
     if empty:
@@ -212,7 +214,33 @@ def read_depth(
         gate=(half * histograms.gate_start, half * gate_stop),
         profile=_profile(histograms),
         source=f"{reduced.quantity} by {method} from histograms",
+        histograms=histograms if histograms.values.dtype.kind in "iu" and histograms.response is not None else None,
     )
+
+
+def _clues(histograms: Histograms, *, group_index: float | None, device: str | None) -> NDArray[np.float32]:
+    """What counts tell beyond each pixel's depth, `[N, CLUES, H, W]`, pooled depths in metres."""
+    from spadwarp.frame_files import depth_from_time
+
+    bins, width = histograms.values.shape[-1], float(histograms.bin_width or 0.0)
+    counts = histograms.values.reshape(-1, *histograms.values.shape[-3:])
+    known = histograms.background
+    if known is None:  # of all pixels and frames together: the median of sparse counts would be 0
+        total = counts.sum(axis=(0, 1, 2), dtype=np.float64)
+        known = np.full(bins, np.median(total) / (counts.size / bins), np.float32)
+    background = np.broadcast_to(np.asarray(known, np.float64), (*np.shape(known)[:-1], bins)).reshape(-1, bins)
+    assert histograms.response is not None
+    clues = clues_of(
+        counts, background=background.mean(axis=0), response=histograms.response.per_bin(width), device=device
+    )
+    scene = histograms.scene
+    for channel in range(POOLED):
+        time = histograms.gate_start + clues[:, channel].astype(np.float64) * (bins * width)
+        if scene is not None:
+            clues[:, channel] = depth_from_time(time, scene=scene)
+        else:
+            clues[:, channel] = 0.5 * SPEED_OF_LIGHT / float(group_index or 1.0) * time
+    return clues
 
 
 def _profile(histograms: Histograms) -> NDArray[np.float64] | None:

@@ -138,6 +138,8 @@ def evaluate(
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + (["bm3d"] if bm3d_frames > 0 else [])
     if unknown := [name for name in (*models, *wanted) if name not in METHODS]:
         raise ValueError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+    if "histograms" in wanted:
+        raise ValueError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
     if frames < 1:
         raise ValueError(f"frames = {frames} is outside [1, inf)")
     own = own_weights(wanted, None if weights is None else Path(weights))

@@ -9,13 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
+__all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "POOLED", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
 
 LOG_DENSITY_LIMIT = 4.0
 """The logarithm of a backscatter density is cut at ± this."""
 
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
+
+POOLED = 3
+"""Of the clues of histograms, so many are depths: one for each window in which histograms were pooled."""
 
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
@@ -30,17 +33,21 @@ class DepthFrames:
         gate: (start, stop) in depth [m].
         density: Density of the water's backscatter at each depth, relative to a flat one over the gate, float32 of
             `depth`'s shape; 1 everywhere if it is not known.
+        clues: What the histograms behind them tell, float32 `[N, CLUES, H, W]` as `spadwarp.denoising.clues` has it,
+            but with pooled depths in metres; None where there are none.
     """
 
     depth: NDArray[np.float32]
     gate: tuple[float, float]
     density: NDArray[np.float32]
+    clues: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.depth)
 
     def __getitem__(self, part: slice) -> DepthFrames:
-        return replace(self, depth=self.depth[part], density=self.density[part])
+        clues = None if self.clues is None else self.clues[part]
+        return replace(self, depth=self.depth[part], density=self.density[part], clues=clues)
 
     @property
     def scaled(self) -> NDArray[np.float32]:
@@ -48,14 +55,14 @@ class DepthFrames:
         start, stop = self.gate
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
-    def network_input(self) -> NDArray[np.float32]:
-        """`[N, 3, H, W]` as `spadwarp.denoising.networks` describes it.
+    def network_input(self, *, histograms: bool = False) -> NDArray[np.float32]:
+        """`[N, 3, H, W]`, with `histograms` and their clues, as `spadwarp.denoising.networks` describes it.
 
-        A pixel that reported nothing stands for its nearest that did, where pixels about it report nearly as often as
-        elsewhere: networks learn from frames in which few are missing.
+        Without, a pixel that reported nothing stands for its nearest that did, where pixels about it report nearly as
+        often as elsewhere: networks of depth learn from frames in which few are missing.
         """
         scaled, density = self.scaled, self.density
-        if np.isnan(scaled).any():
+        if not histograms and np.isnan(scaled).any():
             density = density.copy()
             for depth, likely in zip(scaled, density, strict=True):
                 places = _stand_ins(depth, likely)
@@ -64,7 +71,13 @@ class DepthFrames:
         limit = LOG_DENSITY_LIMIT
         log_density = np.log(np.clip(density, math.exp(-limit), math.exp(limit)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
-        return np.stack([one.astype(np.float32) for one in channels], axis=1)
+        frame = np.stack([one.astype(np.float32) for one in channels], axis=1)
+        if not histograms:
+            return frame
+        assert self.clues is not None
+        start, stop = self.gate
+        pooled = (self.clues[:, :POOLED] - start) / (stop - start) - 0.5
+        return np.concatenate([frame, pooled, self.clues[:, POOLED:]], axis=1, dtype=np.float32)
 
 
 def depth_frames(
@@ -73,6 +86,7 @@ def depth_frames(
     gate: tuple[float, float],
     profile: ArrayLike | None = None,
     density: ArrayLike | None = None,
+    clues: NDArray[np.float32] | None = None,
 ) -> DepthFrames:
     """Checks depth and brings it into the form that denoisers take.
 
@@ -81,6 +95,7 @@ def depth_frames(
         gate: (start, stop) in depth [m].
         profile: Backscatter over the gate in any number of equal bins, `[bins]`, ≥ 0, in any unit.
         density: In its place, its density [1/m] at each depth, of `depth`'s shape; NaN for not known.
+        clues: Of the histograms, `[N, CLUES, H, W]`, pooled depths in metres.
 
     What lies farther than `MARGIN` outside the gate counts as not reported, with a warning that gives the number.
 
@@ -96,6 +111,8 @@ def depth_frames(
             f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; one of "
             f"{SMALLEST_SIDE} x {SMALLEST_SIDE} is the least"
         )
+    if clues is not None and (len(clues) != len(values) or clues.shape[2:] != values.shape[1:]):
+        raise ValueError(f"histograms are {len(clues)} frames of {clues.shape[2:]} pixels, depth is {values.shape}")
     start, stop = map(float, gate)
     if not (math.isfinite(stop) and 0 <= start < stop):
         raise ValueError(f"gate = ({start}, {stop}) m is not (start, stop) with 0 <= start < stop")
@@ -125,7 +142,7 @@ def depth_frames(
             )
         place = np.nan_to_num((values - start) / (stop - start)) * bins.size
         relative = (bins / bins.mean())[np.clip(place.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
-    return DepthFrames(depth=values, gate=(start, stop), density=relative)
+    return DepthFrames(depth=values, gate=(start, stop), density=relative, clues=clues)
 
 
 def _stand_ins(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import DeviceError, FileError, SpadwarpError
 
 from .baselines import BASELINES, MEDIAN_WINDOWS, median_filter
-from .frames import DepthFrames, depth_frames
+from .frames import POOLED, DepthFrames, depth_frames
 from .recipe import MODELS
 
 __all__ = ["METHODS", "denoise", "denoise_frames", "weights_card"]
@@ -33,6 +33,9 @@ def denoise(
     gate: tuple[float, float],
     model: str = "pyramid",
     profile: ArrayLike | None = None,
+    counts: ArrayLike | None = None,
+    background: ArrayLike | None = None,
+    response: ArrayLike | None = None,
     weights: str | Path | None = None,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -43,9 +46,15 @@ def denoise(
         depth: `[H, W]` or `[N, H, W]` [m], planar depth or range; NaN and 0 mean that nothing was reported.
         gate: (start, stop) of the camera's gate, in `depth`'s own measure [m]. The network sees depth over the gate:
             distances need not be those of its training.
-        model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d".
+        model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" stands
+            for "histograms", its variant that makes use of them.
         profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; taken as flat if not
             given. PyramidNet and gating make use of it.
+        counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.
+            PyramidNet makes use of them and of the two that follow: where photons are few, pixels tell more together.
+        background: Expected background counts of a pixel, `[T]`.
+        response: Instrument response per bin about its time zero, `[2 r + 1]`, as
+            `spadwarp.InstrumentResponse.per_bin` gives it.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
         progress: Called with ("frames", done, total).
@@ -59,7 +68,14 @@ def denoise(
         SpadwarpError: A package of the extra `denoise` is missing; a device that is not there; weights that cannot be
             read.
     """
-    frames = depth_frames(depth, gate=gate, profile=profile)
+    clues = None
+    if counts is not None and model in ("pyramid", "histograms"):
+        model = "histograms"
+        if background is None or response is None:
+            raise ValueError("counts go with background and response, which are missing")
+        clues = clues_of(counts, background=background, response=response, device=device)
+        clues[:, :POOLED] = gate[0] + (gate[1] - gate[0]) * clues[:, :POOLED]
+    frames = depth_frames(depth, gate=gate, profile=profile, clues=clues)
     found, seen = denoise_frames(frames, model=model, weights=weights, device=device, progress=progress)
     return np.where(seen, found, np.float32(np.nan)).reshape(np.shape(depth))
 
@@ -79,6 +95,8 @@ def denoise_frames(
     """
     if model not in METHODS:
         raise ValueError(f"model = {model!r} is not one of {', '.join(map(repr, METHODS))}")
+    if model == "histograms" and frames.clues is None:
+        raise ValueError('model = "histograms" needs histograms, and there is depth alone')
     reported = ~np.isnan(frames.depth)
     if model in BASELINES:
         if weights is not None:
@@ -90,7 +108,7 @@ def denoise_frames(
     torch = _torch()
     place = _device(torch, device)
     network, _ = load_network(model, weights, str(place))
-    inputs = frames.network_input()
+    inputs = frames.network_input(histograms=model == "histograms")
     start, stop = frames.gate
     found, seen = np.empty_like(frames.depth), reported.copy()
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
@@ -108,6 +126,45 @@ def denoise_frames(
             progress("frames", min(first + part, len(inputs)), len(inputs))
     seen &= reported.any(axis=(1, 2), keepdims=True)
     return found, seen
+
+
+def clues_of(
+    counts: ArrayLike, *, background: ArrayLike, response: ArrayLike, device: str | None = None
+) -> NDArray[np.float32]:
+    """Clues of histograms over the gate, as `spadwarp.denoising.clues` has them, frame by frame.
+
+    Args:
+        counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
+        background: Expected background counts of a pixel, `[T]`.
+        response: Instrument response per bin about its time zero, `[2 r + 1]`.
+        device: torch device.
+
+    Returns:
+        float32 `[N, CLUES, H, W]`; the pooled depths, which come first, as parts of the gate.
+
+    Raises:
+        ValueError: Shapes or values that cannot be.
+    """
+    torch = _torch()
+    from .clues import histogram_clues
+
+    cubes = np.asarray(counts)
+    levels, taps = (np.asarray(one, np.float32) for one in (background, response))
+    if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
+        raise ValueError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
+    if levels.shape != cubes.shape[-1:] or not (np.isfinite(levels).all() and (levels >= 0).all()):
+        raise ValueError(f"background has shape {levels.shape}; {cubes.shape[-1:]} is needed, of numbers >= 0")
+    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
+        raise ValueError(f"response has shape {taps.shape}; an odd number of values about time zero is needed")
+    place = _device(torch, device)
+    level, tap = (torch.from_numpy(one[None]).to(place) for one in (levels, taps / taps.sum()))
+    level = level.clamp_min(1e-6 * float(level.mean()) + 1e-9)
+    found = []
+    with torch.inference_mode():
+        for cube in cubes.reshape(-1, *cubes.shape[-3:]):
+            one = torch.from_numpy(cube.astype(np.float32)[None]).to(place)
+            found.append(histogram_clues(one, level, tap).cpu().numpy())
+    return np.concatenate(found)
 
 
 def weights_card(model: str, weights: str | Path | None = None) -> dict[str, Any]:

@@ -2,19 +2,27 @@
 
 All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at its end; 1 where nothing was reported),
 1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
-profile, see `spadwarp.denoising.noise.log_density`). They return denoised depth over the gate, `[batch, 1, height,
-width]`; PyramidNet also the logits of "this pixel sees a target" and of "its depth is the target's".
+profile, see `spadwarp.denoising.noise.log_density`); PyramidNet for histograms also the channels of
+`spadwarp.denoising.clues` with 0.5 taken off the depths among them. They return denoised depth over the gate, `[batch,
+1, height, width]`; PyramidNet also the logits of "this pixel sees a target" and of "its depth is the target's".
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds"]
+from .clues import CLUES, WINDOWS
+
+__all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
+
+
+LONGEST_DELAY = 0.2
+"""The most by which light that was scattered forward is taken to be late [gate widths]."""
 
 
 class USDN(nn.Module):
@@ -94,6 +102,10 @@ class PyramidNet(nn.Module):
     What it knows beyond depth: which pixels reported, how probable backscatter is at the reported depth, and three
     order statistics of each 3×3 neighbourhood, which shut out the nearer, scattered photons. The pyramid works on 2×2
     blocks (a quarter of the pixels), then on 4, 8 and 16 pixels.
+
+    With `histograms` it also sees the channels of `spadwarp.denoising.clues`. Each pixel then first gets a depth out of
+    its own and those of pooled histograms, which takes the place of the reported one in all that follows; and the
+    delay of scattered light, which the shape of the return shows, is taken off the result.
     """
 
     radius = 2
@@ -101,7 +113,7 @@ class PyramidNet(nn.Module):
     blocks = (4, 16)  # sides of the coarse candidates
     stride = 16  # sizes are padded to multiples of it
 
-    def __init__(self, *, widths: tuple[int, int, int, int] = (40, 64, 80, 96)) -> None:
+    def __init__(self, *, widths: tuple[int, int, int, int] = (40, 64, 80, 96), histograms: bool = False) -> None:
         super().__init__()
         one, two, three, four = widths
         self.enter = nn.Conv2d(4 * (3 + self.ranks), one, 3, padding=1)
@@ -125,17 +137,30 @@ class PyramidNet(nn.Module):
             bias[self.candidates + 2 :] = 2.0
             self.leave.weight.mul_(0.3)
             self.leave.bias.copy_(bias.repeat_interleave(4))
+        self.enter_clues: nn.Conv2d | None = None
+        if histograms:
+            self.enter_clues = nn.Conv2d(4 * CLUES, one, 3, padding=1, bias=False)
+            # For each of the 4 pixels: logits of its own depth and of the pooled ones, and of the delay.
+            self.leave_clues = nn.Conv2d(one, 4 * (len(WINDOWS) + 2), 1)
+            with torch.no_grad():  # begins as the network without
+                assert self.leave_clues.bias is not None
+                self.enter_clues.weight.mul_(0.1)
+                self.leave_clues.weight.mul_(0.3)
+                self.leave_clues.bias.copy_(torch.tensor([2.0, *[0.0] * (len(WINDOWS) + 1)]).repeat_interleave(4))
 
     def forward(self, frame: Tensor) -> Tensor:
-        """Three channels: depth, and the logits of "sees a target" and of "the reported depth is the target's"."""
+        """Depth, the logits of "sees a target" and of "its depth is the target's"; with histograms that depth, too."""
         height, width = frame.shape[-2:]
         bottom, right = -height % self.stride, -width % self.stride
         if bottom or right:
             frame = F.pad(frame, (0, right, 0, bottom), mode="replicate")
-        depth, reported, density = (one.contiguous() for one in frame.split(1, dim=1))
+        depth, reported, density = (one.contiguous() for one in frame[:, :3].split(1, dim=1))
         ranked = [rank - depth for rank in _ranks(depth)]
         inputs = torch.cat([depth - 0.5, reported, 0.25 * density, *ranked], dim=1)
-        x = self.before[0](self.enter(F.pixel_unshuffle(inputs, 2)))
+        x = self.enter(F.pixel_unshuffle(inputs, 2))
+        if self.enter_clues is not None:
+            x = x + self.enter_clues(F.pixel_unshuffle(frame[:, 3:], 2))
+        x = self.before[0](x)
         skipped = []
         for down, before in zip(self.down, list(self.before)[1:], strict=True):
             skipped.append(x)
@@ -147,6 +172,9 @@ class PyramidNet(nn.Module):
         head = self.leave(F.relu(x)).float().unflatten(1, (-1, 2, 2))
         depth, reported = depth.float(), reported.float()
         true = F.pixel_shuffle(head[:, -1].flatten(1, 2), 2)
+        if self.enter_clues is not None:
+            depth, delay = self._chosen(depth, reported, frame[:, 3:].float(), self.leave_clues(F.relu(x)))
+            reported = torch.ones_like(depth)
         certainty = torch.sigmoid(true) * reported
         values = [_windows(depth, self.radius)]
         trusts = [_windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), self.radius)]
@@ -159,7 +187,18 @@ class PyramidNet(nn.Module):
         own = head[:, self.candidates :, None]
         found = _weighted_mean([*logits, own[:, :1]], [*values, 0.5 + own[:, 1:2]])
         output = torch.cat([found[:, None], head[:, -2:]], dim=1)
-        return F.pixel_shuffle(output.flatten(1, 3), 2)[..., :height, :width]
+        output = F.pixel_shuffle(output.flatten(1, 3), 2)
+        if self.enter_clues is not None:
+            output = torch.cat([output[:, :1] - delay, output[:, 1:], depth], dim=1)
+        return output[..., :height, :width]
+
+    def _chosen(self, depth: Tensor, reported: Tensor, clues: Tensor, head: Tensor) -> tuple[Tensor, Tensor]:
+        """A depth for each pixel out of its own and those of pooled histograms, and how late its light is."""
+        depths = torch.cat([depth, 0.5 + clues[:, : len(WINDOWS)]], dim=1)
+        head = F.pixel_shuffle(head, 2).float()
+        logits = torch.cat([head[:, :1] + 1e4 * (reported - 1.0), head[:, 1:-1]], dim=1)
+        chosen = (logits.softmax(dim=1) * depths).sum(dim=1, keepdim=True)
+        return chosen, LONGEST_DELAY * torch.sigmoid(head[:, -1:] - 5.0)
 
 
 class _Planes(nn.Conv2d):
@@ -222,7 +261,12 @@ def _weighted_mean(logits: list[Tensor], values: list[Tensor]) -> Tensor:
     return torch.stack(sums).sum(dim=0) / torch.stack([one.sum(dim=(1, 2)) for one in weights]).sum(dim=0)
 
 
-NETWORKS: dict[str, Callable[[], nn.Module]] = {"usdn": USDN, "dncnn": DnCNN, "pyramid": PyramidNet}
+NETWORKS: dict[str, Callable[[], nn.Module]] = {
+    "usdn": USDN,
+    "dncnn": DnCNN,
+    "pyramid": PyramidNet,
+    "histograms": partial(PyramidNet, histograms=True),
+}
 """Networks by the name that recipes and commands use."""
 
 
@@ -231,6 +275,11 @@ def build_network(name: str) -> nn.Module:
     if name not in NETWORKS:
         raise ValueError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
     return NETWORKS[name]()
+
+
+def reads_histograms(network: nn.Module) -> bool:
+    """Whether frames need the channels of `spadwarp.denoising.clues` for this network."""
+    return getattr(network, "enter_clues", None) is not None
 
 
 def multiply_adds(network: nn.Module, height: int, width: int) -> int:
@@ -246,7 +295,8 @@ def multiply_adds(network: nn.Module, height: int, width: int) -> int:
     mode = network.training
     try:
         with torch.inference_mode():
-            network.eval()(torch.zeros(1, 3, height, width, device=next(network.parameters()).device))
+            channels = 3 + CLUES * reads_histograms(network)
+            network.eval()(torch.zeros(1, channels, height, width, device=next(network.parameters()).device))
     finally:
         network.train(mode)
         for hook in hooks:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .clues import WINDOWS, histogram_clues, toeplitz
 from .frames import LOG_DENSITY_LIMIT, MARGIN
 from .recipe import Noise
 
@@ -48,7 +49,8 @@ class CleanScenes:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Noisy frames as networks take them, `[B, 3, h, w]`; clean depth over the gate and target seen, `[B, 1, h, w]`."""
+    """Noisy frames as networks take them, `[B, 3, h, w]`, or `[B, 3 + CLUES, h, w]` with histograms; clean depth over
+    the gate and target seen, `[B, 1, h, w]`."""
 
     frame: Tensor
     clean: Tensor
@@ -63,8 +65,12 @@ def draw_batch(
     crop: int,
     generator: torch.Generator,
     always_replaced: bool = False,
+    histograms: bool = False,
 ) -> Batch:
-    """`size` pairs of `crop` × `crop` pixels, on the scenes' device; one in ten without backscatter pixels, or none."""
+    """`size` pairs of `crop` × `crop` pixels, on the scenes' device; one in ten without backscatter pixels, or none.
+
+    With `histograms`, all samples are of counts and have the channels for them.
+    """
     device = scenes.depth.device
 
     def uniform(*shape: int) -> Tensor:
@@ -114,11 +120,12 @@ def draw_batch(
     present = hit | (stray & coin(0.5)[:, None, None])
 
     counted = round(noise.counting * size)
+    clues = None
     if counted:
         photons, background = log_between(noise.photons)[:counted], log_between(noise.sbr)[:counted]
-        reported[:counted], present[:counted] = _counting(
+        reported[:counted], present[:counted], clues = _counting(
             clean[:counted], hit[:counted], sigma[:counted], reach[:counted], profile[:counted],
-            photons, photons / background, generator,
+            photons, photons / background, noise, generator, histograms=histograms,
         )  # fmt: skip
     dead = torch.where(coin(0.7), 0.0, noise.dead * uniform(size))[:, None, None]
     present &= (uniform(size, crop, crop) >= dead) & (reported > -MARGIN) & (reported < 1.0 + MARGIN)
@@ -127,6 +134,9 @@ def draw_batch(
     known = torch.where(coin(noise.unknown_water)[:, None], 1.0, profile)
     density = torch.where(present, log_density(known, reported), 0.0)
     frame = torch.stack([reported, present.float(), density], dim=1)
+    if clues is not None:
+        clues[:, : len(WINDOWS)] -= 0.5
+        frame = torch.cat([frame, clues], dim=1)
     return Batch(frame, clean[:, None], hit[:, None].float())
 
 
@@ -187,9 +197,12 @@ def _counting(
     profile: Tensor,
     photons: Tensor,
     background: Tensor,
+    noise: Noise,
     generator: torch.Generator,
-) -> tuple[Tensor, Tensor]:
-    """Maximum-likelihood depth from histograms of Poisson counts, and where there were counts; `[B, h, w]`."""
+    *,
+    histograms: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Maximum-likelihood depth from histograms of Poisson counts, where there were counts, and the clues."""
     size, device = len(clean), clean.device
     bins = _COUNT_BINS
     width = (0.6 + 1.2 * torch.rand(size, generator=generator, device=device))[:, None]  # σ of the response [bins]
@@ -201,19 +214,23 @@ def _counting(
     edges = torch.arange(bins + 1, device=device, dtype=torch.float32)
     level = torch.nn.functional.interpolate(profile[:, None], size=bins, mode="nearest")[:, 0]
     level = background[:, None] * level / bins + 1e-4  # expected background counts per bin
-    rate = level[:, None, None] * (edges[:-1] < (reach * bins)[..., None]) + 1e-4
-    phase = (edges - (clean * bins)[..., None]) / width[:, None, None]
-    rate += signal[..., None] * torch.special.ndtr(phase).diff(dim=-1)
-    counts = torch.poisson(rate, generator=generator)
+    phase = (edges - (clean * bins)[..., None]).div_(width[:, None, None])
+    rate = torch.special.ndtr(phase).diff(dim=-1).mul_(signal[..., None])
+    scattered = round(noise.scattered * size)
+    if scattered:
+        rate[:scattered] = _scattered(rate[:scattered], noise, generator)
+    rate += level[:, None, None] * (edges[:-1] < (reach * bins)[..., None])
+    counts = torch.poisson(rate.add_(1e-4), generator=generator)
+    del rate, phase
 
     # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), all k at once as a product of matrices.
-    apart = torch.arange(bins, device=device)
-    distance = (apart[:, None] - apart).abs()
-    response = torch.exp(-0.5 * (distance / width[:, :, None]).square()) * (distance <= _TAPS)
-    response = response / response[:, bins // 2].sum(dim=1)[:, None, None]
-    gain = torch.log1p(photons[:, None, None] * response / level[:, :, None])  # [B, j, k]
+    apart = torch.arange(-_TAPS, _TAPS + 1, device=device)
+    response = torch.exp(-0.5 * (apart / width).square())
+    response = response / response.sum(dim=1, keepdim=True)
+    gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
     best = score.argmax(dim=-1, keepdim=True)
+    clues = histogram_clues(counts, level, response) if histograms else None
 
     # Centroid of the counts within 2σ about the best bin.
     offsets = torch.arange(-4, 5, device=device)
@@ -222,4 +239,47 @@ def _counting(
     total = weight.sum(dim=-1)
     centroid = (weight * (near + 0.5)).sum(dim=-1) / total.clamp_min(1e-9)
     depth = torch.where(total > 0, centroid, best[..., 0] + 0.5)
-    return depth / bins, counts.sum(dim=-1) > 0
+    return depth / bins, counts.sum(dim=-1) > 0, clues
+
+
+def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
+    """A part of the signal `[B, h, w, T]`, in half of the frames nearly all of it, late and spread over the image.
+
+    Light that water scatters forward has longer ways: its delays are drawn as a sum of two exponentials, after a first
+    delay; and it comes from beside the pixel, by an exponential in rows and in columns. Energy is kept, but for what
+    leaves the gate. Its rate may be rough, as histograms of a simulation with few photons are.
+    """
+    size, height, width, bins = rate.shape
+    device = rate.device
+
+    def uniform() -> Tensor:
+        return torch.rand(size, 1, 1, generator=generator, device=device)
+
+    def log_between(limits: tuple[float, float]) -> Tensor:
+        return torch.exp(math.log(limits[0]) + math.log(limits[1] / limits[0]) * uniform())
+
+    def lateness(mean: Tensor) -> Tensor:
+        """Share that a return in bin k has in bin j, `[B, k, j]`."""
+        late = torch.arange(bins, device=device)
+        late = late - late[:, None]
+        decay = torch.exp(-1.0 / (mean * bins).clamp_min(0.05))
+        return torch.where(late >= 0, (1.0 - decay) * decay ** late.clamp_min(0), 0.0)
+
+    def spread(length: int, scale: Tensor) -> Tensor:
+        place = torch.arange(length, device=device)
+        weight = torch.exp(-(place - place[:, None]).abs() / scale)
+        return weight / weight.sum(dim=2, keepdim=True)
+
+    delay, slow = log_between(noise.delay), 0.6 * uniform()
+    late = (1.0 - slow) * lateness(delay) + slow * lateness(delay * (2.0 + 4.0 * uniform()))
+    late = lateness(delay * 0.7 * uniform()) @ late
+    scale = log_between(noise.spread)
+    spread_light = torch.bmm(rate.flatten(1, 2), late).view_as(rate)
+    spread_light = torch.matmul(spread(width, scale)[:, None], spread_light)
+    spread_light = torch.bmm(spread(height, scale), spread_light.flatten(2)).view_as(rate)
+    rough = (noise.roughness[0] + (noise.roughness[1] - noise.roughness[0]) * uniform())[..., None]
+    if noise.roughness[1] > 0:
+        grain = torch.randn(rate.shape, generator=generator, device=device)
+        spread_light *= grain.mul_(rough).sub_(0.5 * rough.square()).exp_()
+    share = torch.where(uniform() < 0.5, uniform(), 0.95 + 0.05 * uniform())[..., None]
+    return torch.lerp(rate, spread_light, share)

@@ -25,8 +25,8 @@ from spadwarp.response import InstrumentResponse, instrument_response
 from spadwarp.result import SPEED_OF_LIGHT
 
 from .baselines import MEDIAN_WINDOWS
-from .frames import DepthFrames, depth_frames
-from .inference import METHODS, denoise_frames, own_weights
+from .frames import POOLED, DepthFrames, depth_frames
+from .inference import METHODS, clues_of, denoise_frames, own_weights
 
 if TYPE_CHECKING:
     from spadwarp.result import Result
@@ -82,7 +82,7 @@ def photon_sweep(
     *,
     photons: Sequence[float] = (1, 3, 10, 30, 100),
     sbr: Sequence[float] = (0.05, 0.3, 1.0, 5.0),
-    models: Sequence[str] = ("median", "usdn", "dncnn", "pyramid"),
+    models: Sequence[str] = ("median", "usdn", "dncnn", "pyramid", "histograms"),
     frames: int = 1,
     seed: int = 0,
     weights: str | Path | None = None,
@@ -122,7 +122,9 @@ def photon_sweep(
     for row, ratio in enumerate(sbr):
         for column, count in enumerate(photons):
             for _ in range(frames):
-                noisy, sigma = photon_frame(result, photons=count, sbr=ratio, seed=seed * 1_000_003 + done)
+                noisy, sigma = photon_frame(
+                    result, photons=count, sbr=ratio, seed=seed * 1_000_003 + done, device=device
+                )
                 start, stop = noisy.gate
                 seen = np.isfinite(truth) & np.isfinite(sigma) & (truth >= start) & (truth < stop)
                 guess = (stop - start) / np.sqrt(12.0)
@@ -162,13 +164,18 @@ def photon_sweep(
     )
 
 
-def photon_frame(result: Result, *, photons: float, sbr: float, seed: int) -> tuple[DepthFrames, NDArray[np.float64]]:
-    """One frame of likelihood depth from Poisson counts, and the Cramér–Rao bound of each pixel `[H, W]` [m]."""
+def photon_frame(
+    result: Result, *, photons: float, sbr: float, seed: int, device: str | None = None
+) -> tuple[DepthFrames, NDArray[np.float64]]:
+    """One frame of likelihood depth from Poisson counts, and the Cramér–Rao bound of each pixel `[H, W]` [m].
+
+    The frame also has the clues of its histograms, worked out on the torch device.
+    """
     from scipy.ndimage import convolve1d
 
     scene = result.scene
     response = _response(scene)
-    matrix = _smearing(response, scene.gate.bin_width)
+    matrix = response.per_bin(scene.gate.bin_width)
     signal = result.component("ballistic") + result.component("forward_scattered")
     back = result.component("backscatter")
     seen = np.isfinite(result.truth.depth) & (signal.sum(axis=-1) > 0)
@@ -193,7 +200,11 @@ def photon_frame(result: Result, *, photons: float, sbr: float, seed: int) -> tu
     sigma = crlb_from_histogram(signal * scale, background, bin_width=scene.gate.bin_width, pulses=1.0, irf=response)
     half = 0.5 * SPEED_OF_LIGHT / scene.medium.group_index
     gate = (half * scene.gate.start, half * scene.gate.stop)
-    return depth_frames(depth, gate=gate, profile=profile), sigma * half
+    clues = clues_of(counts[None], background=background[0, 0], response=matrix, device=device)
+    for channel in range(POOLED):
+        time = scene.gate.start + clues[0, channel].astype(np.float64) * (scene.gate.stop - scene.gate.start)
+        clues[0, channel] = depth_from_time(time, scene=scene)
+    return depth_frames(depth, gate=gate, profile=profile, clues=clues), sigma * half
 
 
 def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:
@@ -209,7 +220,7 @@ def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:
         for name, values in sweep.rmse.items():
             axis.plot(
                 sweep.photons, 1e3 * values[row], color=COLOURS[name], marker="o", markersize=3.5,
-                linewidth=2.2 if name == "pyramid" else 1.2, linestyle="--" if name == "input" else "-",
+                linewidth=2.2 if name == "histograms" else 1.2, linestyle="--" if name == "input" else "-",
                 label="likelihood of each pixel" if name == "input" else TITLES[name],
             )  # fmt: skip
         axis.plot(
@@ -240,10 +251,3 @@ def _response(scene: Any) -> InstrumentResponse:
         shape=detector.irf,
         tail=detector.irf_tail_ps * 1e-12,
     )
-
-
-def _smearing(response: InstrumentResponse, bin_width: float) -> NDArray[np.float64]:
-    """The response per bin, centred, for light that is spread evenly over a bin."""
-    reach = int(np.ceil(max(map(abs, response.support)) / bin_width)) + 2
-    edges = np.arange(-reach - 1, reach + 2) * bin_width
-    return np.diff(response.cumulative_integral(edges), 2) / bin_width

@@ -6,17 +6,26 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from spadwarp._problems import describe
 from spadwarp.errors import ConfigError, FileError
 
 __all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]
 
-MODELS = ("pyramid", "dncnn", "usdn")
-"""Names of the networks."""
+MODELS = ("pyramid", "histograms", "dncnn", "usdn")
+"""Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
 
 
 class _Table(BaseModel):
@@ -67,6 +76,10 @@ class Noise(_Table):
     counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
     photons: Positive = Field((0.7, 150.0), description="signal counts a pixel of these, even in the logarithm")
     sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, even in the logarithm")
+    scattered: Share = Field(0.0, description="of these, samples with light scattered forward, late and spread")
+    delay: Positive = Field((0.004, 0.12), description="mean delay of that light [gate widths], even in the logarithm")
+    spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], even in the logarithm")
+    roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
     dead: Share = Field(0.1, description="highest part of the pixels that report nothing for no reason")
     unknown_water: Share = Field(0.2, description="samples whose backscatter profile the network is not told")
 
@@ -91,12 +104,21 @@ class Optimiser(_Table):
 class TrainingRecipe(_Table):
     """Everything a training depends on, checked and frozen."""
 
-    model: Literal["pyramid", "dncnn", "usdn"] = Field(..., description="network")
+    model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
+    start: Literal["pyramid"] | None = Field(None, description="network of the package with whose weights it begins")
     data: str = Field(..., min_length=1, description="dataset (folder), relative to the working directory")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
     optimiser: Optimiser = Optimiser()
     _source: Path | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if self.model == "histograms" and self.noise.counting != 1:
+            raise ValueError(f'noise.counting = {self.noise.counting} with model = "histograms", which needs 1')
+        if self.start is not None and self.model not in ("pyramid", "histograms"):
+            raise ValueError(f"start = {self.start!r}: its layers are not those of {self.model!r}")
+        return self
 
     @property
     def source(self) -> Path | None:

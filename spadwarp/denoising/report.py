@@ -27,6 +27,7 @@ TITLES = {
     "usdn": "USDN",
     "dncnn": "DnCNN",
     "pyramid": "PyramidNet",
+    "histograms": "PyramidNet, histograms",
 }
 COLOURS = {
     "input": "0.55",
@@ -36,6 +37,7 @@ COLOURS = {
     "usdn": "#009E73",
     "dncnn": "#D55E00",
     "pyramid": "#0072B2",
+    "histograms": "black",
 }
 _FIELDS = {
     "psnr": ("PSNR [dB]", "{:.2f}"),

@@ -97,7 +97,8 @@ def draw_learning_curves(log: str | Path, path: str | Path, *, title: str) -> Pa
     loss.set(yscale="log" if min(losses) > 0 else "linear", xlabel="step", ylabel="loss")  # "psnr" is a logarithm
     for level, shade in zip(lines[-1]["psnr"], np.linspace(0.75, 0.0, len(lines[-1]["psnr"])), strict=True):
         values = [line["psnr"][level] for line in lines]
-        psnr.plot(steps, values, color=str(shade), marker="o", markersize=size, label=f"BS {level}")
+        name = f"BS {level}" if float(level) < 1 else f"{float(level):g} photons"
+        psnr.plot(steps, values, color=str(shade), marker="o", markersize=size, label=name)
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
     psnr.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (loss, psnr):

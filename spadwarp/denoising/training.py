@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.files import atomic_path
 
-from .inference import _device
-from .networks import build_network
+from .inference import _device, load_network
+from .networks import build_network, reads_histograms
 from .noise import Batch, CleanScenes, draw_batch
 from .recipe import Noise, TrainingRecipe
 
@@ -32,6 +32,9 @@ __all__ = ["LEVELS", "Trained", "fit"]
 
 LEVELS = (0.042, 0.183, 0.264, 0.337, 0.394, 0.480)
 """Shares of backscatter pixels at which the paper, and validation here, measures."""
+
+PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
+"""Signal photons a pixel, at a third of the background, at which networks that read histograms are validated."""
 
 _CHECKPOINT = "checkpoint.pt"
 _FLOOR = 3e-6  # mean square over the gate below which a crop is good enough: 55 dB
@@ -91,7 +94,10 @@ def fit(
     training, validation = training.to(crew.device), validation.to(crew.device)
     torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = crew.is_cuda
     torch.manual_seed(recipe.seed)
-    network: Any = build_network(recipe.model).to(crew.device)
+    network: Any = build_network(recipe.model)
+    if recipe.start is not None:
+        network.load_state_dict(load_network(recipe.start)[0].state_dict(), strict=False)
+    network = network.to(crew.device)
     network = network.to(memory_format=torch.channels_last)
     learner = nn.parallel.DistributedDataParallel(network, **crew.placed) if crew.size > 1 else network
     average = copy.deepcopy(network).requires_grad_(False)
@@ -111,8 +117,9 @@ def fit(
             group["lr"] = _learning_rate(step, recipe)
         learner.train()
         batch = draw_batch(
-            training, recipe.noise, size=settings.batch // crew.size, crop=settings.crop, generator=generator
-        )
+            training, recipe.noise, size=settings.batch // crew.size, crop=settings.crop, generator=generator,
+            histograms=reads_histograms(network),
+        )  # fmt: skip
         with torch.autocast(crew.device.type, dtype=precision, enabled=precision != torch.float32):
             output = learner(batch.frame.contiguous(memory_format=torch.channels_last))
         loss = loss_of(output.float(), batch, kind=settings.loss)
@@ -172,7 +179,7 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
     shows = (batch.hit.flatten(1).mean(dim=1) > 0.02).float()
     error = (shows * error).sum() / shows.sum().clamp_min(1.0)
     if logits.shape[1]:
-        reported = batch.frame[:, :1]
+        reported = logits[:, 2:].detach() if logits.shape[1] > 2 else batch.frame[:, :1]
         true = batch.hit * ((reported - batch.clean).abs() < _TRUE)
         error = error + 0.02 * F.binary_cross_entropy_with_logits(logits[:, :1], batch.hit)
         error = error + 0.02 * F.binary_cross_entropy_with_logits(logits[:, 1:2], true)
@@ -181,20 +188,29 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
 
 @torch.no_grad()
 def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRecipe) -> dict[float, float]:
-    """PSNR [dB] over the gate, mean over crops with a target, at each level; the same crops and photons every time."""
+    """PSNR [dB] over the gate, mean over crops with a target, at each of `LEVELS`, or of `PHOTONS` for a network that
+    reads histograms; the same crops and photons every time.
+    """
     network.eval()
     device = scenes.depth.device
     result = {}
-    for level in LEVELS:
+    counting = reads_histograms(network)
+    quiet: dict[str, Any] = {
+        "own_gate": 1.0,
+        "own_profile": 1.0,
+        "dead": 0.0,
+        "slanted_gate": 0.0,
+        "unknown_water": 0.0,
+    }
+    for level in PHOTONS if counting else LEVELS:
         generator = torch.Generator(device).manual_seed(round(1e4 * level))
-        noise = Noise(
-            backscatter=(level, level), sigma_scale=(1.0, 1.0), own_gate=1.0, own_profile=1.0, counting=0.0, dead=0.0,
-            slanted_gate=0.0,
-            behind=0.0, unknown_water=0.0,
-        )  # fmt: skip
+        if counting:
+            noise = recipe.noise.model_copy(update={**quiet, "photons": (level, level), "sbr": (1 / 3, 1 / 3)})
+        else:
+            noise = Noise(backscatter=(level, level), sigma_scale=(1.0, 1.0), counting=0.0, behind=0.0, **quiet)
         batch = draw_batch(
-            scenes, noise, size=64 if device.type == "cuda" else 8, crop=recipe.optimiser.crop, generator=generator,
-            always_replaced=True,
+            scenes, noise, size=64 if device.type == "cuda" and not counting else 8, crop=recipe.optimiser.crop,
+            generator=generator, always_replaced=True, histograms=counting,
         )  # fmt: skip
         depth = network(batch.frame)[:, :1].float()
         square = (batch.hit * (depth.clamp(0, 1) - batch.clean).square()).flatten(1).sum(dim=1)
