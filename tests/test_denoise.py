@@ -1,5 +1,6 @@
 """Denoising of frames and files, baselines, metrics, the evaluation and its report."""
 
+import dataclasses
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from spadwarp.cli import app
 from spadwarp.denoising import baselines, depth_files, inference, metrics, photons
 from spadwarp.denoising.frames import depth_frames, fill_missing
 from spadwarp.files import write_exr
+from spadwarp.frame_files import record_frames
 from stepped_frames import GATE, noisy_frame, scene
 
 torch.set_num_threads(1)
@@ -226,6 +228,8 @@ def test_evaluation_and_report(dataset, tmp_path):
 def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
     with pytest.raises(ValueError, match="'unet' is not one of"):
         spadwarp.evaluate(dataset, models=("unet",))
+    with pytest.raises(ValueError, match="'histograms' needs histograms, which datasets do not keep"):
+        spadwarp.evaluate(dataset, models=("histograms",))
     with pytest.raises(FileError, match="no dataset there"):
         spadwarp.evaluate(tmp_path)
 
@@ -327,6 +331,21 @@ def wall(reflectance=0.5):
         }
     )
     return spadwarp.simulate(scene, photons=200_000, seed=2, device="cpu")
+
+
+def test_counts_are_denoised_with_their_histograms(tmp_path):
+    """One detection in five pixels: 2 cm with the histograms, of which depth alone is far."""
+    result = wall()
+    result = dataclasses.replace(result, scene=result.scene.with_overrides({"laser.pulse_energy": 1e-13}))
+    recorded = record_frames(result, tmp_path / "frames.h5", pulses=2000, frames=4, seed=1, device="cpu")
+    assert 0.1 < recorded.detections / (4 * 16 * 12) < 0.4
+    errors = []
+    for weights in (None, inference.WEIGHTS / "pyramid.safetensors"):
+        found = depth_files.denoise_file(tmp_path / "frames.h5", tmp_path / "out", weights=weights, device="cpu")
+        assert ("denoised with its histograms" in found.notes) == (weights is None)
+        errors.append(np.nan_to_num(found.depth, nan=0.5 * sum(found.gate)) - result.truth.depth)
+    rmse = np.sqrt(np.mean(np.square(errors), axis=(1, 2, 3)))
+    assert rmse[0] < 0.02 < 0.1 < rmse[1]
 
 
 def test_frames_of_few_photons_meet_the_bound_where_they_are_many(tmp_path):

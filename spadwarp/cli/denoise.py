@@ -87,8 +87,9 @@ def denoise(
 ) -> None:
     """Denoise depth frames.
 
-    Writes NAME.npy (all frames), NAME.exr and NAME.png (the first) for each file. Histograms become depth first, by the
-    log-matched filter where the instrument response is known. Needs pip install "spadwarp[denoise]".
+    Writes NAME.npy (all frames), NAME.exr and NAME.png (the first) for each file. Histograms become depth first: counts
+    by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then denoised
+    with their histograms. Needs pip install "spadwarp[denoise]".
 
     \b
     Examples:

@@ -43,7 +43,7 @@ def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Ten
 
     Args:
         counts: Histograms over the gate, `[B, H, W, T]`.
-        background: Expected background counts of a pixel, > 0, `[B, T]`.
+        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or of all alike `[B, 1, 1, T]`.
         response: Instrument response per bin about its time zero, sum 1, `[B, 2 r + 1]`.
 
     Returns:
@@ -55,7 +55,9 @@ def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Ten
     if merged > 1:
         counts, background, response = _rebinned(counts, background, response, merged)
     bins = counts.shape[-1]
-    signal = (counts.sum(dim=-1).mean(dim=(1, 2)) - background.sum(dim=1)).clamp_min(0.05)
+    above = counts - background
+    background = background.mean(dim=(1, 2))  # scores are sums over pixels: these have one template
+    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(0.05)
     narrow = toeplitz(response, bins)
     delays = torch.arange(bins, device=counts.device)
     tail = torch.exp(-delays / (TAIL * bins))
@@ -64,25 +66,20 @@ def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Ten
     floor = _ANYWHERE * signal[:, None] / bins
     ratio = signal[:, None, None] / (background + floor)[:, :, None]
 
-    above = (counts - background[:, None, None, :]).flatten(1, 2)
-    score = torch.bmm(above, torch.log1p(ratio * narrow)).view_as(counts)
+    score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * narrow)).view_as(counts)
     found = []
     for side in WINDOWS[:-1]:
         found.append(_highest(_pooled(score, side)))
-    score = torch.bmm(above, torch.log1p(ratio * (late @ narrow))).view_as(counts)
+    score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * (late @ narrow))).view_as(counts)
     found.append(_highest(_pooled(score, WINDOWS[-1])))
-    del score, above
+    del score
 
     anchor = found[-1]
     edges = anchor[..., None] + torch.tensor(EDGES, device=counts.device)
-    expected = _within(background[:, None, None, :].cumsum(dim=-1), edges)
-    cumulative = counts.cumsum(dim=-1)
-    alone = _within(cumulative, edges[..., [0, -1]])
-    level = expected.sum(dim=-1)
-    pixel = (alone[..., 0] - level) / (level + 1.0).sqrt()
-    around = 49.0 * _within(_pooled(counts, 7).cumsum(dim=-1), edges)
-    excess = around - 49.0 * expected
-    spread = (around.sum(dim=-1) + 1.0).sqrt()
+    level = _within(background[:, None, None, :].cumsum(dim=-1), edges[..., [0, -1]])[..., 0]
+    pixel = _within(above.cumsum(dim=-1), edges[..., [0, -1]])[..., 0] / (level + 1.0).sqrt()
+    excess = 49.0 * _within(_pooled(above, 7).cumsum(dim=-1), edges)
+    spread = ((excess.sum(dim=-1) + 49.0 * level).clamp_min(0.0) + 1.0).sqrt()
     shares = excess / (excess.abs().sum(dim=-1) + spread)[..., None]
     pooled = excess.sum(dim=-1) / (49.0 * level + 1.0).sqrt()
     signs = [0.5 * torch.asinh(pixel), 0.3 * torch.asinh(pooled)]

@@ -20,7 +20,7 @@ from spadwarp.histogram_files import Histograms, read_histograms
 from spadwarp.reduction import depth_of
 
 from .frames import POOLED, depth_frames
-from .inference import clues_of, denoise_frames
+from .inference import clues_of, denoise_frames, weights_card
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 
@@ -112,8 +112,10 @@ def denoise_file(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         clues = None
-        if read.histograms is not None and model == "pyramid":
+        suited = weights is None or weights_card(model, weights).get("model") == "histograms"
+        if read.histograms is not None and model in ("pyramid", "histograms") and suited:
             model = "histograms"
+            notes.append("denoised with its histograms")
             clues = _clues(read.histograms, group_index=reading.get("group_index"), device=device)
         frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile, clues=clues)
         found, seen = denoise_frames(frames, model=model, weights=weights, device=device)
@@ -140,7 +142,7 @@ def read_depth(
     channel: str | None = None,
     scale: float = 1.0,
     variable: str | None = None,
-    method: Method = "matched",
+    method: Method | None = None,
     bin_width_ps: float | None = None,
     gate_start_ns: float | None = None,
     group_index: float | None = None,
@@ -158,7 +160,8 @@ def read_depth(
         channel: Of an EXR; default: the first of Z, depth, range, A that it has.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
         variable: Array of a `.mat`.
-        method: Estimator for histograms; where the response is not known, `"centroid"` takes its place.
+        method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
+            where the response is not known.
         bin_width_ps, gate_start_ns, group_index, irf_fwhm_ps: Of measured histograms, see `depth_of`.
         device: Warp device of the estimator.
 
@@ -201,6 +204,15 @@ def read_depth(
 
             changes["irf"] = changes["response"] = instrument_response(pulse_fwhm=0.0, jitter_fwhm=1e-12 * irf_fwhm_ps)
         histograms = dataclasses.replace(histograms, **changes)
+    counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
+    if counted and histograms.background is None:
+        # Flat, at the median bin of all pixels and frames together: that of sparse counts would be 0.
+        bins = histograms.values.shape[-1]
+        total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
+        level = np.median(total) * bins / histograms.values.size
+        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32))
+    if method is None:
+        method = "likelihood" if counted else "matched"
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
     reduced = depth_of(histograms, method=method, group_index=group_index, device=device)
@@ -214,7 +226,7 @@ def read_depth(
         gate=(half * histograms.gate_start, half * gate_stop),
         profile=_profile(histograms),
         source=f"{reduced.quantity} by {method} from histograms",
-        histograms=histograms if histograms.values.dtype.kind in "iu" and histograms.response is not None else None,
+        histograms=histograms if counted else None,
     )
 
 
@@ -224,15 +236,10 @@ def _clues(histograms: Histograms, *, group_index: float | None, device: str | N
 
     bins, width = histograms.values.shape[-1], float(histograms.bin_width or 0.0)
     counts = histograms.values.reshape(-1, *histograms.values.shape[-3:])
-    known = histograms.background
-    if known is None:  # of all pixels and frames together: the median of sparse counts would be 0
-        total = counts.sum(axis=(0, 1, 2), dtype=np.float64)
-        known = np.full(bins, np.median(total) / (counts.size / bins), np.float32)
-    background = np.broadcast_to(np.asarray(known, np.float64), (*np.shape(known)[:-1], bins)).reshape(-1, bins)
+    known = np.asarray(histograms.background, np.float32)
+    background = np.broadcast_to(known, counts.shape[1:] if known.ndim == 3 else (bins,))
     assert histograms.response is not None
-    clues = clues_of(
-        counts, background=background.mean(axis=0), response=histograms.response.per_bin(width), device=device
-    )
+    clues = clues_of(counts, background=background, response=histograms.response.per_bin(width), device=device)
     scene = histograms.scene
     for channel in range(POOLED):
         time = histograms.gate_start + clues[:, channel].astype(np.float64) * (bins * width)

@@ -52,7 +52,7 @@ def denoise(
             given. PyramidNet and gating make use of it.
         counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.
             PyramidNet makes use of them and of the two that follow: where photons are few, pixels tell more together.
-        background: Expected background counts of a pixel, `[T]`.
+        background: Expected background counts of all pixels alike `[T]`, or of each `[H, W, T]`.
         response: Instrument response per bin about its time zero, `[2 r + 1]`, as
             `spadwarp.InstrumentResponse.per_bin` gives it.
         weights: File of `spadwarp train`; default: the weights of the package.
@@ -135,7 +135,7 @@ def clues_of(
 
     Args:
         counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
-        background: Expected background counts of a pixel, `[T]`.
+        background: Expected background counts of all pixels alike `[T]`, or of each `[H, W, T]`.
         response: Instrument response per bin about its time zero, `[2 r + 1]`.
         device: torch device.
 
@@ -149,15 +149,20 @@ def clues_of(
     from .clues import histogram_clues
 
     cubes = np.asarray(counts)
-    levels, taps = (np.asarray(one, np.float32) for one in (background, response))
+    levels, taps = (np.array(one, np.float32) for one in (background, response))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ValueError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
-    if levels.shape != cubes.shape[-1:] or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ValueError(f"background has shape {levels.shape}; {cubes.shape[-1:]} is needed, of numbers >= 0")
+    if levels.shape not in (cubes.shape[-1:], cubes.shape[-3:]) or not (
+        np.isfinite(levels).all() and (levels >= 0).all()
+    ):
+        raise ValueError(
+            f"background has shape {levels.shape}; {cubes.shape[-1:]} or {cubes.shape[-3:]} is needed, of numbers >= 0"
+        )
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ValueError(f"response has shape {taps.shape}; an odd number of values about time zero is needed")
     place = _device(torch, device)
-    level, tap = (torch.from_numpy(one[None]).to(place) for one in (levels, taps / taps.sum()))
+    tap = torch.from_numpy((taps / taps.sum())[None]).to(place)
+    level = torch.from_numpy(levels if levels.ndim == 3 else levels[None, None])[None].to(place)
     level = level.clamp_min(1e-6 * float(level.mean()) + 1e-9)
     found = []
     with torch.inference_mode():

@@ -230,7 +230,7 @@ def _counting(
     gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
     best = score.argmax(dim=-1, keepdim=True)
-    clues = histogram_clues(counts, level, response) if histograms else None
+    clues = histogram_clues(counts, level[:, None, None], response) if histograms else None
 
     # Centroid of the counts within 2σ about the best bin.
     offsets = torch.arange(-4, 5, device=device)
