@@ -214,6 +214,9 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert found.windows["0.042"] <= found.windows["0.480"]
     assert found.steps["input", "0.042"].total > 0
     assert "seed" in found.about and "photons" in found.about and "attenuation lengths" in found.about
+    middle = spadwarp.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
+    assert "the middle 32 x 24 pixels" in middle.about
+    assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
     result = CliRunner().invoke(
         app, ["evaluate", str(dataset), "--models", "median", "--frames", "1", "--report", str(tmp_path)]
     )
@@ -230,6 +233,8 @@ def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
         spadwarp.evaluate(dataset, models=("unet",))
     with pytest.raises(ValueError, match="'histograms' needs histograms, which datasets do not keep"):
         spadwarp.evaluate(dataset, models=("histograms",))
+    with pytest.raises(ValueError, match=r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"):
+        spadwarp.evaluate(dataset, models=("median",), crop=(65, 48))
     with pytest.raises(FileError, match="no dataset there"):
         spadwarp.evaluate(tmp_path)
 

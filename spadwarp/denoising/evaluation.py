@@ -110,6 +110,7 @@ def evaluate(
     split: str = "test",
     frames: int = 20,
     bm3d_frames: int = 0,
+    crop: tuple[int, int] | None = None,
     weights: str | os.PathLike[str] | None = None,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -122,6 +123,7 @@ def evaluate(
         split: "test", "validation", "train" or "all".
         frames: Of each target and level, at most; the same for each method.
         bm3d_frames: Of each level for BM3D, which takes up to a minute a frame; 0 leaves it out.
+        crop: (width, height) of the middle part of each frame that methods see [pixels]; all of it if not given.
         weights: File of `spadwarp train`, in place of the package's for the network that it names.
         device: torch device of the networks.
         progress: Called with ("frames", done, total).
@@ -152,7 +154,15 @@ def evaluate(
     steps: dict[tuple[str, str], Steps] = {}
     samples: dict[tuple[str, str], Sample] = {}
     counts: dict[tuple[str, str], int] = {}
-    windows = _best_windows(reader, chosen, medians) if "median" in wanted else {}
+    shape = reader[0]["noisy"].shape[-2:]
+    width, height = (shape[1], shape[0]) if crop is None else crop
+    if not (8 <= width <= shape[1] and 8 <= height <= shape[0]):
+        raise ValueError(f"crop = ({width}, {height}) is outside (8, 8) to ({shape[1]}, {shape[0]})")
+    top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
+    part = slice(top, top + height), slice(left, left + width)
+    if crop is not None:
+        about += f"; the middle {width} x {height} pixels of each frame"
+    windows = _best_windows(reader, part, chosen, medians) if "median" in wanted else {}
 
     total, done = sum(map(len, chosen.values())), 0
     quota = math.ceil(bm3d_frames / len({target for target, _ in chosen}))
@@ -161,7 +171,7 @@ def evaluate(
         used = 0
         for index in indices:
             item = reader[index]
-            noisy, clean = _frame(item), _truth(item)
+            noisy, clean = _frame(item, part), _truth(item, part)
             done += 1
             if not _has_target(clean, noisy.gate):
                 continue
@@ -250,14 +260,14 @@ def _level_order(level: str) -> float:
     return float(level.removeprefix("over ").split()[0])
 
 
-def _frame(item: dict[str, Any]) -> DepthFrames:
+def _frame(item: dict[str, Any], part: tuple[slice, slice]) -> DepthFrames:
     gate = (float(item["gate"][0]), float(item["gate"][1]))
-    return depth_frames(item["noisy"][0], gate=gate, density=item["prior"][0])
+    return depth_frames(item["noisy"][0][part], gate=gate, density=item["prior"][0][part])
 
 
-def _truth(item: dict[str, Any]) -> NDArray[np.float32]:
+def _truth(item: dict[str, Any], part: tuple[slice, slice]) -> NDArray[np.float32]:
     """True depth where its light falls into the gate, which is one in range."""
-    return np.where(np.isfinite(item["bound"][0]), item["clean"][0], np.float32(np.nan))
+    return np.where(np.isfinite(item["bound"][0][part]), item["clean"][0][part], np.float32(np.nan))
 
 
 def _has_target(clean: NDArray[np.float32], gate: tuple[float, float]) -> bool:
@@ -274,13 +284,16 @@ def _estimate(
 
 
 def _best_windows(
-    reader: FrameReader, chosen: dict[tuple[int, str], list[int]], errors: dict[tuple[str, int], list[float]]
+    reader: FrameReader,
+    part: tuple[slice, slice],
+    chosen: dict[tuple[int, str], list[int]],
+    errors: dict[tuple[str, int], list[float]],
 ) -> dict[str, int]:
     """The window of the highest mean PSNR at each level."""
     for (_, level), indices in chosen.items():
         for index in indices:
             item = reader[index]
-            frames, clean = _frame(item), _truth(item)
+            frames, clean = _frame(item, part), _truth(item, part)
             if not _has_target(clean, frames.gate):
                 continue
             seen = np.isfinite(clean) & (clean >= frames.gate[0]) & (clean < frames.gate[1])
