@@ -121,6 +121,16 @@ def test_histograms_help_where_photons_are_few():
     assert after < 0.7 * before
 
 
+def test_a_frame_that_is_turned_gives_the_same_depth():
+    """Windows and network take no side; edges of blocks apart, for which sizes are multiples of 16."""
+    counts, level = histograms(np.linspace(40.0, 80.0, 32) + np.zeros((32, 1)), 3.0, 3.0)
+    depth = np.full((32, 32), 15.0)
+    options = {"gate": (13.5, 16.0), "background": level, "response": TAPS, "device": "cpu"}
+    found = spadwarp.denoise(depth, counts=counts, **options)
+    turned = spadwarp.denoise(depth, counts=counts[::-1, ::-1], **options)
+    assert np.nanmax(np.abs(turned[::-1, ::-1] - found)) < 1e-4
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
