@@ -14,6 +14,7 @@ from .guided import Guiding
 from .laser import Laser, Scan
 from .layers import Layers
 from .medium import Medium
+from .philox import round_keys
 from .score import COMPONENTS
 from .shadow import near_depth_map
 from .surface import Surfaces, Textures
@@ -280,6 +281,7 @@ def launch_transport(
             model.surfaces,
             model.scan,
             seed,
+            round_keys(seed),
             first_id,
             photon_count,
             model.scale,

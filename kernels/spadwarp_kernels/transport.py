@@ -46,7 +46,8 @@ from .philox import (
     STREAM_ROULETTE,
     STREAM_SURFACE,
     STREAM_TRANSPORT,
-    random_block,
+    RoundKeys,
+    random_block_keyed,
     u01,
     u01_fine,
     u01_last,
@@ -289,6 +290,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         scan: Scan,
         # Photons:
         seed: wp.uint64,
+        keys: RoundKeys,
         first_id: wp.uint64,
         photon_count: int,
         # Data out:
@@ -324,17 +326,17 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             while waiting < wp.static(ray_lanes):
                 if s.stage == _FLIGHT:
                     id = first_id + wp.uint64(s.photon)
-                    s.block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
+                    s.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
                     s.face = -1
                     s.distance = water_free_path(medium, layers, s.x, s.u, u01(s.block[0]))
                     limit = limits.max_path - s.path
                     s.reach = wp.min(s.distance, limit)
                     if wp.static(paper_albedo):
-                        draw = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
+                        draw = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
                         s.albedo = medium.albedo * u01(draw[1])
                     s.stage = _EVENT
                     if wp.static(guided):
-                        s.sample_block = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+                        s.sample_block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                         s.lens = lens_point(camera, u01(s.sample_block[2]), u01(s.sample_block[3]))
                         if wp.static(bounded):
                             limit = wp.min(limit, to_exit(limits, s.x, s.u))
@@ -545,7 +547,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.reason = WEIGHT_CUTOFF
                         if wp.static(roulette):
                             id = first_id + wp.uint64(s.photon)
-                            chance = u01(random_block(seed, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
+                            chance = u01(random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
                             s.reason = ROULETTE
                             if chance < 0.1 and s.analog_weight > 0.0:
                                 s.reason = -1
@@ -569,7 +571,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             reflected = wp.vec3(s.u)
                             if on_surface:
                                 id = first_id + wp.uint64(s.photon)
-                                draw = random_block(seed, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                                draw = random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
                                 reflected = sample_reflection(
                                     incoming, s.normal, surfaces.roughness[s.face], lobe, draw
                                 )
@@ -580,7 +582,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 # To the point of the lens at which the flight to come will be scored: a lobe about
                                 # the lens's centre could not have a peak narrower than the lens.
                                 id = first_id + wp.uint64(s.photon)
-                                ahead = random_block(seed, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+                                ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                                 v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
                             inward = inward_of(s.view, s.x)
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from spadwarp_kernels.philox import philox4x32, random_block, u01, u01_fine
+from spadwarp_kernels.philox import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
+from statistics_of_samples import DEVICES
 
 
 @wp.kernel(enable_backward=False)
@@ -23,6 +24,12 @@ def _uniforms(words: wp.array(dtype=wp.uint32), coarse: wp.array(dtype=float), f
 def _blocks(seed: wp.uint64, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
     i = wp.tid()
     out[i] = random_block(seed, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
+
+
+@wp.kernel(enable_backward=False)
+def _keyed_blocks(keys: RoundKeys, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
+    i = wp.tid()
+    out[i] = random_block_keyed(keys, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
 
 
 @pytest.mark.parametrize(
@@ -59,3 +66,12 @@ def test_ids_beyond_32_bits_have_streams_of_their_own():
     wp.launch(_blocks, 1000, [7, 0, low], device="cpu")
     wp.launch(_blocks, 1000, [7, 1 << 32, high], device="cpu")
     assert len(np.unique(np.concatenate([low.numpy(), high.numpy()]), axis=0)) == 2000
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("seed", [0, 1, 0x123456789ABCDEF0, 2**64 - 1])
+def test_round_keys_give_the_blocks_of_their_seed(seed, device):
+    plain, keyed = (wp.zeros(1000, dtype=wp.vec4ui, device=device) for _ in range(2))
+    wp.launch(_blocks, 1000, [seed, 1 << 33, plain], device=device)
+    wp.launch(_keyed_blocks, 1000, [round_keys(seed), 1 << 33, keyed], device=device)
+    np.testing.assert_array_equal(plain.numpy(), keyed.numpy())
