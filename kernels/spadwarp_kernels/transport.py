@@ -473,7 +473,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wanted:
                                 shelve(entry, q)
                             gathered += count_lanes(wanted)
-                            ready = gathered >= 32 or done == 32
+                            ready = gathered >= 32 or (done == 32 and gathered > 0)
                             first = wp.max(gathered - 32, 0)
                         if ready:
                             request = q
@@ -481,7 +481,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(gathers):
                                 meet_lanes()
                                 wanted = first + lane < gathered
-                                request = fetch(first + lane)
+                                request = fetch(wp.min(first + lane, gathered - 1))
                                 gathered = first
                                 meet_lanes()
                             found = score(request, medium, layers, camera, gate, surfaces, scan)
