@@ -88,7 +88,16 @@ from .tally import (
     deposit,
     to_ledger,
 )
-from .warp_lanes import count_lanes, count_lanes_before, exchange, meet_lanes, take_photons
+from .warp_lanes import (
+    COUNT_PLACES,
+    SET_PLACES,
+    TAKE_PLACE,
+    count_lanes,
+    count_lanes_before,
+    exchange,
+    places,
+    take_photons,
+)
 
 ESTIMATORS = ("none", "analog", "next_event", "guided")
 
@@ -317,8 +326,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         if wp.static(not cuda):
             # Launches on several cores write to slots of the ledger that lie in cache lines of their own.
             thread = 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
-        gathered = int(0)
         done = int(0)
+        gathered = int(0)
+        if wp.static(gathers):
+            gathered = places(SET_PLACES, 0)
 
         while count_lanes(s.stage == _DONE) < 32:
             # ---- Water: until enough lanes of the warp wait for a ray
@@ -382,6 +393,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             q.slot = -1
                             q.target = s.target
                             s.interval = wp.vec2(0.0, 0.0)
+                            if wp.static(gathers):
+                                shelve(places(TAKE_PLACE, 0), q)
                     # What guided has sampled may wait for its shadow ray: without a surface nothing more is scored.
                     if (
                         round == 1
@@ -462,6 +475,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                             q.weight *= s.albedo
                                             if s.surface_count == 0:
                                                 q.component = BACKSCATTER
+                                        if wp.static(gathers):
+                                            shelve(places(TAKE_PLACE, 0), q)
                     round += 1
 
                     # ---- Scores: each lane its own or, where a warp gathers them, 32 together
@@ -469,21 +484,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         first = int(0)
                         ready = wanted
                         if wp.static(gathers):
-                            entry = gathered + count_lanes_before(wanted)
-                            if wanted:
-                                shelve(entry, q)
-                            gathered += count_lanes(wanted)
-                            ready = gathered >= 32 or (done == 32 and gathered > 0)
+                            gathered = places(COUNT_PLACES, 0)
                             first = wp.max(gathered - 32, 0)
+                            ready = gathered >= 32 or (done == 32 and gathered > 0)
                         if ready:
                             request = q
                             wanted = True
                             if wp.static(gathers):
-                                meet_lanes()
                                 wanted = first + lane < gathered
                                 request = fetch(wp.min(first + lane, gathered - 1))
-                                gathered = first
-                                meet_lanes()
+                                gathered = places(SET_PLACES, first)
                             found = score(request, medium, layers, camera, gate, surfaces, scan)
                             if wanted and not found.value <= 0.0:  # what is not a number is counted as such
                                 s.contributions += 1

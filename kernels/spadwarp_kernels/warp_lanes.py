@@ -88,11 +88,23 @@ def shelf(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
     ...
 
 
-@wp.func_native("""
+TAKE_PLACE, COUNT_PLACES, SET_PLACES = (wp.constant(i) for i in range(3))
+
+
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
+    __shared__ int counts[{BLOCK_SIZE // 32}];
+    int* count = counts + (threadIdx.x >> 5u);
+    if (act == 0) return atomicAdd(count, 1);
+    __syncwarp();
+    if (act == 1) return __shfl_sync(0xffffffffu, *count, 0);
+    if ((threadIdx.x & 31u) == 0u) *count = number;
     __syncwarp();
 #endif
+    return number;
 """)
-def meet_lanes():
-    """All lanes of the warp wait here for each other, and see what the others have put on shelves."""
+def places(act: int, number: int) -> int:
+    """The places of the warp's shelf that are taken: any lane takes one more and gets its index (`TAKE_PLACE`); all
+    lanes together ask how many there are (`COUNT_PLACES`), after which they see what stands there, or set that to a
+    number (`SET_PLACES`); CUDA alone."""
     ...
