@@ -204,7 +204,8 @@ def _cube60() -> dict[str, Any]:
 
 def _cases() -> dict[str, Case]:
     listed = [
-        Case("water", "water alone, next_event, 64 x 64 x 1024 bins", scene=_at_5m()),
+        Case("water", "41 m of water alone, next_event, 64 x 64 x 2048 bins", scene=_at_5m(bins=2048)),
+        Case("water_20m", "20 m of it, 64 x 64 x 1024 bins", scene=_at_5m()),
         Case("plane_5m", "a wall at 5 m, guided, 32 x 32 x 16 bins", scene=_plane()),
         Case("staircase_5m", "the staircase at 5 m, next_event, 64 x 64 x 1024 bins", scene=_at_5m(_staircase())),
         Case("staircase_5m_guided", "the same, guided", scene=_at_5m(_staircase(), "guided")),
