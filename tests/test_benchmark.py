@@ -55,8 +55,9 @@ def test_a_million_faces_by_the_arithmetic_of_subdivision():
 
 
 def test_scenes_end_paths_with_the_gate():
-    for name in ("water", "staircase_5m"):
+    for name in ("water_20m", "staircase_5m"):
         assert scene(name).path_limit == pytest.approx(20.48, rel=1e-4)
+    assert scene("water").path_limit == pytest.approx(40.96, rel=1e-4)
     assert scene("plane_5m").path_limit == pytest.approx(14.8, rel=1e-9)
 
 
