@@ -233,7 +233,7 @@ def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:
     axes[0].set_ylabel("RMSE of depth [mm]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5)
-    figure.supxlabel(textwrap.fill(sweep.about, 24 + 28 * columns), fontsize=8, color="0.35")
+    figure.supxlabel(textwrap.fill(sweep.about, 30 + 30 * columns), fontsize=8, color="0.35")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150, format="png")
     return Path(path)
