@@ -158,7 +158,10 @@ def evaluate(
     ],
     models: Annotated[
         str,
-        typer.Option(metavar="NAMES", help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid.'),
+        typer.Option(
+            metavar="NAMES",
+            help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid, of results histograms too.',
+        ),
     ] = "all",
     split: Annotated[str, typer.Option(metavar="NAME", help="test, validation, train or all.")] = "test",
     frames: Annotated[
