@@ -146,11 +146,11 @@ def make_score(spec: Any) -> wp.Function:
             y = request.x + flight.s * request.u
             path += flight.s
             there = water_at(medium, layers, y)
+            if wp.static(local_albedo):
+                weight *= there.albedo
             weight *= there.extinction * wp.exp(
                 -water_extinction(medium, layers, request.x, request.u, flight.s) * flight.s
             )
-            if wp.static(local_albedo):
-                weight *= there.albedo
             weight = wp.where(flight.density > 0.0, weight / flight.density, 0.0)
         found.origin = y
         view = camera.view
