@@ -167,7 +167,7 @@ def _read_mat(path: Path, variable: str | None = None) -> Histograms:
     from scipy.io import loadmat, whosmat
 
     name = _chosen(path, {name: shape for name, shape, _ in whosmat(path)}, variable)
-    return Histograms(values=np.asarray(loadmat(path, variable_names=[name])[name]))
+    return Histograms(values=np.asarray(loadmat(path, variable_names=[name], spmatrix=False)[name]))
 
 
 def _chosen(path: Path, shapes: dict[str, tuple[int, ...]], variable: str | None) -> str:

@@ -77,7 +77,7 @@ def test_mat_as_denoisers_read_it(origin, frames, detection, result, tmp_path):
     written = spadwarp.export(source, tmp_path / "a.mat", result=result)
     assert written == [tmp_path / "a-00000.mat", tmp_path / "a-00001.mat"]
     for number, path in enumerate(written):
-        file = io.loadmat(path)
+        file = io.loadmat(path, spmatrix=False)
         assert sparse.issparse(file["spad"])
         spad = np.asarray(file["spad"].todense()).reshape(1, WIDTH, HEIGHT, -1).transpose(0, 3, 2, 1)  # [1, T, H, W]
         assert np.array_equal(spad[0], detection.counts[number].transpose(2, 0, 1))
@@ -252,7 +252,7 @@ def test_datasets_with_histograms(dataset, tmp_path):
     written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
     assert len(written) == len(items) == 4
     for path, item in zip(written, items, strict=True):
-        file = io.loadmat(path)
+        file = io.loadmat(path, spmatrix=False)
         counts = np.asarray(file["spad"].todense()).reshape(7, 4, -1).transpose(2, 1, 0)
         assert np.array_equal(counts, item["counts"]) and counts.any()
         assert np.array_equal(file["rates"].transpose(2, 0, 1), item["expected"])

@@ -278,7 +278,11 @@ def _array(path: Path, variable: str | None) -> NDArray[Any]:
             return np.load(path, allow_pickle=False)
         from scipy.io import loadmat
 
-        arrays = {name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray) and one.ndim >= 2}
+        arrays = {
+            name: one
+            for name, one in loadmat(path, spmatrix=False).items()
+            if isinstance(one, np.ndarray) and one.ndim >= 2
+        }
     except NotImplementedError:  # MATLAB 7.3 is HDF5
         import h5py
 
