@@ -282,12 +282,12 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, mo
         while run.poll() is None and not (out / "checkpoint.pt").is_file():
             time.sleep(0.02)
         run.terminate()
-        said = run.communicate(timeout=60)[1]
+        said = run.communicate(timeout=240)[1]
     assert (out / "checkpoint.pt").is_file(), said
     assert not (out / "usdn.safetensors").exists()
     with (out / "log.jsonl").open("a") as file:
         file.write('{"step": 1')  # of a kill between a line and its checkpoint
-    again = subprocess.run(command, capture_output=True, timeout=60, **options)
+    again = subprocess.run(command, capture_output=True, timeout=240, **options)
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("written") == 1 and "strides" not in again.stderr
     names = sorted(one.name for one in out.iterdir() if one.name[0] != ".")  # hidden: what was half written
