@@ -284,8 +284,8 @@ def bench(
         device: As for `spadwarp.simulate`.
         photons: Of one timed run of a transport case, > 0; by default 2^26 on a GPU and 2^18 a core on a CPU.
             "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
-        repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are repeated for two
-            seconds at most.
+        repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are not repeated
+            once two seconds have been timed.
         progress: Called with each case before it is run.
         found: Called with each result as it comes.
 

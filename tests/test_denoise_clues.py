@@ -84,7 +84,6 @@ def test_each_pixel_may_have_its_background():
     each = np.broadcast_to(np.maximum(beam, 1.0) * level, (32, 32, BINS))
     sides = np.abs(np.linspace(-1, 1, 32)) > 0.6
     wrong = [np.mean(np.abs(BINS * clues_of(counts, one)[2] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)]
-    print(wrong)
     assert wrong[1] < 0.1 < wrong[0]
 
 

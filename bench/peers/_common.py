@@ -87,6 +87,7 @@ def compare(
     """
     from spadwarp.benchmark import CASES, TransportRun
     from spadwarp.hardware import core_count, pick_device
+    from spadwarp_kernels import LEDGER_UNIT
 
     device = pick_device(args.device)
     run = TransportRun(CASES[case], device)
@@ -117,4 +118,4 @@ def compare(
         print(f"{name:<12} {them:.4g} {unit}/s{clock}")
         print(f"{'spadwarp':<12} {us:.4g} photons/s{clock}")
         print(f"ratio        {us / them:.3g}{clock}")
-    return taken * 2.0**-22 / (args.photons * args.repeats)
+    return taken * LEDGER_UNIT / (args.photons * args.repeats)

@@ -109,8 +109,8 @@ def _pack_kernel(
         _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
         nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
         nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
-        nodes[2] = _with_bits(wp.vec3(_NOWHERE), 0)
-        nodes[3] = _with_bits(wp.vec3(_NOWHERE), 0)
+        nodes[2] = _with_bits(wp.vec3(_NOWHERE), FINISHED)
+        nodes[3] = _with_bits(wp.vec3(_NOWHERE), FINISHED)
     if kind == 0:
         # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
         place = wp.where(node == root, 0, before[node] + 1)
@@ -252,7 +252,7 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
 
     Of each face `faces` holds three planes, as normals and offsets: of its first two barycentric coordinates, and its
     own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the
-    ray, so that none slips between two faces.
+    ray, so that none slips between two faces; more than that beyond the short edges of a sliver, where its box ends it.
     """
     a = load_vec4(faces, 3 * slot)
     b = load_vec4(faces, 3 * slot + 1)

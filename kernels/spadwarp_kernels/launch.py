@@ -63,7 +63,8 @@ class Data:
         tally: int64 [component * height * width * bin], fixed point.
         ledger: int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`.
         records: Terminal states of the last launch's photons.
-        cursor: int32 [1]: how many photons of the launch have been handed out.
+        cursor: int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
+            stream.
     """
 
     tally: wp.array

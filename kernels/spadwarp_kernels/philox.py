@@ -1,8 +1,7 @@
 """Counter-based random numbers: Philox4x32-10 (Salmon et al. 2011).
 
 A draw is a pure function of (seed, 64-bit id, event, stream): it does not depend on launch size, thread or history, so
-one id
-gives the same numbers however a launch is cut up.
+one id gives the same numbers however a launch is cut up.
 """
 
 import warp as wp

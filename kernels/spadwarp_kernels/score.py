@@ -31,7 +31,8 @@ class Request:
     Attributes:
         x: Where the photon scatters, or where the flight begins [m].
         u: Its direction until there, or of the flight.
-        weight: Of the photon, times the water's albedo unless layers have their own.
+        weight: Of the photon; in water times the albedo, but for flights through layers, whose albedo is that of the
+            sampled point.
         path: Geometric path up to x [m].
         lens: The point of the lens, if it has been drawn.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
@@ -151,7 +152,7 @@ def make_score(spec: Any) -> wp.Function:
             weight *= there.extinction * wp.exp(
                 -water_extinction(medium, layers, request.x, request.u, flight.s) * flight.s
             )
-            weight = wp.where(flight.density > 0.0, weight / flight.density, 0.0)
+            weight = wp.where(flight.density <= 0.0, 0.0, weight / flight.density)
         found.origin = y
         view = camera.view
         if wp.static(confocal):

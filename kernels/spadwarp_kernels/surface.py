@@ -76,6 +76,7 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
     """Nearest hit of the ray x + s u, 0 <= s < max_distance, against the BVH of a `wp.Mesh`."""
     hit = SurfaceHit()
     hit.face = -1
+    hit.slot = -1
     hit.distance = max_distance
     query = wp.mesh_query_ray(mesh, x, u, max_distance)
     if query.result:
@@ -90,6 +91,7 @@ def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: fl
     """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them on a GPU."""
     hit = SurfaceHit()
     hit.face = -1
+    hit.slot = -1
     hit.distance = max_distance
     nearest = int(-1)
     for slot in range(surfaces.order.shape[0]):
@@ -105,8 +107,8 @@ def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: fl
 
 
 @wp.func
-def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any: bool) -> SurfaceHit:
-    """As `intersect_mesh`, with the tree of `make_surfaces`; `any` is content with the first face that is found.
+def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any_hit: bool) -> SurfaceHit:
+    """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
 
     Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
     """
@@ -134,7 +136,7 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
             if struck >= 0.0 and struck < distance:
                 distance = struck
                 found = slot
-                if any:
+                if any_hit:
                     depth = 1
             node = wp.where(surfaces.order[slot] < 0, node - 1, FINISHED)  # the next face of the leaf
         if node == FINISHED and depth > 0:

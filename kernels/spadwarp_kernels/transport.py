@@ -316,7 +316,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         s.view = camera.view
         s.target = -1
         s.node = FINISHED
-        if wp.static(has_bvh):
+        if wp.static(has_bvh and cuda):
             stack = Stack()
             stack[0] = FINISHED
         # On the CPU one thread walks all photons.

@@ -75,9 +75,10 @@ def bench(
             progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
             found=found,
         )
-    finally:  # Ctrl-C and a device that is too small leave what was measured until then
+    except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
             write_json(report(results), json_path)
+        raise
     summary = report(results)
     if not quiet:
         made = summary["provenance"]

@@ -48,7 +48,7 @@ def denoise(
     ],
     out: Out,
     model: Annotated[
-        str, typer.Option(metavar="NAME", help="pyramid, dncnn, usdn; or median, gating, bm3d.")
+        str, typer.Option(metavar="NAME", help="pyramid, histograms, dncnn, usdn; or median, gating, bm3d.")
     ] = "pyramid",
     gate: Annotated[
         tuple[float, float] | None,
@@ -104,9 +104,16 @@ def denoise(
     if path.is_dir() and (path / "result.h5").is_file():
         path = path / "result.h5"
     paths = depth_files(path)
+    stems = [one.stem for one in paths]
+    if twice := sorted({one for one in stems if stems.count(one) > 1}):
+        raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
+    given = None
+    if profile is not None:
+        try:
+            given = np.load(profile, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise FileError(f"{profile}: not a .npy file that can be read: {error}") from error
     prepare_directory(out, overwrite=overwrite, needed=sum(one.stat().st_size for one in paths if one.is_file()))
-    with arguments_checked():
-        given = None if profile is None else np.load(profile, allow_pickle=False)
     told, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
         try:
@@ -128,10 +135,10 @@ def denoise(
                     group_index=group_index,
                     irf_fwhm_ps=irf_fwhm_ps,
                 )
-        except FileError as error:
+        except (ConfigError, FileError) as error:
             if len(paths) == 1:
                 raise
-            complain(f"error: {error}")
+            complain(f"error: {error}" if isinstance(error, FileError) else f"error: {one}: {error}")
             failed += 1
             continue
         there = float(np.isfinite(done.depth).mean())

@@ -112,8 +112,8 @@ def denoise_file(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         clues = None
-        suited = weights is None or weights_card(model, weights).get("model") == "histograms"
-        if read.histograms is not None and model in ("pyramid", "histograms") and suited:
+        counted = read.histograms is not None and model in ("pyramid", "histograms")
+        if counted and (weights is None or weights_card(model, weights).get("model") == "histograms"):
             model = "histograms"
             notes.append("denoised with its histograms")
             clues = _clues(read.histograms, group_index=reading.get("group_index"), device=device)

@@ -96,7 +96,7 @@ def denoise_frames(
     if model not in METHODS:
         raise ValueError(f"model = {model!r} is not one of {', '.join(map(repr, METHODS))}")
     if model == "histograms" and frames.clues is None:
-        raise ValueError('model = "histograms" needs histograms, and there is depth alone')
+        raise ValueError('model = "histograms" needs counts with their background and response; there are none')
     reported = ~np.isnan(frames.depth)
     if model in BASELINES:
         if weights is not None:

@@ -96,7 +96,10 @@ def fit(
     torch.manual_seed(recipe.seed)
     network: Any = build_network(recipe.model)
     if recipe.start is not None:
-        network.load_state_dict(load_network(recipe.start)[0].state_dict(), strict=False)
+        told = network.load_state_dict(load_network(recipe.start)[0].state_dict(), strict=False)
+        new = [name for name in told.missing_keys if not name.startswith(("enter_clues.", "leave_clues."))]
+        if new or told.unexpected_keys:
+            raise FileError(f"start = {recipe.start!r}: its layers are not those of {recipe.model!r}")
     network = network.to(crew.device)
     network = network.to(memory_format=torch.channels_last)
     learner = nn.parallel.DistributedDataParallel(network, **crew.placed) if crew.size > 1 else network
