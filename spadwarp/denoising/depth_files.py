@@ -112,11 +112,11 @@ def denoise_file(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         clues = None
-        counted = read.histograms is not None and model in ("pyramid", "histograms")
-        if counted and (weights is None or weights_card(model, weights).get("model") == "histograms"):
+        counts = read.histograms if model in ("pyramid", "histograms") else None
+        if counts is not None and (weights is None or weights_card(model, weights).get("model") == "histograms"):
             model = "histograms"
             notes.append("denoised with its histograms")
-            clues = _clues(read.histograms, group_index=reading.get("group_index"), device=device)
+            clues = _clues(counts, group_index=reading.get("group_index"), device=device)
         frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile, clues=clues)
         found, seen = denoise_frames(frames, model=model, weights=weights, device=device)
         depth = np.where(seen, found, np.float32(np.nan))
