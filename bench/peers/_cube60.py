@@ -31,11 +31,19 @@ def settings(photons: int) -> dict[str, Any]:
     }
 
 
-def device_of(found: Sequence[dict[str, Any]], cpu: bool) -> int:
-    """1-based number of the first OpenCL device that is, or is not, a CPU."""
+def opencl_device(package: ModuleType, name: str, cpu: bool) -> int:
+    """1-based number of the first OpenCL device that is, or is not, a CPU; leaves where there is none."""
+    try:
+        with told():
+            found: Sequence[dict[str, Any]] = package.gpuinfo()
+    except RuntimeError as error:
+        skip(f"{name} finds no OpenCL device ({error})")
+    if not found:
+        skip(f"{name} finds no OpenCL device")
     for i, device in enumerate(found):
         # PoCL's names begin with how it runs threads, those of Intel's and AMD's CPU drivers have the word.
         if (device["name"].startswith("pthread") or "CPU" in device["name"]) == cpu:
+            print(f"{name} on {device['name']}")
             return i + 1
     skip(f"there is no OpenCL {'CPU' if cpu else 'GPU'} among {', '.join(device['name'] for device in found)}")
 

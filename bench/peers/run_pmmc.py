@@ -6,8 +6,8 @@ from itertools import permutations
 from typing import Any
 
 import numpy as np
-from _common import options, peer, skip, told
-from _cube60 import device_of, measure
+from _common import options, peer
+from _cube60 import measure, opencl_device
 
 
 def cube(side: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,15 +46,7 @@ def settings(photons: int) -> dict[str, Any]:
 if __name__ == "__main__":
     pmmc = peer("pmmc", "pip install pmmc (GPL, needs an OpenCL driver or an NVIDIA GPU)")
     args = options("cube60 on MMC and on spadwarp", photons=10**6)
-    try:
-        with told():
-            found = pmmc.gpuinfo()
-    except RuntimeError as error:
-        skip(f"pmmc finds no OpenCL device ({error})")
-    if not found:
-        skip("pmmc finds no OpenCL device")
-    number = device_of(found, args.device == "cpu")
-    print(f"pmmc on {found[number - 1]['name']}")
+    number = opencl_device(pmmc, "pmmc", args.device == "cpu")
     measure(pmmc, "pmmc", args, {**settings(args.photons), "gpuid": number})
     # MMC's own report comes when the process ends; what counts of it is told above.
     sys.stdout.flush()

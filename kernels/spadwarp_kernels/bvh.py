@@ -153,8 +153,12 @@ def _faces_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(d
     faces[3 * slot + 2] = wp.vec4(n[0], n[1], n[2], wp.dot(n, p))
 
 
-def pack_bvh(mesh: wp.Mesh) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `walk_node` and `walk_leaf`; to be made anew after a refit.
+def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of a mesh's tree, for `walk_node` and `face_distance`; to be made anew after a refit.
+
+    Args:
+        mesh: Any `wp.Mesh`.
+        extent: Its largest coordinate [m], for the padding of the boxes.
 
     Returns:
         nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
@@ -162,7 +166,6 @@ def pack_bvh(mesh: wp.Mesh) -> tuple[wp.array, wp.array, wp.array]:
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
     """
     count, device = mesh.indices.size // 3, mesh.device
-    extent = float(abs(mesh.points.numpy()).max())
     has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
     before = wp.zeros_like(has_children)
     nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)

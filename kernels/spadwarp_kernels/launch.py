@@ -185,9 +185,10 @@ def make_surfaces(
         by_face("textures.face", textures.face, int)
     points = mesh.points.numpy()
     lower, upper = points.min(axis=0), points.max(axis=0)
-    padding = 1e-6 * abs(points).max() + 1e-6
+    extent = float(abs(points).max())
+    padding = 1e-6 * extent + 1e-6
     surfaces.mesh = mesh.id
-    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh)
+    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, extent)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
