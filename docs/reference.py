@@ -24,10 +24,10 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 import spadwarp
-from spadwarp._layers import COEFFICIENTS
 from spadwarp.cli import app
-from spadwarp.config import Scene
 from spadwarp.dataset.recipe import Distribution, Recipe
+from spadwarp.scene import Scene
+from spadwarp.scene.load import COEFFICIENTS
 
 FOLDER = Path(__file__).parent / "reference"
 MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"
@@ -245,9 +245,9 @@ def _short(value: Any) -> str:
 
 def dataset() -> str:
     """Datasets in the files of a dataset."""
-    from spadwarp.dataset.columns import FRAME_COLUMNS, scene_columns
     from spadwarp.dataset.histograms import MEANING
-    from spadwarp.dataset.plan import Plan
+    from spadwarp.dataset.sampling import Plan
+    from spadwarp.dataset.schema import FRAME_COLUMNS, scene_columns
 
     def table(rows: Mapping[str, tuple[str, str]]) -> str:
         lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]

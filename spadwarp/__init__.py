@@ -12,64 +12,61 @@ __version__ = "0.1.0"
 
 # Loaded when first used, so that `import spadwarp` and `spadwarp --help` need neither Warp nor h5py.
 _HOMES = {
-    "load_scene": "config",
-    "Scene": "config",
-    "presets": "catalog",
-    "water_optics": "water",
-    "WaterOptics": "water",
-    "refractive_index": "water",
-    "group_index": "water",
-    "pure_water_absorption": "water",
-    "pure_water_scattering": "water",
-    "phase_function": "phase_functions",
-    "PhaseFunction": "phase_functions",
-    "check": "checks",
-    "bench": "benchmark",
-    "simulate": "simulation",
-    "Ray": "engines",
-    "run_jobs": "engines",
-    "interruptible": "engines",
-    "trace": "records",
-    "PhotonRecords": "records",
-    "look_at": "pose",
-    "opencv_pose": "pose",
-    "truth_maps": "model",
-    "devices": "hardware",
-    "doctor": "health",
-    "Diagnosis": "health",
-    "SelfTest": "health",
-    "Result": "result",
-    "merge": "sums",
-    "Truth": "result",
-    "load_result": "files",
-    "detect": "detector",
-    "Detection": "detector",
-    "coates": "detector",
-    "InstrumentResponse": "response",
-    "instrument_response": "response",
-    "arrival_time": "depth",
-    "crlb_map": "crlb",
-    "analytic": "analytic_model",
-    "AnalyticResult": "analytic_model",
-    "load_truth_exr": "truth_exr",
-    "budget": "budgets",
-    "sweep": "budgets",
-    "export": "exports",
-    "view": "viewer",
-    "video": "film",
-    "to_torch": "tensors",
-    "TorchResult": "tensors",
-    "validate": "validation",
-    "denoise": "denoising.inference",
-    "evaluate": "denoising.evaluation",
-    "train": "denoising.run",
+    "load_scene": "scene",
+    "Scene": "scene",
+    "presets": "scene.presets",
+    "water_optics": "water.seawater",
+    "WaterOptics": "water.seawater",
+    "refractive_index": "water.seawater",
+    "group_index": "water.seawater",
+    "pure_water_absorption": "water.seawater",
+    "pure_water_scattering": "water.seawater",
+    "phase_function": "scene.phase_function",
+    "PhaseFunction": "scene.phase_function",
+    "check": "checks.checks",
+    "bench": "benchmark.cases",
+    "simulate": "transport.simulate",
+    "Ray": "parallel",
+    "run_jobs": "parallel",
+    "interruptible": "parallel",
+    "trace": "transport.records",
+    "PhotonRecords": "transport.records",
+    "look_at": "scene.pose",
+    "opencv_pose": "scene.pose",
+    "truth_maps": "transport.model",
+    "devices": "device",
+    "Diagnosis": "doctor.diagnosis",
+    "SelfTest": "doctor.diagnosis",
+    "Result": "result.result",
+    "merge": "result.merge",
+    "Truth": "result.result",
+    "load_result": "result.file",
+    "detect": "frames.spad",
+    "Detection": "frames.spad",
+    "coates": "frames.spad",
+    "InstrumentResponse": "frames.response",
+    "instrument_response": "frames.response",
+    "arrival_time": "frames.arrival_time",
+    "crlb_map": "frames.cramer_rao",
+    "simulate_analytic": "analytic.model",
+    "AnalyticResult": "analytic.model",
+    "load_truth_exr": "result.rendered_truth",
+    "budget": "analytic.budget",
+    "sweep": "analytic.budget",
+    "export": "run.export",
+    "view": "viz.viewer",
+    "video": "viz.transient_video",
+    "to_torch": "interop.torch",
+    "TorchResult": "interop.torch",
+    "evaluate": "denoise.evaluation",
+    "train": "denoise.training_run",
     "load_recipe": "dataset.recipe",
     "Recipe": "dataset.recipe",
-    "make_dataset": "dataset.making",
-    "verify_dataset": "dataset.making",
-    "FrameReader": "dataset.reading",
-    "SpadDataset": "dataset.reading",
-    "iterate_dataset": "dataset.reading",
+    "make_dataset": "dataset.make",
+    "verify_dataset": "dataset.make",
+    "FrameReader": "dataset.read",
+    "SpadDataset": "dataset.read",
+    "iterate_dataset": "dataset.read",
     "SpadwarpError": "errors",
     "ConfigError": "errors",
     "DeviceError": "errors",
@@ -80,41 +77,39 @@ _HOMES = {
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
-    from spadwarp.analytic_model import AnalyticResult, analytic
-    from spadwarp.benchmark import bench
-    from spadwarp.budgets import budget, sweep
-    from spadwarp.catalog import presets
-    from spadwarp.checks import check
-    from spadwarp.config import Scene, load_scene
-    from spadwarp.crlb import crlb_map
-    from spadwarp.dataset.making import make_dataset, verify_dataset
-    from spadwarp.dataset.reading import FrameReader, SpadDataset, iterate_dataset
+    from spadwarp.analytic.budget import budget, sweep
+    from spadwarp.analytic.model import AnalyticResult, simulate_analytic
+    from spadwarp.benchmark.cases import bench
+    from spadwarp.checks.checks import check
+    from spadwarp.dataset.make import make_dataset, verify_dataset
+    from spadwarp.dataset.read import FrameReader, SpadDataset, iterate_dataset
     from spadwarp.dataset.recipe import Recipe, load_recipe
-    from spadwarp.denoising.evaluation import evaluate
-    from spadwarp.denoising.inference import denoise
-    from spadwarp.denoising.run import train
-    from spadwarp.depth import arrival_time
-    from spadwarp.detector import Detection, coates, detect
-    from spadwarp.engines import Ray, interruptible, run_jobs
+    from spadwarp.denoise.evaluation import evaluate
+    from spadwarp.denoise.training_run import train
+    from spadwarp.device import devices
+    from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.exports import export
-    from spadwarp.files import load_result
-    from spadwarp.film import video
-    from spadwarp.hardware import devices
-    from spadwarp.health import Diagnosis, SelfTest, doctor
-    from spadwarp.model import truth_maps
-    from spadwarp.phase_functions import PhaseFunction, phase_function
-    from spadwarp.pose import look_at, opencv_pose
-    from spadwarp.records import PhotonRecords, trace
-    from spadwarp.response import InstrumentResponse, instrument_response
-    from spadwarp.result import Result, Truth
-    from spadwarp.simulation import simulate
-    from spadwarp.sums import merge
-    from spadwarp.tensors import TorchResult, to_torch
-    from spadwarp.truth_exr import load_truth_exr
-    from spadwarp.validation import validate
-    from spadwarp.viewer import view
-    from spadwarp.water import (
+    from spadwarp.frames.arrival_time import arrival_time
+    from spadwarp.frames.cramer_rao import crlb_map
+    from spadwarp.frames.response import InstrumentResponse, instrument_response
+    from spadwarp.frames.spad import Detection, coates, detect
+    from spadwarp.interop.torch import TorchResult, to_torch
+    from spadwarp.parallel import Ray, interruptible, run_jobs
+    from spadwarp.result.file import load_result
+    from spadwarp.result.merge import merge
+    from spadwarp.result.rendered_truth import load_truth_exr
+    from spadwarp.result.result import Result, Truth
+    from spadwarp.run.export import export
+    from spadwarp.scene import Scene, load_scene
+    from spadwarp.scene.phase_function import PhaseFunction, phase_function
+    from spadwarp.scene.pose import look_at, opencv_pose
+    from spadwarp.scene.presets import presets
+    from spadwarp.transport.model import truth_maps
+    from spadwarp.transport.records import PhotonRecords, trace
+    from spadwarp.transport.simulate import simulate
+    from spadwarp.viz.transient_video import video
+    from spadwarp.viz.viewer import view
+    from spadwarp.water.seawater import (
         WaterOptics,
         group_index,
         pure_water_absorption,

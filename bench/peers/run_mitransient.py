@@ -29,9 +29,9 @@ def staircase(folder: str) -> str:
     """The target as a PLY file in the camera frame."""
     import trimesh
 
-    from spadwarp.benchmark import CASES
-    from spadwarp.config import Scene
-    from spadwarp.targets import build_mesh
+    from spadwarp.benchmark.cases import CASES
+    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.scene import Scene
 
     mesh = build_mesh(Scene.from_dict(CASES["staircase_5m"].scene))
     assert mesh is not None
@@ -126,7 +126,7 @@ if __name__ == "__main__":
     import drjit
 
     import spadwarp
-    from spadwarp.benchmark import CASES
+    from spadwarp.benchmark.cases import CASES
 
     samples = max(1, args.photons // SIZE**2)
     with tempfile.TemporaryDirectory() as folder:

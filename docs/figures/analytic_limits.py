@@ -67,8 +67,8 @@ def monte_carlo(optical_depth: float, *, photons: int, seed: int) -> NDArray[np.
 
 def analytic(optical_depth: float) -> NDArray[np.float64]:
     """The same sums by the analytic model."""
-    whole = spadwarp.analytic(scene(optical_depth), frames=0, device="cpu")
-    gated = spadwarp.analytic(scene(optical_depth, gate=GATED), frames=0, device="cpu")
+    whole = spadwarp.simulate_analytic(scene(optical_depth), frames=0, device="cpu")
+    gated = spadwarp.simulate_analytic(scene(optical_depth, gate=GATED), frames=0, device="cpu")
     signal = whole.signal.sum()
     return np.array([signal, signal, signal, whole.backscatter.sum(), gated.backscatter.sum()])
 

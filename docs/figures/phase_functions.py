@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import spadwarp
-from spadwarp.config import Medium
+from spadwarp.scene import Medium
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 LAWS = {

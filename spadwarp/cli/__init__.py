@@ -3,8 +3,8 @@
 Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
 """
 
-from . import bench, dataset, denoise, doctor, exports, inspect, look, plan, reduce, runs, simulate
-from ._app import app, main
+from spadwarp.cli import bench, dataset, denoise, doctor, exports, inspect, look, plan, reduce, runs, simulate
+from spadwarp.cli._app import app, main
 
 __all__ = [
     "app",

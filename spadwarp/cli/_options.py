@@ -126,7 +126,7 @@ def one_device(devices: str | None, engine: Ray | None) -> str | None:
 
 def load_run(place: Path) -> Result:
     """The result in a file, or in the directory of a run."""
-    from spadwarp.files import file_within
+    from spadwarp.io.atomic import file_within
 
     return spadwarp.load_result(file_within(place, ("result.h5",)))
 

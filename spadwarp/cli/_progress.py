@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ._app import complain
-from ._options import count
+from spadwarp.cli._app import complain
+from spadwarp.cli._options import count
 
 Report = Callable[[str, int, int], None]
 

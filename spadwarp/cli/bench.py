@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-
-from ._app import app, complain, fail, say
-from ._options import Device, Json, Photons, Quiet, check_writable, in_bytes, write_json
+from spadwarp.cli._app import app, complain, fail, say
+from spadwarp.cli._options import Device, Json, Photons, Quiet, check_writable, in_bytes, write_json
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp.benchmark import BenchResult
+    from spadwarp.benchmark.cases import BenchResult
 
 
 @app.command()
@@ -47,7 +46,7 @@ def bench(
       spadwarp bench water staircase_5m --compare before.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark import CASES, load_report, ratios, report
+    from spadwarp.benchmark.cases import CASES, load_report, ratios, report
 
     if list_cases:
         for case in CASES.values():

@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 import spadwarp
-
-from ._app import app, fail, say
-from ._options import (
+from spadwarp.cli._app import app, fail, say
+from spadwarp.cli._options import (
     Devices,
     EngineName,
     Json,
@@ -25,7 +24,7 @@ from ._options import (
     rows,
     write_json,
 )
-from ._progress import progress
+from spadwarp.cli._progress import progress
 
 group = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(group, name="dataset", help="Datasets of labelled depth frames: make, verify, info, preview.")
@@ -125,7 +124,7 @@ def info(folder: Folder, json_path: Json = None) -> None:
     Example:
       spadwarp dataset info data/small/
     """
-    from spadwarp.dataset.making import read_manifest
+    from spadwarp.dataset.make import read_manifest
 
     manifest = read_manifest(folder)
     size = sum(one["bytes"] for one in manifest["files"].values())
@@ -165,7 +164,7 @@ def preview(
     Example:
       spadwarp dataset preview data/small/ --out sheet.png
     """
-    from spadwarp.dataset.sheet import draw_dataset
+    from spadwarp.viz.contact_sheet import draw_dataset
 
     with arguments_checked():
         path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)

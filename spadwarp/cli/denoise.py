@@ -8,10 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from spadwarp.errors import ConfigError, FileError
-
-from ._app import app, complain, say
-from ._options import (
+from spadwarp.cli._app import app, complain, say
+from spadwarp.cli._options import (
     Json,
     Out,
     Overwrite,
@@ -27,7 +25,8 @@ from ._options import (
     whole_number,
     write_json,
 )
-from ._progress import progress
+from spadwarp.cli._progress import progress
+from spadwarp.errors import ConfigError, FileError
 
 _TorchDevice = Annotated[
     str | None,
@@ -99,7 +98,7 @@ def denoise(
     """
     import numpy as np
 
-    from spadwarp.denoising.depth_files import denoise_file, depth_files
+    from spadwarp.denoise.files import denoise_file, depth_files
 
     if path.is_dir() and (path / "result.h5").is_file():
         path = path / "result.h5"
@@ -216,8 +215,8 @@ def evaluate(
     """
     from rich.table import Table
 
-    from spadwarp.denoising.evaluation import evaluate as run
-    from spadwarp.denoising.report import TITLES, write_report
+    from spadwarp.denoise.evaluation import evaluate as run
+    from spadwarp.viz.evaluation import TITLES, write_report
 
     chosen = ["median", "gating", "usdn", "dncnn", "pyramid"] if models == "all" else models.split(",")
     chosen = [name.strip() for name in chosen]
@@ -291,8 +290,8 @@ def _sweep(
     """Frames of few photons from a result."""
     from rich.table import Table
 
-    from spadwarp.denoising.photons import draw_photon_sweep, photon_sweep
-    from spadwarp.denoising.report import TITLES
+    from spadwarp.denoise.photon_counts import draw_photon_sweep, photon_sweep
+    from spadwarp.viz.evaluation import TITLES
 
     result = load_run(data)
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
@@ -346,8 +345,8 @@ def train(
       spadwarp dataset make configs/datasets/training.toml --out data/training/
       spadwarp train configs/training/pyramid.toml --out runs/pyramid/
     """
-    from spadwarp.denoising.recipe import load_training_recipe
-    from spadwarp.denoising.run import train as run
+    from spadwarp.denoise.recipe import load_training_recipe
+    from spadwarp.denoise.training_run import train as run
 
     changes: dict[str, Any] = {}
     if data is not None:

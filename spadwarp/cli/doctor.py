@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 import spadwarp
-
-from ._app import app, complain, fail, say
-from ._options import Device, Json, Quiet, rows, write_json
+from spadwarp.cli._app import app, complain, fail, say
+from spadwarp.cli._options import Device, Json, Quiet, rows, write_json
 
 
 @app.command()
@@ -32,7 +31,7 @@ def doctor(
       spadwarp doctor
       spadwarp doctor --device cpu --json report.json
     """
-    found = spadwarp.doctor(device=device, self_test=self_test, progress=None if quiet else complain)
+    found = spadwarp.doctor.diagnosis.doctor(device=device, self_test=self_test, progress=None if quiet else complain)
     if not quiet:
         for title, facts in found.facts.items():
             say(f"{title}\n{rows(facts, indent='  ')}")

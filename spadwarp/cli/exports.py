@@ -9,13 +9,12 @@ from typing import Annotated
 import typer
 
 import spadwarp
-
-from ._app import app, say
-from ._options import Json, Out, Overwrite, Quiet, arguments_checked, prepare_directory, rows, write_json
+from spadwarp.cli._app import app, say
+from spadwarp.cli._options import Json, Out, Overwrite, Quiet, arguments_checked, prepare_directory, rows, write_json
 
 
 class Format(enum.StrEnum):
-    """`spadwarp.exports.FORMATS`, known without loading it."""
+    """`spadwarp.run.export.FORMATS`, known without loading it."""
 
     npy = "npy"
     mat = "mat"
@@ -83,7 +82,7 @@ def export(
 
 def _inside(place: Path) -> Path:
     """The file, or the one that can be exported in a directory."""
-    from spadwarp.files import file_within
+    from spadwarp.io.atomic import file_within
 
     if (place / "manifest.json").is_file():
         return place

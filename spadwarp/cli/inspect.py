@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import typer
 
 import spadwarp
-
-from ._app import app, say
-from ._options import (
+from spadwarp.cli._app import app, say
+from spadwarp.cli._options import (
     Json,
     Mesh,
     Overrides,
@@ -44,8 +43,8 @@ def check(
     Example:
       spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
     """
-    from spadwarp.checks import summary
-    from spadwarp.targets import build_mesh
+    from spadwarp.checks.checks import summary
+    from spadwarp.mesh.targets import build_mesh
 
     scene = read_scene(scene_path, mesh=mesh, overrides=overrides)
     triangles = build_mesh(scene)

@@ -8,9 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 import spadwarp
-
-from ._app import app, say
-from ._options import Device, Quiet, arguments_checked, in_bytes
+from spadwarp.cli._app import app, say
+from spadwarp.cli._options import Device, Quiet, arguments_checked, in_bytes
 
 Run = Annotated[
     Path,

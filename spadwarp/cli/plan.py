@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-
-from ._app import app, say
-from ._options import (
+from spadwarp.cli._app import app, say
+from spadwarp.cli._options import (
     Device,
     Json,
     Mesh,
@@ -38,11 +37,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spadwarp import AnalyticResult, Scene, Truth
-    from spadwarp.budgets import BudgetRow, DepthErrorRow
+    from spadwarp.analytic.budget import BudgetRow, DepthErrorRow
 
 
 class Exporter(enum.StrEnum):
-    """`spadwarp.truth_exr.EXR_PRESETS`, known without loading it."""
+    """`spadwarp.result.result.rendered_truth.EXR_PRESETS`, known without loading it."""
 
     unreal = "unreal"
     blender = "blender"
@@ -104,7 +103,7 @@ def analytic(
       spadwarp analytic scene.toml --depth cat_RGBD.EXR --depth-channel A --depth-scale 0.01 \\
           --normal cat_Surf_Norm.EXR --albedo cat_Base_Col.EXR --out cat/
     """
-    from spadwarp.frame_preview import draw_analytic
+    from spadwarp.viz.frames import draw_analytic
 
     scene = read_scene(scene_path, mesh=mesh, overrides=overrides)
     given = {
@@ -140,7 +139,7 @@ def analytic(
                 albedo=_albedo(albedo),
                 albedo_channel=albedo_channel,
             )
-        result = spadwarp.analytic(
+        result = spadwarp.simulate_analytic(
             scene,
             truth=truth,
             frames=min(frames, 1),
@@ -230,7 +229,7 @@ def budget(
     Example:
       spadwarp budget configs/scenes/harbour_5m.toml --range 1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
     """
-    from spadwarp.budgets import plot_budget
+    from spadwarp.analytic.budget import plot_budget
 
     scene = read_scene(scene_path, mesh=None, overrides=overrides)
     if out is not None:
@@ -249,7 +248,7 @@ def budget(
 
 
 def _numbers(text: str | None) -> list[float] | None:
-    from spadwarp.budgets import parse_vary
+    from spadwarp.analytic.budget import parse_vary
 
     if text is None:
         return None
@@ -283,7 +282,7 @@ def sweep(
     Example:
       spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
     """
-    from spadwarp.budgets import plot_sweep
+    from spadwarp.analytic.budget import plot_sweep
 
     scene: Scene = read_scene(scene_path, mesh=mesh, overrides=overrides)
     prepare_directory(out, overwrite=overwrite, needed=16 << 20)
@@ -306,7 +305,7 @@ def sweep(
 
 
 def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
-    from spadwarp.budgets import OUTLIERS
+    from spadwarp.analytic.budget import OUTLIERS
 
     table = _table(
         title,
@@ -387,7 +386,7 @@ def _percent(value: float) -> str:
 def _write_csv(path: Path, table: Sequence[dict[str, Any]]) -> Path:
     import csv
 
-    from spadwarp.files import atomic_path
+    from spadwarp.io.atomic import atomic_path
 
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(table[0]))

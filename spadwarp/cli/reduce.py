@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-from spadwarp.errors import ConfigError
-
-from ._app import app, complain, say
-from ._options import (
+from spadwarp.cli._app import app, complain, say
+from spadwarp.cli._options import (
     Device,
     Json,
     Out,
@@ -29,22 +27,23 @@ from ._options import (
     whole_number,
     write_json,
 )
-from ._progress import progress
+from spadwarp.cli._progress import progress
+from spadwarp.errors import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from spadwarp import Result
-    from spadwarp.frame_files import Recording
-    from spadwarp.histogram_files import Histograms
+    from spadwarp.frames.file import Recording
+    from spadwarp.frames.measured import Histograms
 
 # What a detector sees of a scene; the rest has decided which photons came.
 _DETECTOR_FIELDS = ("detector", "laser.pulse_energy", "laser.repetition_rate", "laser.pulse_fwhm_ps")
 
 
 class Estimator(enum.StrEnum):
-    """`spadwarp.depth.METHODS`, known without loading it."""
+    """`spadwarp.frames.arrival_time.METHODS`, known without loading it."""
 
     peak = "peak"
     centroid = "centroid"
@@ -88,8 +87,8 @@ def detect(
       spadwarp detect run1/result.h5 --pulses 20000 --frames 100 --seed 3 --out frames/
       spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
     """
-    from spadwarp.frame_files import record_frames
-    from spadwarp.frame_preview import draw_recording
+    from spadwarp.frames.file import record_frames
+    from spadwarp.viz.frames import draw_recording
 
     result = _with_detector(load_run(run), overrides)
     chosen: Any = [one.value for one in method or Estimator]
@@ -227,9 +226,9 @@ def depth(
       spadwarp depth counts.npy --bin-width-ps 55 --group-index 1.3566 --horizontal-fov-deg 15 \\
           --irf-fwhm-ps 200 --method likelihood --out depth/
     """
-    from spadwarp.files import file_within
-    from spadwarp.histogram_files import read_histograms
-    from spadwarp.reduction import depth_of, write_depth
+    from spadwarp.frames.measured import read_histograms
+    from spadwarp.io.atomic import file_within
+    from spadwarp.run.depth import depth_of, write_depth
 
     if ply is not None:
         check_writable(ply.parent)

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import spadwarp
-
-from ._app import app, complain, fail, say
-from ._options import (
+from spadwarp.cli._app import app, complain, fail, say
+from spadwarp.cli._options import (
     Device,
     Json,
     Out,
@@ -27,12 +26,12 @@ from ._options import (
     whole_number,
     write_json,
 )
-from .simulate import bytes_needed, described, write_run
+from spadwarp.cli.simulate import bytes_needed, described, write_run
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp.validation import CaseResult
+    from spadwarp.validate import CaseResult
 
 
 @app.command()
@@ -96,8 +95,8 @@ def validate(
       spadwarp validate
       spadwarp validate slab cube60 --photons 1e7 --seed 1 --json report.json --plots plots/
     """
-    from spadwarp.validation import CASES, plot_results
-    from spadwarp.validation import write_json as write_report
+    from spadwarp.validate import CASES, plot_results
+    from spadwarp.validate import write_json as write_report
 
     if list_cases:
         say(rows({case.name: case.about for case in CASES.values()}))
@@ -105,7 +104,7 @@ def validate(
     for place in (plots, None if json_path is None else json_path.parent):
         if place is not None:
             check_writable(place)
-    results = spadwarp.validate(
+    results = spadwarp.validate.validate(
         cases or None,
         photons=photons,
         seed=seed or 0,
@@ -166,7 +165,7 @@ def targets(
     Example:
       spadwarp targets --out pictures/
     """
-    from spadwarp.gallery import describe_targets, draw_targets
+    from spadwarp.viz.targets import describe_targets, draw_targets
 
     if out is not None:
         prepare_directory(out, overwrite=overwrite, needed=16 << 20)

@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-from spadwarp.errors import ConfigError, FileError
-
-from ._app import INTERRUPTED, app, complain, fail, say
-from ._options import (
+from spadwarp.cli._app import INTERRUPTED, app, complain, fail, say
+from spadwarp.cli._options import (
     Devices,
     EngineName,
     Json,
@@ -39,7 +37,8 @@ from ._options import (
     whole_number,
     write_json,
 )
-from ._progress import progress
+from spadwarp.cli._progress import progress
+from spadwarp.errors import ConfigError, FileError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -262,8 +261,8 @@ def bytes_needed(scene: Scene, *, records: bool, batches: bool, checkpoint: bool
 
 def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
     """Files of a result as its `[output]` asks for, the one that nothing can replace first, and the depth frame."""
-    from spadwarp.files import save_depth_exr, save_truth_exr
-    from spadwarp.preview import write_previews
+    from spadwarp.result.file import save_depth_exr, save_truth_exr
+    from spadwarp.viz.result import write_previews
 
     scene, output = result.scene, result.scene.output
     written: list[Path] = []
@@ -277,7 +276,7 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
     written.append(text)
     options: dict[str, Any] = {}
     if output.depth_method == "matched":
-        from spadwarp.detector import instrument_response
+        from spadwarp.frames.spad import instrument_response
 
         options["irf"] = instrument_response(
             pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
@@ -305,7 +304,7 @@ def _save(result: Result, path: Path) -> Path:
 
 
 def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None, quiet: bool) -> Path:
-    from spadwarp.records import save_records
+    from spadwarp.transport.records import save_records
 
     if not quiet:
         complain("the photons again, for their records")

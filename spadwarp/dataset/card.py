@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from .columns import FRAME_COLUMNS, scene_columns
-from .histograms import MEANING
-from .plan import Plan
-from .recipe import SPLITS
+from spadwarp.dataset.histograms import MEANING
+from spadwarp.dataset.recipe import SPLITS
+from spadwarp.dataset.sampling import Plan
+from spadwarp.dataset.schema import FRAME_COLUMNS, scene_columns
 
 __all__ = ["card"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scenes import RenderedScene
+from spadwarp.dataset.render_analytic import RenderedScene
 
 __all__ = ["HistogramFile", "HistogramWriter"]
 

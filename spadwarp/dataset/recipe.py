@@ -27,11 +27,11 @@ from pydantic import (
     model_validator,
 )
 
-from spadwarp._layers import parse_override, toml_value
-from spadwarp._problems import describe
-from spadwarp.config import Scene
-from spadwarp.config.sections import Whole, listed
 from spadwarp.errors import ConfigError, FileError
+from spadwarp.scene import Scene
+from spadwarp.scene.load import parse_override, toml_value
+from spadwarp.scene.messages import describe
+from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 

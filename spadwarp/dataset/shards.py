@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.dataset.histograms import HistogramWriter
+from spadwarp.dataset.render_analytic import RenderedScene, render_scene
+from spadwarp.dataset.sampling import Plan, Shard
+from spadwarp.dataset.schema import FORMAT_VERSION, FRAME_COLUMNS, scene_columns, scene_row
+from spadwarp.device import core_count, pick_device
 from spadwarp.errors import DeviceError
-from spadwarp.files import hdf5_file
-from spadwarp.hardware import core_count, pick_device
-
-from .columns import FORMAT_VERSION, FRAME_COLUMNS, scene_columns, scene_row
-from .histograms import HistogramWriter
-from .plan import Plan, Shard
-from .scenes import RenderedScene, render_scene
+from spadwarp.io.hdf5 import hdf5_file
 
 __all__ = ["checksum", "write_scene_index", "write_shard"]
 

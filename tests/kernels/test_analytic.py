@@ -7,13 +7,13 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.statistics_of_samples import DEVICES
 from reference import crlb
 from reference.single_scatter import Lidar as ReferenceLidar
 from reference.single_scatter import single_scatter
 from spadwarp_kernels import analytic as sampling
 from spadwarp_kernels import analytic_budget as budget
 from spadwarp_kernels import cramer_rao
-from statistics_of_samples import DEVICES
 
 C0 = 299_792_458.0
 AXIS = [0.0, 0.0, 1.0]

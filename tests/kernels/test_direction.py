@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.statistics_of_samples import DEVICES, chi2_p
 from spadwarp_kernels import (
     one_minus_cosine,
     orthonormal_basis,
@@ -14,7 +15,6 @@ from spadwarp_kernels import (
     snap_direction,
     u01,
 )
-from statistics_of_samples import DEVICES, chi2_p
 
 
 @wp.kernel(enable_backward=False)

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from statistics_of_samples import chi2_p
+from helpers.statistics_of_samples import chi2_p
 
 FOLDER = Path(__file__).parents[2] / "kernels" / "examples"
 

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels.frames import FrameCoding, draw_frames
-from statistics_of_samples import DEVICES
 
 WIDTH, HEIGHT = 52, 40  # rows that do not end at a byte
 OFFSET, STEP = 9.0, 1e-3

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.statistics_of_samples import DEVICES, chi2_p
 from spadwarp_kernels import (
     TABULATED,
     Camera,
@@ -22,7 +23,6 @@ from spadwarp_kernels import (
 )
 from spadwarp_kernels.camera import clip_to_planes, field
 from spadwarp_kernels.guided import HENYEY_GREENSTEIN_GUIDE, clip_to_gate, make_sample_flight
-from statistics_of_samples import DEVICES, chi2_p
 
 COUNT = 10_000_000
 G = 0.924

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from helpers.statistics_of_samples import DEVICES, chi2_p
 from spadwarp_kernels import LASER_PROFILES, Laser, emit_photon
-from statistics_of_samples import DEVICES, chi2_p
 
 COUNT = 10_000_000
 AXIS = np.array([0.36, -0.48, 0.8])

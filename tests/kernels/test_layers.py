@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from statistics_of_samples import DEVICES
+from helpers.statistics_of_samples import DEVICES
 
 AXIS = np.array([0.36, -0.48, 0.8])
 START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read

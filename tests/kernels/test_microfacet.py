@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
-from statistics_of_samples import DEVICES
 
 NORMAL = np.array([0.36, -0.48, 0.8])
 ACROSS = np.array([0.8, 0.6, 0.0])

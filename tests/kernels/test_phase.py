@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from helpers.statistics_of_samples import DEVICES, chi2_p
 from spadwarp_kernels import henyey_greenstein_pdf, random_block, sample_henyey_greenstein, u01_fine
-from statistics_of_samples import DEVICES, chi2_p
 
 ANISOTROPIES = [-0.7, 0.0, 0.01, 0.5, 0.924, 0.99]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels.philox import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
-from statistics_of_samples import DEVICES
 
 
 @wp.kernel(enable_backward=False)

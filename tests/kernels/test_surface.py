@@ -6,6 +6,7 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
+from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels import (
     intersect_mesh,
     intersect_surfaces,
@@ -15,7 +16,6 @@ from spadwarp_kernels import (
     segment_meets_box,
     u01,
 )
-from statistics_of_samples import DEVICES
 
 
 def _mesh(shape, device, *, builder=None, leaf_size=1):

@@ -9,10 +9,10 @@ from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
 import spadwarp_kernels as sk
+from helpers.statistics_of_samples import DEVICES, chi2_p
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp_kernels import TABULATED, random_block, u01_fine
-from statistics_of_samples import DEVICES, chi2_p
 
 COUNT = 1_000_000
 FLAT = 2.0**-32  # the tables are constant up to here

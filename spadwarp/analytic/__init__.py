@@ -1,0 +1,1 @@
+"""The analytic simulator: numbers without photon transport."""

@@ -1,0 +1,293 @@
+"""Reading datasets: frame by frame as NumPy arrays, or as torch tensors for a `DataLoader`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.dataset.histograms import HistogramFile
+from spadwarp.dataset.make import read_manifest
+from spadwarp.dataset.recipe import SPLITS
+from spadwarp.errors import FileError
+
+__all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
+
+FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", "counts", "expected")
+"""Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
+
+_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
+
+
+class FrameReader:
+    """The frames of a split as a sequence of dicts of float32 NumPy arrays `[C, H, W]`.
+
+    - `noisy`: depth frame [m], NaN where there was no return.
+    - `clean`: true planar depth [m], NaN where nothing is hit.
+    - `label`: 1 where the pixel reports backscatter or other background, else 0.
+    - `intensity`: recorded photons.
+    - `bound`: Cramér–Rao bound of the depth [m], NaN for no estimate.
+    - `normal`: `[3, H, W]`, unit vectors towards the camera. `albedo`: Lambertian reflectance.
+    - `counts`: histograms of the frame `[T, H, W]`; `expected`: their expectation. Of traced scenes only.
+    - `prior`: density [1/m] with which the water alone reports the depth in `noisy`; NaN where `noisy` is.
+
+    And numbers: `sample`, `scene`, `target` (int64), `backscatter_fraction`, `attenuation_lengths`, `distance`
+    (float32), `gate` (float32 `[2]`, ranges at which it opens and closes [m]).
+
+    Args:
+        path: The dataset's folder.
+        split: "train", "validation", "test", or "all".
+        fields: Images of an item, from `FIELDS`.
+        crop: Side, or height and width, of a random part of the frame; None for the whole.
+        augment: Whether items are turned by random multiples of 90° (of 180° where they are not square) and mirrored.
+        repeats: How many differently cropped and turned items there are of each frame.
+        seed: Of crops and turns. They depend on it, on the epoch (`set_epoch`) and on the item's index alone.
+
+    Files are opened in the process that reads them, when it does: workers of a `DataLoader` need no care.
+
+    Raises:
+        FileError: No dataset, or one that is not whole.
+        ValueError: An argument out of range.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        split: str = "train",
+        *,
+        fields: Sequence[str] = ("noisy", "clean", "label", "intensity"),
+        crop: int | tuple[int, int] | None = None,
+        augment: bool = False,
+        repeats: int = 1,
+        seed: int = 0,
+    ) -> None:
+        self.path = Path(path)
+        self.manifest = read_manifest(self.path)
+        if split not in (*SPLITS, "all"):
+            raise ValueError(f"split = {split!r} is not one of {', '.join(map(repr, (*SPLITS, 'all')))}")
+        if unknown := [name for name in fields if name not in FIELDS]:
+            raise ValueError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, FIELDS))}")
+        if repeats < 1:
+            raise ValueError(f"repeats = {repeats} is outside [1, inf)")
+        self.split, self.fields, self.repeats, self.seed = split, tuple(fields), repeats, seed
+        self.augment, self.epoch = augment, 0
+        self.shape: tuple[int, int] = (self.manifest["height"], self.manifest["width"])
+        self.crop = (crop, crop) if isinstance(crop, int) else crop
+        if self.crop is not None and not all(1 <= a <= b for a, b in zip(self.crop, self.shape, strict=True)):
+            raise ValueError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
+        self.shards: list[str] = [
+            name for one in (SPLITS if split == "all" else (split,)) for name in self.manifest["splits"][one]["shards"]
+        ]
+        per_scene = self.manifest["frames_per_scene"]
+        self._stops = np.cumsum([_frames_in(self.path / name, per_scene) for name in self.shards], dtype=np.int64)
+        self._open: dict[int, _Shard] = {}
+        self._process = os.getpid()
+
+    def __len__(self) -> int:
+        return self.repeats * self.frame_count
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the split."""
+        return int(self._stops[-1]) if len(self._stops) else 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Other crops and turns than those of other epochs."""
+        self.epoch = epoch
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index = {index} is outside [{-len(self)}, {len(self)})")
+        index %= len(self)
+        frame = index % self.frame_count
+        number = int(np.searchsorted(self._stops, frame, side="right"))
+        shard = self._shard(number)
+        row = frame - (int(self._stops[number - 1]) if number else 0)
+        window: tuple[slice, slice] = (slice(None), slice(None))
+        turns, mirrored = 0, False
+        if self.crop is not None or self.augment:
+            generator = np.random.Generator(np.random.Philox(key=[self.seed, self.epoch], counter=[0, 0, index, 0]))
+            if self.crop is not None:
+                corner = [int(generator.integers(b - a + 1)) for a, b in zip(self.crop, self.shape, strict=True)]
+                window = tuple(slice(low, low + side) for low, side in zip(corner, self.crop, strict=True))  # type: ignore[assignment]
+            if self.augment:
+                height, width = self.crop or self.shape
+                turns = int(generator.integers(4)) if height == width else 2 * int(generator.integers(2))
+                mirrored = bool(generator.integers(2))
+        item: dict[str, Any] = {}
+        for name, image in shard.images(row, self.fields, window).items():
+            if turns:
+                image = np.rot90(image, turns, axes=(-2, -1))
+            item[name] = np.ascontiguousarray(image[..., ::-1] if mirrored else image)
+        if "normal" in item:
+            item["normal"] = _turned(item["normal"], turns, mirrored)
+        return item | shard.numbers(row)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for index in range(len(self)):
+            yield self[index]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_open": {}}
+
+    def _shard(self, number: int) -> _Shard:
+        if self._process != os.getpid():  # files opened before a fork are the parent's
+            self._open, self._process = {}, os.getpid()
+        if number not in self._open:
+            self._open[number] = _Shard(self.path, self.shards[number])
+        return self._open[number]
+
+
+class SpadDataset(FrameReader):
+    """`FrameReader` for torch: a map-style dataset whose items hold tensors; goes into a `DataLoader` as it is.
+
+    `SpadDataset(path, crop=128, augment=True, repeats=20)` makes the paper's 400 000 pairs of 20 000 frames. Arguments,
+    fields and errors are those of `FrameReader`; NaN marks what is not there.
+    """
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        import torch
+
+        item = super().__getitem__(index)
+        return {
+            name: torch.from_numpy(value) if isinstance(value, np.ndarray) else torch.tensor(value)
+            for name, value in item.items()
+        }
+
+
+def iterate_dataset(
+    path: str | os.PathLike[str],
+    split: str = "train",
+    *,
+    fields: Sequence[str] = ("noisy", "clean", "label", "intensity"),
+    shuffle: int | None = None,
+) -> Iterator[dict[str, Any]]:
+    """The frames of a split, one dict of NumPy arrays each, as `FrameReader` has them.
+
+    `shuffle`: seed of a random order; in their own order if None. Raises as `FrameReader`, before the first frame.
+    """
+    reader = FrameReader(path, split, fields=fields)
+    order = np.arange(len(reader))
+    if shuffle is not None:
+        np.random.Generator(np.random.Philox(shuffle)).shuffle(order)
+    return (reader[int(index)] for index in order)
+
+
+class _Shard:
+    """Two open files. What is stored without compression is read past HDF5, through a memory map."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        import h5py
+
+        self.frames = _opened(folder / name)
+        self.scenes = _opened(folder / "scenes" / name.replace("frames-", "scenes-"))
+        cubes = folder / name.replace("frames-", "histograms-")
+        self.histograms = HistogramFile(_opened(cubes)) if cubes.is_file() else None
+        depth = self.frames["depth"]
+        self.step, self.offset = np.float32(depth.attrs["step"]), np.float32(depth.attrs["offset"])
+        self.width: int = depth.shape[2]
+        self.stored = {one: _mapped(folder / name, self.frames[one]) for one in ("depth", "label", "intensity")}
+        place = Path(self.scenes.filename)
+        self.scene_images = {field: _mapped(place, self.scenes[column]) for field, column in _SCENE_FIELDS.items()}
+        self.columns: dict[str, NDArray[Any]] = {
+            one: value[...] for one, value in self.frames.items() if isinstance(value, h5py.Dataset) and value.ndim == 1
+        }
+        self.gate = np.stack([self.scenes["gate_near"][...], self.scenes["gate_far"][...]], axis=1).astype(np.float32)
+        self.profiles, self.edges = self.scenes["backscatter_profile"][...], self.scenes["profile_edges"][...]
+        self.first_scene = int(self.columns["scene"][0])
+
+    def images(self, row: int, fields: Sequence[str], window: tuple[slice, slice]) -> dict[str, NDArray[np.float32]]:
+        scene = int(self.columns["scene"][row]) - self.first_scene
+        out: dict[str, NDArray[np.float32]] = {}
+        for name in fields:
+            if name == "noisy":
+                out[name] = self._noisy(row, window)[None]
+            elif name == "label":
+                rows, columns = window
+                bits = np.unpackbits(self.stored["label"][row, rows], axis=-1, count=self.width)
+                out[name] = bits[:, columns].astype(np.float32)[None]
+            elif name == "intensity":
+                scale = self.columns["intensity_step"][row]
+                out[name] = np.multiply(self.stored["intensity"][(row, *window)], scale, dtype=np.float32)[None]
+            elif name == "prior":
+                out[name] = self._prior(scene, self._noisy(row, window))[None]
+            elif name in ("counts", "expected"):
+                out[name] = np.moveaxis(self._histogram(name, row)[window], -1, 0)
+            else:
+                image = np.array(self.scene_images[name][(scene, *window)], np.float32)
+                out[name] = np.moveaxis(image, -1, 0) if name == "normal" else image[None]
+        return out
+
+    def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
+        cube = None
+        if self.histograms is not None:
+            number = int(self.columns["sample" if name == "counts" else "scene"][row])
+            cube = self.histograms.counts(number) if name == "counts" else self.histograms.expected(number)
+        if cube is None:
+            raise FileError(f"{self.frames.filename}: frame {int(self.columns['sample'][row])} has no {name!r}")
+        return cube
+
+    def numbers(self, row: int) -> dict[str, Any]:
+        scene = int(self.columns["scene"][row])
+        return {
+            **{name: int(self.columns[name][row]) for name in ("sample", "scene", "target")},
+            **{
+                name: np.float32(self.columns[name][row])
+                for name in ("backscatter_fraction", "attenuation_lengths", "distance")
+            },
+            "gate": self.gate[scene - self.first_scene].copy(),
+        }
+
+    def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
+        codes = self.stored["depth"][(row, *window)]
+        depth = codes.astype(np.float32)
+        depth *= self.step
+        depth += self.offset
+        np.copyto(depth, np.nan, where=codes == 0)
+        return depth
+
+    def _prior(self, scene: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        edges, profile = self.edges[scene], self.profiles[scene]
+        # Density 0 on both sides of the profile.
+        density = np.concatenate([[0.0], profile, [0.0]]).astype(np.float32)
+        place = (depth - edges[0]) * np.float32(len(profile) / (edges[-1] - edges[0])) + np.float32(1.0)
+        place = np.nan_to_num(np.clip(place, 0.0, np.float32(len(density) - 1)), copy=False)
+        prior = density[place.astype(np.intp)]
+        np.copyto(prior, np.nan, where=np.isnan(depth))
+        return prior
+
+
+def _opened(path: Path) -> Any:
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError:
+        raise FileError(f"{path}: no such file; `spadwarp dataset make` makes what is missing") from None
+    except OSError as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def _mapped(path: Path, stored: Any) -> Any:
+    """A dataset's values without a copy where they lie in one piece, else the dataset itself."""
+    offset = stored.id.get_offset()
+    if offset is None:
+        return stored
+    return np.memmap(path, dtype=stored.dtype, mode="r", offset=offset, shape=stored.shape).view(np.ndarray)
+
+
+def _frames_in(path: Path, per_scene: int) -> int:
+    with _opened(path) as file:
+        return int(file["sample"].shape[0])
+
+
+def _turned(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:
+    """Normals of an image that was turned: their x and y turn with it."""
+    x, y, z = normal
+    for _ in range(turns):  # np.rot90: what pointed right (+x) points up (−y)
+        x, y = y, -x
+    return np.ascontiguousarray(np.stack([-x if mirrored else x, y, z]))

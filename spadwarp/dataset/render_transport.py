@@ -1,0 +1,84 @@
+"""One scene of a dataset by photon transport: expected histograms, counts of the camera, depth frames from counts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.analytic.model import depth_per_time
+from spadwarp.dataset.render_analytic import Frames, Histograms, RenderedScene, exposed, intensity_step, water_profile
+from spadwarp.dataset.sampling import Plan, SceneDraw
+from spadwarp.frames.cramer_rao import crlb_map
+from spadwarp.frames.spad import Detection, detect
+from spadwarp.result.result import Result, pixel_directions, range_from_path
+from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.transport.simulate import simulate
+
+__all__ = ["render_traced"]
+
+_MOST_PULSES = 2**31 - 1  # what the camera's counters take
+
+
+def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
+    """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
+    assert draw.photons is not None
+    scene = draw.scene
+    result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
+    if result.partial:
+        raise KeyboardInterrupt
+    scale = scene.laser.photons_per_pulse * scene.detector.pde
+    water = result.component("backscatter")
+    returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
+    seen = (returned > 0) & np.isfinite(result.truth.depth)
+    if draw.signal_photons is not None:
+        scene = exposed(scene, draw, returned[seen], most=_MOST_PULSES)
+    pulses = min(scene.analytic.pulses, _MOST_PULSES)
+    taken = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
+    time_bound = crlb_map(result, pulses=pulses, device=device)
+    view = pixel_directions(scene.camera)
+    distances = np.nan_to_num(result.truth.range.reshape(-1).astype(np.float64))
+    per_time = depth_per_time(scene, view.reshape(-1, 3), distances).reshape(seen.shape)
+    profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
+    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    return RenderedScene(
+        draw=draw,
+        scene=scene,
+        truth=result.truth,
+        bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
+        profile=water_profile(scene, result.bin_edges * speed, profile / max(profile[-1], 1e-300)),
+        signal=float(np.median(returned[seen])) if seen.any() else 0.0,
+        backscatter=float(np.median(water.sum(axis=-1))) * scale,
+        frames=_frames(plan, scene, result, taken, device=device),
+        histograms=Histograms(
+            expected=np.minimum(taken.expected * np.float32(pulses), 65504.0).astype(np.float16), counts=taken.counts
+        ),
+    )
+
+
+def _frames(plan: Plan, scene: Scene, result: Result, taken: Detection, *, device: str | None) -> Frames:
+    """Depth from the counts, and whether it is background that was most likely reported."""
+    time = taken.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
+    view = pixel_directions(scene.camera)
+    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    start, stop = taken.gate_start, taken.gate_start + taken.expected.shape[-1] * taken.bin_width
+    depth = range_from_path(np.clip(time, start, stop) * speed, view, scene.beam.position) * view[..., 2]
+    code = np.rint((depth - plan.depth_offset) / plan.depth_step)
+    codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
+    counts = taken.counts.sum(axis=-1, dtype=np.int64)
+    step = intensity_step(float((taken.expected.sum(axis=-1) * taken.pulses).max()))
+    return Frames(
+        depth=codes,
+        intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
+        labels=np.packbits(_stray(taken, time), axis=-1),
+        intensity_step=step,
+    )
+
+
+def _stray(taken: Detection, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether background is more likely than the target at the time that a pixel reports, `[K, H, W]`."""
+    bins = taken.expected.shape[-1]
+    at = np.nan_to_num((time - taken.gate_start) / taken.bin_width).astype(np.int64).clip(0, bins - 1)
+    expected = np.take_along_axis(taken.expected[None], at[..., None], axis=-1)[..., 0]
+    known = np.broadcast_to(taken.background, taken.expected.shape)
+    background = np.take_along_axis(known[None], at[..., None], axis=-1)[..., 0]
+    return (background > 0.5 * expected) & ~np.isnan(time)

@@ -1,0 +1,154 @@
+"""Training recipes: TOML in, frozen and validated out."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
+
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.scene.messages import describe
+
+__all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]
+
+MODELS = ("pyramid", "histograms", "dncnn", "usdn")
+"""Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] <= limits[1]:
+        raise ValueError(f"{list(limits)} is not (lowest, highest)")
+    return limits
+
+
+def _positive(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] > 0:
+        raise ValueError(f"{limits[0]} is outside (0, inf)")
+    return limits
+
+
+def _shares(limits: tuple[float, float]) -> tuple[float, float]:
+    if not (limits[0] >= 0 and limits[1] <= 1):
+        raise ValueError(f"{list(limits)} is outside [0, 1]")
+    return limits
+
+
+def _pair(value: Any) -> Any:
+    return tuple(float(one) for one in value) if isinstance(value, list) else value
+
+
+Limits = Annotated[tuple[float, float], BeforeValidator(_pair), AfterValidator(_ordered)]
+Positive = Annotated[Limits, AfterValidator(_positive)]
+Shares = Annotated[Limits, AfterValidator(_shares)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Noise(_Table):
+    """What the noise of a training is drawn from: `[lowest, highest]`, or the share of the samples."""
+
+    backscatter: Shares = Field((0.0, 0.6), description="part of the pixels that report backscatter (BS)")
+    sigma_scale: Positive = Field((0.3, 8.0), description="factor on a scene's Cramér–Rao bound, even in the logarithm")
+    decay: Positive = Field(
+        (0.3, 40.0), description="rate at which backscatter falls over the gate [1/gate], even in the logarithm"
+    )
+    own_gate: Share = Field(0.5, description="samples with the scene's own gate")
+    own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
+    gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], even in the logarithm")
+    behind: Share = Field(0.4, description="samples with backscatter from behind the target too: multiple scattering")
+    slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
+    counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
+    photons: Positive = Field((0.7, 150.0), description="signal counts a pixel of these, even in the logarithm")
+    sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, even in the logarithm")
+    scattered: Share = Field(0.0, description="of these, samples with light scattered forward, late and spread")
+    delay: Positive = Field((0.004, 0.12), description="mean delay of that light [gate widths], even in the logarithm")
+    spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], even in the logarithm")
+    roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
+    dead: Share = Field(0.1, description="highest part of the pixels that report nothing for no reason")
+    unknown_water: Share = Field(0.2, description="samples whose backscatter profile the network is not told")
+
+
+class Optimiser(_Table):
+    """How it is learnt."""
+
+    steps: int = Field(40_000, ge=1, description="updates of the weights")
+    batch: int = Field(64, ge=1, description="crops of an update, over all GPUs")
+    crop: int = Field(96, ge=32, description="side of a crop [pixels]")
+    learning_rate: float = Field(1e-3, gt=0, description="highest; falls along a cosine to a hundredth")
+    warm_up: int = Field(500, ge=0, description="updates in which the learning rate rises")
+    weight_decay: float = Field(1e-4, ge=0)
+    averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
+    loss: Literal["psnr", "mse"] = Field(
+        "psnr", description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much'
+    )
+    precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
+    report_every: int = Field(500, ge=1, description="updates between two lines of the log and two checkpoints")
+
+
+class TrainingRecipe(_Table):
+    """Everything a training depends on, checked and frozen."""
+
+    model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
+    start: Literal["pyramid"] | None = Field(None, description="network of the package with whose weights it begins")
+    data: str = Field(..., min_length=1, description="dataset (folder), relative to the working directory")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
+    noise: Noise = Noise()
+    optimiser: Optimiser = Optimiser()
+    _source: Path | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if self.model == "histograms" and self.noise.counting != 1:
+            raise ValueError(f'noise.counting = {self.noise.counting} with model = "histograms", which needs 1')
+        if self.start is not None and self.model not in ("pyramid", "histograms"):
+            raise ValueError(f"start = {self.start!r}: its layers are not those of {self.model!r}")
+        return self
+
+    @property
+    def source(self) -> Path | None:
+        """The file that the recipe came from."""
+        return self._source
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> TrainingRecipe:
+        """A recipe from tables as TOML gives them. Raises `ConfigError` with a line for each problem."""
+        try:
+            recipe = cls.model_validate(dict(tables))
+        except ValidationError as error:
+            name = None if source is None else str(source)
+            raise ConfigError(describe(error, cls, {}), source=name) from None
+        recipe._source = None if source is None else Path(source)
+        return recipe
+
+
+def load_training_recipe(path: str | os.PathLike[str], *, overrides: Mapping[str, Any] | None = None) -> TrainingRecipe:
+    """Reads a recipe; `overrides` are tables that lie over the file's.
+
+    Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_bytes().decode())
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+    for name, value in (overrides or {}).items():
+        inner = tables.get(name)
+        tables[name] = {**inner, **value} if isinstance(inner, dict) and isinstance(value, Mapping) else value
+    return TrainingRecipe.from_dict(tables, source=path)

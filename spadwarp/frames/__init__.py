@@ -1,0 +1,1 @@
+"""Frames of a SPAD camera: counts, arrival times, depth."""

@@ -1,0 +1,236 @@
+"""Depth frames: arrival times from histograms of counts, tallies or expected rates."""
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.interop.torch import in_torch_order, is_torch, tensor_of
+
+Method = Literal["peak", "centroid", "matched", "likelihood"]
+METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
+
+
+def arrival_time(
+    histogram: Any,
+    *,
+    gate_start: float,
+    bin_width: float,
+    method: Method = "centroid",
+    irf: Any = None,
+    device: Any = None,
+    background: Any = None,
+    gate: tuple[float, float] | None = None,
+) -> NDArray[np.float64]:
+    """Arrival time of the return in every pixel [s].
+
+    A torch tensor gives a torch tensor, on its device.
+
+    Args:
+        histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
+            rates (float) in any unit, not negative.
+        gate_start: time of the lower edge of bin 0 [s].
+        bin_width: [s], > 0.
+        method: `"peak"`: centre of the largest bin. `"centroid"`: mean about the peak, over ± 1.5 FWHM of `irf` (± 3
+            bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
+            where there is no background. `"likelihood"`: argmax over μ and the signal S of
+            Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
+        irf: instrument response: an `InstrumentResponse`, or an array of response per bin, whose time
+            zero is then its mean. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its
+            mode and its mean.
+        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+        background: expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
+            number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
+            does not use it.
+        gate: (start, stop) [s]: only bins whose centres lie in it are looked at.
+
+    Returns:
+        float64, `histogram.shape[:-1]`, in the histogram's own time [s]. NaN: nothing returned in the gate, or nothing
+        above the background.
+
+    Raises:
+        ValueError: naming the argument, its value and what is allowed.
+    """
+    import warp as wp
+
+    from spadwarp_kernels import depth as kernels
+
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
+    if not (np.isfinite(bin_width) and bin_width > 0):
+        raise ValueError(f"bin_width = {bin_width} s is outside (0, inf)")
+    if not np.isfinite(gate_start):
+        raise ValueError(f"gate_start = {gate_start} s is not finite")
+    if irf is None and method in ("matched", "likelihood"):
+        raise ValueError(f"method = {method!r} needs an irf")
+
+    with in_torch_order(histogram, background):
+        cube = as_warp(histogram, name="histogram", device=device)
+        if cube.ndim < 2 or cube.size == 0:
+            raise ValueError(
+                f"histogram has shape {tuple(cube.shape)}; [..., bin] with at least one pixel and one bin is needed"
+            )
+        frame, bins = tuple(cube.shape[:-1]), cube.shape[-1]
+        rows = cube.reshape((cube.size // bins, bins))
+        if (row := kernels.first_invalid_row(rows)) is not None:
+            pixel = tuple(int(i) for i in np.unravel_index(row, frame))
+            raise ValueError(f"histogram holds a negative or non-finite value in pixel {pixel}")
+
+        first, stop = 0, bins
+        if gate is not None:
+            # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
+            edges = [(t - gate_start) / bin_width - 0.5 for t in gate]
+            first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
+            if first >= stop:
+                end = gate_start + bins * bin_width
+                raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
+
+        response, lowest_tap, half_width, offset = None, 0, 3, 0.0
+        if irf is not None:
+            mean, mode, fwhm = _moments(irf, bin_width)
+            half_width = max(1, int(np.ceil(1.5 * fwhm)))
+            offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
+            if method in ("matched", "likelihood"):
+                response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
+        bins_from_start = kernels.arrival_bins(
+            rows,
+            method=method,
+            background=_background_rows(background, rows, frame, wp),
+            response=response,
+            lowest_tap=lowest_tap,
+            first=first,
+            stop=stop,
+            half_width=half_width,
+        )
+        found: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
+    found = found.double() if is_torch(found) else found.astype(np.float64)
+    return gate_start + (found.reshape(frame) - offset) * bin_width
+
+
+def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
+    """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
+
+    Raises:
+        TypeError: the data is of another kind (complex, text).
+    """
+    import warp as wp
+
+    from spadwarp.device import start_warp
+
+    start_warp()
+    if isinstance(array, wp.array):
+        result = array if device is None else array.to(device)
+    elif type(array).__module__.partition(".")[0] == "torch":
+        tensor = array.detach().contiguous()
+        if not tensor.is_floating_point() and tensor.element_size() < 4:
+            tensor = tensor.int()
+        elif tensor.element_size() < 4:
+            tensor = tensor.float()
+        result = wp.from_torch(tensor)
+        result = result if device is None else result.to(device)
+    else:
+        values = np.asarray(array)
+        if values.dtype.kind in "bui":
+            small = values.dtype.itemsize < 4 or values.dtype == np.int32
+            values = values.astype(np.int32 if small else np.int64, copy=False)
+        elif values.dtype.kind == "f":
+            values = values.astype(np.float64 if values.dtype.itemsize >= 8 else np.float32, copy=False)
+        else:
+            raise TypeError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
+        device = wp.get_preferred_device() if device is None else wp.get_device(device)
+        result = wp.array(np.ascontiguousarray(values), device=device, copy=device.is_cuda)
+    if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
+        raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
+    return result if result.is_contiguous else result.contiguous()
+
+
+def _background_rows(background: Any, rows: Any, frame: tuple[int, ...], wp: Any) -> Any:
+    """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
+    from spadwarp_kernels.depth import first_invalid_row
+
+    if background is None:
+        return None
+    bins = rows.shape[1]
+    shape = tuple(background.shape) if np.ndim(background) else ()
+    shapes = (
+        [(), (bins,)] + [(*frame[i:], bins) for i in range(len(frame))] + [(*frame[i:], 1) for i in range(len(frame))]
+    )
+    if shape not in shapes:
+        raise ValueError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
+    last = shape[-1] if shape else 1
+    if isinstance(background, wp.array) and background.dtype != wp.float32:
+        background = background.numpy()
+    if is_torch(background) or isinstance(background, wp.array):
+        values = wp.from_torch(background.detach().float().contiguous()) if is_torch(background) else background
+        values = values.to(rows.device).contiguous().reshape((values.size // last, last))
+        valid = first_invalid_row(values) is None
+    else:
+        array = np.ascontiguousarray(np.asarray(background, np.float32).reshape(-1, last))
+        valid = bool(np.isfinite(array).all() and (array >= 0).all())
+        values = wp.array(array, dtype=wp.float32, device=rows.device)
+    if not valid:
+        found = values.numpy()
+        raise ValueError(f"background = {found.min()} … {found.max()} is outside [0, inf)")
+    return values
+
+
+def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
+    """Mean, mode and FWHM of the response [bins], relative to its time zero."""
+    if hasattr(irf, "cumulative"):
+        return irf.mean / bin_width, irf.mode / bin_width, irf.fwhm / bin_width
+    weights = _array_response(irf)
+    taps = np.arange(weights.size)
+    mean = float(weights @ taps)
+    top = np.flatnonzero(weights == weights.max())
+    half = np.flatnonzero(weights >= 0.5 * weights.max())
+    return 0.0, float(top.mean()) - mean, float(half[-1] - half[0] + 1)
+
+
+def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
+    """Fraction of the response per bin for returns at every sub-bin phase, and the bin of the first tap."""
+    if hasattr(irf, "cumulative"):
+        lower, upper = (edge / bin_width for edge in irf.support)
+
+        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return irf.cumulative(x * bin_width)
+    else:
+        weights = _array_response(irf)
+        zero = float(weights @ (np.arange(weights.size) + 0.5))
+        lower, upper = -zero, weights.size - zero
+        knots = np.arange(weights.size + 1) - zero
+        curve = _MonotoneCubic(knots, np.concatenate([[0.0], np.cumsum(weights)]))
+
+        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return curve(np.clip(x, lower, upper))
+
+    lowest = int(np.floor(lower))
+    taps = int(np.ceil(upper)) + 1 - lowest
+    shift = np.arange(phases)[:, None] / phases
+    edges = lowest + np.arange(taps + 1)[None, :] - shift
+    return np.clip(np.diff(cumulative(edges), axis=1), 0.0, None), lowest
+
+
+def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
+    weights = np.asarray(irf, np.float64)
+    if weights.ndim != 1 or weights.size == 0:
+        raise ValueError(f"irf has shape {weights.shape}; one value per bin is needed")
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+        raise ValueError("irf must be finite and not negative, and its sum larger than 0")
+    return weights / weights.sum()
+
+
+class _MonotoneCubic:
+    """Cubic Hermite curve through increasing data that stays increasing (Fritsch and Butland 1984)."""
+
+    def __init__(self, x: NDArray[np.floating], y: NDArray[np.floating]):
+        rise = np.diff(y) / np.diff(x)
+        both = rise[:-1] * rise[1:]
+        inner = np.divide(2.0 * both, rise[:-1] + rise[1:], out=np.zeros_like(both), where=both > 0)
+        self.x, self.y, self.slope = x, y, np.concatenate([[0.0], inner, [0.0]])
+
+    def __call__(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        i = np.clip(np.searchsorted(self.x, at, side="right") - 1, 0, self.x.size - 2)
+        width = self.x[i + 1] - self.x[i]
+        t = (at - self.x[i]) / width
+        y0, y1, m0, m1 = self.y[i], self.y[i + 1], self.slope[i] * width, self.slope[i + 1] * width
+        return y0 + t * (m0 + t * (3 * (y1 - y0) - 2 * m0 - m1 + t * (2 * (y0 - y1) + m0 + m1)))

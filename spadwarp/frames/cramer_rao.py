@@ -1,0 +1,142 @@
+"""The Cramér–Rao bound of the delay from a histogram's own shape, scattered light included."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.analytic.model import dark_rate
+from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response
+
+if TYPE_CHECKING:
+    from spadwarp.result.result import Result
+
+__all__ = ["crlb_from_histogram", "crlb_map"]
+
+Map = NDArray[np.float64]
+
+
+def crlb_from_histogram(
+    signal_cube: ArrayLike,
+    background_cube: ArrayLike,
+    *,
+    bin_width: float,
+    pulses: float,
+    irf: InstrumentResponse | float | ArrayLike | None = None,
+    law: Literal["poisson", "first_photon"] = "poisson",
+    device: Any = None,
+) -> Map:
+    """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
+
+    F = Σ_k (dλ_k/dμ)²/λ_k with λ = signal + background; the delay μ moves the signal alone. Amplitude and background
+    count as known.
+
+    Args:
+        signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
+        background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
+        bin_width: [s], > 0.
+        pulses: Pulses of one depth frame, > 0.
+        irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
+            value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
+        law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
+        device: Warp device; default: the first GPU, else the CPU.
+
+    Returns:
+        float64 `[...]` [s]; NaN where the histogram holds no information.
+
+    Raises:
+        ValueError: Negative or non-finite cubes, shapes that do not fit, values out of range.
+    """
+    import warp as wp
+
+    from spadwarp.transport.model import pick_device
+    from spadwarp_kernels import cramer_rao
+
+    signal = np.ascontiguousarray(signal_cube, np.float32)
+    background = np.asarray(background_cube, np.float32)
+    bins = signal.shape[-1] if signal.ndim else 0
+    if background.shape not in ((), (bins,), signal.shape) or signal.size == 0:
+        raise ValueError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
+    for name, cube in (("signal_cube", signal), ("background_cube", background)):
+        if not (np.isfinite(cube).all() and (cube >= 0).all()):
+            raise ValueError(f"{name} holds a value outside [0, inf)")
+    for name, value in (("bin_width", bin_width), ("pulses", pulses)):
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} = {value} is outside (0, inf)")
+    if law not in ("poisson", "first_photon"):
+        raise ValueError(f"law = {law!r} is not one of 'poisson', 'first_photon'")
+    taps, slope_taps = _response_taps(irf, bin_width)
+    device = pick_device(device)
+    rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
+    information = cramer_rao.histogram_information(
+        wp.array(signal.reshape(-1, bins), dtype=wp.float32, device=device),
+        wp.array(np.ascontiguousarray(rows), dtype=wp.float32, device=device),
+        wp.array(taps, dtype=wp.float64, device=device),
+        wp.array(slope_taps, dtype=wp.float64, device=device),
+        first_photon=law == "first_photon",
+    ).numpy()
+    with np.errstate(divide="ignore"):
+        sigma = bin_width / np.sqrt(pulses * information)
+    return np.where(information > 0, sigma, np.nan).reshape(signal.shape[:-1])
+
+
+def crlb_map(
+    result: Result,
+    *,
+    pulses: float | None = None,
+    law: Literal["poisson", "first_photon"] = "first_photon",
+    device: Any = None,
+) -> Map:
+    """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
+
+    The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
+    The scene's instrument response is applied. `pulses`: the scene's `analytic.pulses` if not given. See
+    `crlb_from_histogram`.
+    """
+    scene = result.scene
+    detector = scene.detector
+    response = instrument_response(
+        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
+        jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
+        shape=detector.irf,
+        tail=detector.irf_tail_ps * 1e-12,
+    )
+    scale = scene.laser.photons_per_pulse * detector.pde
+    signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
+    background = result.component("backscatter") * scale + dark_rate(scene) * scene.gate.bin_width
+    return crlb_from_histogram(
+        signal,
+        background,
+        bin_width=scene.gate.bin_width,
+        pulses=scene.analytic.pulses if pulses is None else pulses,
+        irf=response,
+        law=law,
+        device=device,
+    )
+
+
+def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width: float) -> tuple[Map, Map]:
+    """Response per bin, and the derivative by the delay in bins of what one bin's photons leave in the others."""
+    stencil = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0  # fourth order
+    if irf is None:
+        return np.ones(1), stencil
+    if not isinstance(irf, InstrumentResponse) and np.ndim(irf) == 0:
+        fwhm = float(irf)  # type: ignore[arg-type]
+        if not (fwhm > 0 and math.isfinite(fwhm)):
+            raise ValueError(f"irf = {irf} s is outside (0, inf)")
+        irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
+    if isinstance(irf, InstrumentResponse):
+        if irf.times is None and irf.sigma == 0:
+            raise ValueError("irf has no width: a step has no derivative")
+        reach = math.ceil(max(map(abs, irf.support)) / bin_width) + 2
+        edges = np.arange(-reach - 1, reach + 2) * bin_width
+        # Light spread evenly over a bin, through the response, collected in bins: second differences of the integrals.
+        return np.diff(irf.cumulative_integral(edges), 2) / bin_width, -np.diff(irf.cumulative(edges), 2)
+    taps = np.asarray(irf, np.float64)
+    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and (taps >= 0).all() and taps.sum() > 0):
+        raise ValueError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")
+    taps = taps / taps.sum()
+    return taps, np.convolve(taps, stencil)

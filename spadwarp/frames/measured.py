@@ -1,0 +1,204 @@
+"""Histograms from files: those that spadwarp wrote, and measured ones (`.npy`, `.mat`, `.ptu`)."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.frames.response import InstrumentResponse, instrument_response
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["ENDINGS", "Histograms", "read_histograms"]
+
+ENDINGS = (".h5", ".npy", ".mat", ".ptu")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Histograms:
+    """Histograms with what the file tells about them.
+
+    Attributes:
+        values: `[H, W, T]` or `[frames, H, W, T]`, not negative.
+        bin_width: [s]; None where the file does not tell.
+        gate_start: Time of flight at the lower edge of bin 0 [s].
+        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes, or None.
+        irf: The response that the histograms contain; None: unknown, or none.
+        response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
+        scene: Of a simulation, else None.
+    """
+
+    values: NDArray[Any]
+    bin_width: float | None = None
+    gate_start: float = 0.0
+    background: NDArray[np.float32] | None = None
+    irf: InstrumentResponse | None = None
+    response: InstrumentResponse | None = None
+    scene: Scene | None = None
+
+
+def read_histograms(path: str | Path, *, variable: str | None = None) -> Histograms:
+    """Reads histograms, of the kind that the file's ending says.
+
+    `.h5`: a result or frames of spadwarp. `.npy`: `[H, W, T]` or `[frames, H, W, T]`. `.mat`: such an array in a file
+    of MATLAB, version 7.3 included. `.ptu`: a T3 image of PicoQuant, frames and channels added up; its bins count from
+    the sync, or from the start of the gate that `spadwarp export` wrote in its comment.
+
+    Args:
+        path: The file.
+        variable: Name of the array in a `.mat` file; default: the largest of three or four dimensions.
+
+    Raises:
+        FileError: No such file, not readable, of an unknown kind, without such an array, or with values that are
+            negative or not finite; a package that is needed to read it is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    readers = {".h5": _read_own, ".npy": _read_npy, ".mat": _read_mat, ".ptu": _read_ptu}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
+    try:
+        read = _read_mat(path, variable) if reader is _read_mat else reader(path)
+    except SpadwarpError:
+        raise
+    except ImportError as error:
+        raise FileError(f"{path}: reading it needs {error.name}: pip install 'spadwarp[formats]'") from error
+    except Exception as error:  # what a reader raises depends on the format
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    values = read.values
+    if values.ndim not in (3, 4) or values.size == 0 or values.dtype.kind not in "biuf":
+        raise FileError(
+            f"{path}: {values.dtype} {values.shape}; real numbers [H, W, T] or [frames, H, W, T] are needed"
+        )
+    if values.dtype.kind == "f" and np.isnan(values).any():
+        raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
+    if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
+        raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
+    return read
+
+
+def _read_own(path: Path) -> Histograms:
+    import h5py
+
+    from spadwarp.result.file import load_result
+
+    if not h5py.is_hdf5(path):
+        raise FileError(f"{path}: not an HDF5 file")
+    with h5py.File(path, "r") as file:
+        kind = file.attrs.get("format")
+    if kind == "spadwarp frames":
+        return _read_frames(path)
+    result = load_result(path)
+    scene = result.scene
+    return Histograms(
+        values=result.histogram,
+        bin_width=scene.gate.bin_width,
+        gate_start=scene.gate.start,
+        background=result.component("backscatter").astype(np.float32),
+        response=scene_response(scene),
+        scene=scene,
+    )
+
+
+def _read_frames(path: Path) -> Histograms:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        about, irf = file.attrs, frames_response(file)
+        return Histograms(
+            values=file["counts"][...],
+            bin_width=float(about["bin_width"]),
+            gate_start=float(about["gate_start"]),
+            background=file["background"][...] * np.float32(about["pulses"]),
+            irf=irf,
+            response=irf,
+            scene=frames_scene(file),
+        )
+
+
+def frames_scene(file: Any) -> Scene:
+    """The scene in an open file of frames."""
+    import tomllib
+
+    from spadwarp.scene import Scene
+
+    return Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs["source"] or None)
+
+
+def frames_response(file: Any) -> InstrumentResponse:
+    """The instrument response in an open file of frames."""
+    if "irf" in file:
+        return InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
+    return InstrumentResponse(sigma=float(file.attrs["irf_sigma"]), tail=float(file.attrs["irf_tail"]))
+
+
+def scene_response(scene: Scene) -> InstrumentResponse:
+    """The instrument response of a scene's laser and detector."""
+    return instrument_response(
+        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
+        jitter_fwhm=scene.detector.jitter_fwhm_ps * 1e-12,
+        shape=scene.detector.irf,
+        tail=scene.detector.irf_tail_ps * 1e-12,
+    )
+
+
+def _read_npy(path: Path) -> Histograms:
+    return Histograms(values=np.load(path, allow_pickle=False))
+
+
+def _read_mat(path: Path, variable: str | None = None) -> Histograms:
+    import h5py
+
+    if h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            # MATLAB lays arrays out column by column: to others their dimensions are reversed.
+            shapes = {name: one.shape[::-1] for name, one in file.items() if isinstance(one, h5py.Dataset)}
+            return Histograms(values=file[_chosen(path, shapes, variable)][...].T)
+    from scipy.io import loadmat, whosmat
+
+    name = _chosen(path, {name: shape for name, shape, _ in whosmat(path)}, variable)
+    return Histograms(values=np.asarray(loadmat(path, variable_names=[name], spmatrix=False)[name]))
+
+
+def _chosen(path: Path, shapes: dict[str, tuple[int, ...]], variable: str | None) -> str:
+    listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
+    if variable is not None:
+        if variable not in shapes:
+            raise FileError(f"{path}: no array {variable!r}; it holds {listed}")
+        return variable
+    cubes = {name: shape for name, shape in shapes.items() if len(shape) in (3, 4)}
+    if not cubes:
+        raise FileError(f"{path}: no array of three or four dimensions; it holds {listed}")
+    return max(cubes, key=lambda name: math.prod(cubes[name]))
+
+
+def _read_ptu(path: Path) -> Histograms:
+    import ptufile
+
+    with ptufile.PtuFile(path) as file:
+        if not file.is_t3 or not file.is_image:
+            raise FileError(f"{path}: not a T3 image; {file.measurement_mode.name}, {file.measurement_submode.name}")
+        image = file.decode_image(frame=-1, channel=-1, dtype=np.uint32, keepdims=False)
+        width = float(file.tcspc_resolution)
+        start = _own_gate(file)
+    if image.ndim == 2:  # a line scan
+        image = image[None]
+    return Histograms(values=np.ascontiguousarray(image), bin_width=width, gate_start=start)
+
+
+def _own_gate(file: Any) -> float:
+    """Time of flight at the start of bin 0 [s] as `spadwarp export` writes it in the comment; 0 for other writers."""
+    if file.tags.get("CreatorSW_Name") != "spadwarp":
+        return 0.0
+    found = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "")
+    return 1e-9 * float(found[1]) if found else 0.0

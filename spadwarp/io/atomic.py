@@ -1,0 +1,45 @@
+"""Files that appear whole or not at all, and the one file that is meant in a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from spadwarp.errors import FileError, SpadwarpError
+
+
+def file_within(place: str | Path, names: Sequence[str]) -> Path:
+    """A file itself, or the only one of `names` in a directory. Raises `FileError` where there are none or several."""
+    path = Path(place)
+    if not path.is_dir():
+        return path
+    found = [path / name for name in names if (path / name).is_file()]
+    if len(found) != 1:
+        what = " and ".join(one.name for one in found) if found else f"no {' and no '.join(names)}"
+        raise FileError(f"{path}: holds {what}; name the file")
+    return found[0]
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its name when the block ends well, and is removed when it does not.
+
+    What was at `path` stays untouched until then. Raises `FileError` where the folder or the file cannot be written.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except SpadwarpError:
+        raise
+    except (OSError, RuntimeError) as error:  # h5py and OpenEXR report a full disk as either
+        raise FileError(f"{target}: cannot be written: {error}") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()

@@ -1,0 +1,229 @@
+"""A result as one HDF5 file; its depth and truth as EXR."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.exr import read_exr, write_exr
+from spadwarp.io.hdf5 import hdf5_file
+
+if TYPE_CHECKING:
+    from spadwarp.result.result import Result, Truth
+
+__all__ = [
+    "FORMAT",
+    "FORMAT_VERSION",
+    "load_result",
+    "load_truth_exr",
+    "save_depth_exr",
+    "save_result",
+    "save_truth_exr",
+]
+
+FORMAT = "spadwarp result"
+FORMAT_VERSION = 1
+
+_CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
+_RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
+_TRUTH = ("depth", "range", "normal", "reflectance")
+_READ_ME = (
+    "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
+    "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
+    "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
+    "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
+    "time * 299792458 / group_index is the path in metres, laser to target to lens. "
+    "squares, if there: low and high 64 bits of the sum over photons / batch_size batches of the squared tally. "
+    "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
+    "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
+    "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
+    "in the camera frame."
+)
+
+
+def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Path:
+    """Writes a result to one HDF5 file from which `load_result` makes an equal one; returns its path.
+
+    Args:
+        result: What to write.
+        path: The file; an existing one is replaced when the new one is whole.
+        compression: Level of gzip, 1 (fast) to 9.
+
+    Raises:
+        FileError: The file cannot be written.
+    """
+    if not 1 <= compression <= 9:
+        raise ValueError(f"compression = {compression} is outside [1, 9]")
+    _, height, width, bins = result.tallies.shape
+    columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
+    rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
+    packed = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
+
+    with hdf5_file(path) as file:
+        file.attrs.update(
+            {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
+        )
+        file.create_dataset("tallies", data=result.tallies, chunks=(1, rows, columns, bins), **packed)
+        if result.squares is not None:
+            file.create_dataset("squares", data=result.squares, chunks=(1, rows, columns, bins), **packed)
+        file.create_dataset("bin_edges", data=result.bin_edges)
+        if result.scene.scan_positions > 1:
+            file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)
+        file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
+        file.create_dataset("requested", data=np.array(result.requested, dtype=np.uint64))
+        file.create_dataset("config", data=result.scene.to_toml())
+        for name in _RECORDS:
+            file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
+        for name in _TRUTH:
+            file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **packed)
+    return Path(path)
+
+
+def load_result(path: str | Path) -> Result:
+    """Reads what `save_result` wrote.
+
+    Raises:
+        FileError: No such file, not a spadwarp result, of a newer format version, or damaged; says which.
+    """
+    import h5py
+
+    from spadwarp.result.result import Result, Truth
+    from spadwarp.scene import Scene
+
+    if not Path(path).is_file():
+        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
+    if not h5py.is_hdf5(path):
+        raise FileError(f"{path}: not an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                kind = file.attrs.get("format", "unknown")
+                raise FileError(
+                    f"{path}: an HDF5 file, but not a spadwarp result: its format is {kind!r}, not {FORMAT!r}"
+                )
+            version = int(file.attrs["format_version"])
+            if version > FORMAT_VERSION:
+                raise FileError(
+                    f"{path}: format version {version} is newer than {FORMAT_VERSION}, the newest that can be read here"
+                )
+            source = file.attrs.get("source")
+            return Result(
+                scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=source),
+                tallies=file["tallies"][...],
+                unit=float(file.attrs["unit"]),
+                photons=int(file.attrs["photons"]),
+                seed=int(file.attrs["seed"]),
+                ledger_unit=float(file.attrs["ledger_unit"]),
+                partial=bool(file.attrs["partial"]),
+                batch_size=int(file.attrs.get("batch_size", 0)),
+                squares=file["squares"][...] if "squares" in file else None,
+                photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
+                requested=_requested(file),
+                truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
+                **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
+            )
+    except FileError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
+        raise FileError(f"{path}: not a whole spadwarp result: {error}") from error
+
+
+def _requested(file: Any) -> tuple[int, int]:
+    """Files of version 0.1.0 do not have it."""
+    if "requested" not in file:
+        return 0, 0
+    start, stop = file["requested"][...]
+    return int(start), int(stop)
+
+
+def _attributes(result: Result) -> dict[str, Any]:
+    """What a reader without spadwarp needs, in SI units."""
+    from spadwarp.result.result import COMPONENTS
+    from spadwarp.scene.intrinsics import camera_attributes
+
+    scene = result.scene
+    medium, laser, camera, detector, gate = scene.medium, scene.laser, scene.camera, scene.detector, scene.gate
+    values = {
+        "unit": result.unit,
+        "photons": result.photons,
+        "seed": str(result.seed),
+        "ledger_unit": result.ledger_unit,
+        "partial": result.partial,
+        "batch_size": result.batch_size,
+        "components": list(COMPONENTS),
+        "gate_start": gate.start,
+        "bin_width": gate.bin_width,
+        "absorption": medium.absorption,
+        "scattering": medium.scattering,
+        "extinction": medium.extinction,
+        "albedo": medium.albedo,
+        "phase_function": medium.phase_function,
+        "molecular_share": medium.molecular_share,
+        **medium.phase_parameters,
+        "group_index": medium.group_index,
+        "phase_index": medium.phase_index,
+        "laser_position": scene.beam.position,
+        "laser_axis": scene.beam.axis,
+        "laser_wavelength": laser.wavelength_nm * 1e-9,
+        "laser_pulse_energy": laser.pulse_energy,
+        "laser_repetition_rate": laser.repetition_rate,
+        "laser_photons_per_pulse": laser.photons_per_pulse,
+        "laser_pulse_fwhm": laser.pulse_fwhm_ps * 1e-12,
+        "camera_pixel_tangent": camera.pixel_tangent,
+        **camera_attributes(camera),
+        "scan": scene.scan.mode,
+        "camera_aperture_area": camera.aperture_area,
+        "detector_pde": detector.pde,
+        "detector_jitter_fwhm": detector.jitter_fwhm_ps * 1e-12,
+        "detector_irf": detector.irf,
+    }
+    return values if scene.source is None else {**values, "source": str(scene.source)}
+
+
+def save_truth_exr(result: Result, path: str | Path) -> Path:
+    """Truth maps as EXR: Z (planar depth [m]), range [m], N.X, N.Y, N.Z (camera frame), and reflectance in R, G and B.
+
+    NaN where nothing is hit. Raises `FileError`.
+    """
+    truth = result.truth
+    channels = {"Z": truth.depth, "range": truth.range}
+    channels |= {f"N.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
+    channels |= dict.fromkeys("RGB", truth.reflectance)
+    return write_exr(path, channels, {"content": "truth", "R G B": "reflectance", **_exr_notes(result)})
+
+
+def load_truth_exr(path: str | Path) -> Truth:
+    """Reads what `save_truth_exr` wrote. Raises `FileError`, also for an EXR without its channels."""
+    from spadwarp.result.result import Truth
+
+    channels, _ = read_exr(path)
+    needed = ("Z", "range", "N.X", "N.Y", "N.Z", "R")
+    if missing := [name for name in needed if name not in channels]:
+        raise FileError(f"{path}: not truth maps: no channel {', '.join(missing)} among {', '.join(channels)}")
+    depth, distance, *normal, reflectance = (channels[name].astype(np.float32) for name in needed)
+    return Truth(depth=depth, range=distance, normal=np.stack(normal, axis=-1), reflectance=reflectance)
+
+
+def save_depth_exr(result: Result, depth: ArrayLike, path: str | Path) -> Path:
+    """A depth frame of the result as EXR: Z (planar depth [m], NaN where nothing returned). Raises `FileError`."""
+    return write_exr(path, {"Z": depth}, {"content": "measured depth", **_exr_notes(result)})
+
+
+def _exr_notes(result: Result) -> dict[str, str | int | float]:
+    scene = result.scene
+    return {
+        "Z": "planar depth [m]",
+        "frame": "+x right, +y down, +z forward",
+        "pixel_tangent": scene.camera.pixel_tangent,
+        "photons": result.photons,
+        "seed": result.seed,
+        "config": scene.to_toml(),
+    }

@@ -1,0 +1,130 @@
+"""Photons added up: sums of integers, which depend neither on the order nor on who did which photons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.result.photon_ids import joined
+from spadwarp.result.result import Result, Truth
+from spadwarp.scene import Scene
+
+__all__ = ["Sums", "merge"]
+
+
+@dataclass
+class Sums:
+    """What photons have left in tallies, ledger and counters; the arrays as in `Result`."""
+
+    tallies: NDArray[np.int64]
+    ledger: dict[str, int]
+    counters: dict[str, int]
+    squares: NDArray[np.uint64] | None = None
+
+    @classmethod
+    def of(cls, result: Sums | Result) -> Sums:
+        """A copy, or the sums of a result, in arrays of their own."""
+        squares = None if result.squares is None else result.squares.copy()
+        return cls(result.tallies.copy(), dict(result.ledger), dict(result.counters), squares)
+
+    def add(self, other: Sums | Result) -> None:
+        """Adds the sums of other photons."""
+        self.tallies += other.tallies
+        self.ledger = {name: value + other.ledger[name] for name, value in self.ledger.items()}
+        self.counters = {name: value + other.counters[name] for name, value in self.counters.items()}
+        if self.squares is not None:
+            assert other.squares is not None
+            low, high = self.squares
+            low += other.squares[0]
+            high += other.squares[1]
+            high += low < other.squares[0]  # the carry
+
+
+def merge(results: Iterable[Result]) -> Result:
+    """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
+
+    The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is kept, with its ids, in
+    `provenance["parts"]`.
+
+    Raises:
+        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
+    """
+    parts = list(results)
+    if not parts:
+        raise ConfigError("merge: no results given")
+    first = parts[0]
+    for other in parts[1:]:
+        for name, a, b in (
+            ("scene", physics_of(first.scene), physics_of(other.scene)),
+            ("seed", first.seed, other.seed),
+            ("tally unit", first.unit, other.unit),
+            ("batch size", first.batch_size, other.batch_size),
+        ):
+            if a != b:
+                detail = f" ({a} and {b})"
+                if name == "scene":
+                    sections = [one for one in type(first.scene).model_fields if getattr(a, one) != getattr(b, one)]
+                    detail = f" in {', '.join(sections)}: only photons and output may differ"
+                raise ConfigError(f"merge: the {name} of the results differs{detail}")
+    try:
+        ranges = joined(r for part in parts for r in part.photon_ranges)
+    except ConfigError as error:
+        raise ConfigError(f"merge: {error}") from error
+    for other in parts[1:]:
+        check_targets(first.truth, other.truth, "merge")
+    check_capacity(np.sum([part.tallies.sum(axis=0, dtype=np.float64) for part in parts], axis=0))
+    total = Sums.of(first)
+    for other in parts[1:]:
+        total.add(other)
+    return replace(
+        first,
+        **vars(total),
+        photons=sum(part.photons for part in parts),
+        timing=add_timing(part.timing for part in parts),
+        provenance=join_provenance(parts),
+        partial=any(part.partial for part in parts),
+        photon_ranges=ranges,
+        requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
+    )
+
+
+def add_timing(timings: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Seconds of each stage, of all parts together."""
+    parts = list(timings)
+    return {name: sum(part.get(name, 0.0) for part in parts) for name in parts[0]}
+
+
+def join_provenance(parts: Iterable[Result]) -> dict[str, Any]:
+    """The first part's provenance, and under `parts` that of each with its photon ids."""
+    each: list[dict[str, Any]] = []
+    for part in parts:
+        own = dict(part.provenance)
+        each += own.pop("parts", None) or [{**own, "photon_ranges": [list(ids) for ids in part.photon_ranges]}]
+    head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
+    return head if len(each) == 1 else {**head, "parts": each}
+
+
+def check_capacity(total: NDArray[np.float64]) -> None:
+    """Raises `SpadwarpError` where a bin's sum over components leaves the range of its 64-bit integer."""
+    if total.size and (total.max() >= 2.0**62 or total.min() < 0.0):
+        raise SpadwarpError(
+            "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at "
+            "a time and add up their histograms"
+        )
+
+
+def check_targets(a: Truth, b: Truth, what: str) -> None:
+    """Raises `ConfigError` where two truth maps are not of the same targets."""
+    if not np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True):
+        raise ConfigError(f"{what}: the targets of the results differ, by their truth maps: was a mesh file changed?")
+
+
+def physics_of(scene: Scene) -> Scene:
+    """The scene without what does not change a photon's history."""
+    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
+    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})

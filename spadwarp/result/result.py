@@ -1,0 +1,360 @@
+"""What a simulation leaves: photon histograms, the energy ledger and the truth of the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.errors import ConfigError
+from spadwarp.scene import SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from spadwarp.frames.arrival_time import Method
+    from spadwarp.scene import Camera, Scene
+
+__all__ = ["COMPONENTS", "Component", "Result", "Truth", "pixel_directions", "range_from_path"]
+
+Component = Literal["ballistic", "forward_scattered", "backscatter"]
+COMPONENTS: tuple[Component, ...] = ("ballistic", "forward_scattered", "backscatter")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Truth:
+    """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing.
+
+    Attributes:
+        depth: float32 `[H, W]`, planar depth z [m].
+        range: float32 `[H, W]`, distance along the line of sight [m].
+        normal: float32 `[H, W, 3]`, unit normal on the camera's side, in the camera frame.
+        reflectance: float32 `[H, W]`, Lambertian reflectance in [0, 1].
+    """
+
+    depth: NDArray[np.float32]
+    range: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        shape = self.depth.shape
+        for name, expected in {"depth": shape, "range": shape, "normal": (*shape, 3), "reflectance": shape}.items():
+            array = getattr(self, name)
+            if len(shape) != 2 or array.shape != expected or array.dtype != np.float32:
+                raise ValueError(f"truth.{name} is {array.dtype} {array.shape}; float32 {expected} is needed")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Result:
+    """Expected photon histograms of one scene, exact in fixed point, with what is needed to read them alone.
+
+    Attributes:
+        scene: The scene that was simulated.
+        tallies: int64 `[3, H, W, T]` in the order of `COMPONENTS`; value = tally · unit / photons, see `tally_value`.
+        unit: Fraction of one emitted photon per tally unit, a power of two.
+        photons: Emitted photons, > 0.
+        seed: 64-bit seed of the run.
+        ledger: Where the emitted weight went, in units of `ledger_unit` photons. Entries are differences of fixed-point
+            weights (before − after; a gain is negative), so that their sum is the emitted weight exactly.
+        ledger_unit: Photons per ledger unit, a power of two.
+        counters: Numbers of events and of contributions that were clipped; light before and after the gate in tally
+            units (`guided` aims inside the gate and counts there what its surfaces score alone).
+        truth: Depth, range, normal and reflectance at pixel centres.
+        timing: Seconds of each stage.
+        provenance: Versions, device and date.
+        partial: Whether the run was stopped early; `photons` then counts what was done.
+        photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
+        requested: The ids [start, stop) that were asked for, which a run that was stopped early has only in part.
+        batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
+        squares: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally, summed
+            over components; None without batches.
+    """
+
+    scene: Scene
+    tallies: NDArray[np.int64]
+    unit: float
+    photons: int
+    seed: int
+    ledger: Mapping[str, int]
+    ledger_unit: float
+    counters: Mapping[str, int]
+    truth: Truth
+    timing: Mapping[str, float] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    partial: bool = False
+    photon_ranges: Sequence[tuple[int, int]] = ()
+    batch_size: int = 0
+    squares: NDArray[np.uint64] | None = None
+    requested: tuple[int, int] = (0, 0)
+
+    def __post_init__(self) -> None:
+        if not self.photon_ranges:
+            object.__setattr__(self, "photon_ranges", ((0, self.photons),))
+        if self.requested == (0, 0):
+            object.__setattr__(self, "requested", (self.photon_ranges[0][0], self.photon_ranges[-1][1]))
+        camera, gate = self.scene.camera, self.scene.gate
+        shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
+        if self.tallies.dtype != np.int64 or self.tallies.shape != shape:
+            raise ValueError(f"tallies are {self.tallies.dtype} {self.tallies.shape}; int64 {shape} is needed")
+        if self.truth.depth.shape != shape[1:3]:
+            raise ValueError(f"truth.depth has shape {self.truth.depth.shape}; {shape[1:3]} is needed")
+        counted = sum(stop - start for start, stop in self.photon_ranges)
+        if self.photons <= 0 or counted != self.photons:
+            raise ValueError(f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed")
+        if self.squares is not None:
+            expected = (2, *shape[1:])
+            if self.squares.dtype != np.uint64 or self.squares.shape != expected:
+                raise ValueError(f"squares are {self.squares.dtype} {self.squares.shape}; uint64 {expected} is needed")
+            if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
+                raise ValueError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
+        for name in ("unit", "ledger_unit"):
+            value = getattr(self, name)
+            if not (value > 0 and math.frexp(value)[0] == 0.5):
+                raise ValueError(f"{name} = {value} is not a power of two")
+
+    # Histograms
+
+    @cached_property
+    def histogram(self) -> NDArray[np.float64]:
+        """Expected fraction of emitted photons that arrive in each pixel and bin: float64 `[H, W, T]`, read-only."""
+        total = self._fraction(self.tallies.sum(axis=0))
+        total.flags.writeable = False
+        return total
+
+    def component(self, name: Component) -> NDArray[np.float64]:
+        """One part of the histogram, float64 `[H, W, T]`.
+
+        `"ballistic"`: one surface and no collision. `"forward_scattered"`: every other history with a surface.
+        `"backscatter"`: water alone. Their sum is the histogram (eq 2).
+        """
+        if name not in COMPONENTS:
+            raise ValueError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
+        return self._fraction(self.tallies[COMPONENTS.index(name)])
+
+    @property
+    def detections(self) -> NDArray[np.float64]:
+        """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
+        return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detector.pde)
+
+    @cached_property
+    def tally_value(self) -> NDArray[np.float64]:
+        """Expected fraction of emitted photons per tally unit, float64 `[H, W]`: unit / photons.
+
+        In a scan, of the photons that were emitted while the beam was at the pixel's own position.
+        """
+        return self.unit / photons_per_position(self.scene, self.photon_ranges)
+
+    @property
+    def intensity(self) -> NDArray[np.float64]:
+        """Expected fraction of emitted photons that arrive in each pixel within the gate: float64 `[H, W]`."""
+        return self.tallies.sum(axis=(0, 3), dtype=np.float64) * self.tally_value
+
+    def _fraction(self, tallies: NDArray[np.int64]) -> NDArray[np.float64]:
+        return tallies * self.tally_value[..., None]
+
+    # Errors
+
+    @cached_property
+    def standard_error(self) -> NDArray[np.float64]:
+        """Standard error of `histogram` from the spread between batches, float64 `[H, W, T]`.
+
+        Raises:
+            ConfigError: The run kept no batches, or only one.
+        """
+        if self.squares is None or self.photons < 2 * self.batch_size:
+            raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
+        count = self.photons // self.batch_size
+        total = self.tallies.sum(axis=0).astype(np.float64)
+        squares = self.squares[1] * 2.0**64 + self.squares[0]
+        variance = np.maximum(squares - total**2 / count, 0.0) / (count - 1)
+        return np.sqrt(count * variance) * self.tally_value[..., None]
+
+    @property
+    def relative_error(self) -> float:
+        """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
+        the pixels in which anything returned. Infinite if nothing did."""
+        peak = self.histogram.argmax(axis=2)[..., None]
+        value = np.take_along_axis(self.histogram, peak, axis=2)[..., 0]
+        error = np.take_along_axis(self.standard_error, peak, axis=2)[..., 0]
+        returned = value > 0
+        return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
+
+    # The time axis
+
+    @property
+    def bin_edges(self) -> NDArray[np.float64]:
+        """Edges of the bins in time of flight [s], `[T + 1]`; bin k covers [edge k, edge k + 1)."""
+        gate = self.scene.gate
+        return gate.start + gate.bin_width * np.arange(gate.bins + 1, dtype=np.float64)
+
+    @property
+    def bin_centres(self) -> NDArray[np.float64]:
+        """Centres of the bins in time of flight [s], `[T]`."""
+        gate = self.scene.gate
+        return gate.start + gate.bin_width * (np.arange(gate.bins, dtype=np.float64) + 0.5)
+
+    @property
+    def path_edges(self) -> NDArray[np.float64]:
+        """Edges of the bins in geometric path, laser to target to lens [m], `[T + 1]`."""
+        return self.bin_edges * np.float64(self.water_speed)
+
+    @property
+    def water_speed(self) -> float:
+        """Speed at which a pulse travels, c0 / group index [m/s]."""
+        return SPEED_OF_LIGHT / self.scene.medium.group_index
+
+    # Depth
+
+    def depth(
+        self, *, method: Method = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
+    ) -> NDArray[np.float64]:
+        """Depth frame [m], float64 `[H, W]`; NaN where nothing returned.
+
+        Args:
+            method: `"peak"`, `"centroid"`, `"matched"` or `"likelihood"`; see `spadwarp.arrival_time`, which also
+                takes `options` (`irf`, `background`, `gate`, `device`).
+            quantity: `"depth"` is planar, z; `"range"` runs along the line of sight.
+        """
+        from spadwarp.frames.arrival_time import arrival_time
+
+        if quantity not in ("depth", "range"):
+            raise ValueError(f"quantity = {quantity!r} is not 'depth' or 'range'")
+        gate = self.scene.gate
+        time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
+        directions = pixel_directions(self.scene.camera)
+        distance = range_from_path(time * self.water_speed, directions, self.scene.beam.position)
+        return distance * directions[..., 2] if quantity == "depth" else distance
+
+    def true_path(self) -> NDArray[np.float64]:
+        """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
+        distance = self.truth.range.astype(np.float64)
+        points = distance[..., None] * pixel_directions(self.scene.camera)
+        return np.linalg.norm(points - np.asarray(self.scene.beam.position), axis=-1) + distance
+
+    # Accounts
+
+    def ledger_report(self) -> dict[str, Any]:
+        """The energy ledger as fractions of the emitted weight, and whether it closes.
+
+        Returns:
+            `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum of
+            the entries, in ledger units, from integers) and `exact` (whether it is 0).
+        """
+        emitted = round(self.photons / self.ledger_unit)
+        difference = emitted - sum(self.ledger.values())
+        return {
+            "emitted": self.photons,
+            "fractions": {name: entry / emitted for name, entry in self.ledger.items()},
+            "difference": difference,
+            "exact": difference == 0,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What is in the result and how it was made, in plain numbers and text that JSON can hold."""
+        scene, truth = self.scene, self.truth.depth
+        seen = np.isfinite(truth)
+        # In floating point: the unit keeps each bin below 2^62, not their sum.
+        fractions = self.tallies.sum(axis=(1, 2, 3), dtype=np.float64) * (self.unit / self.photons)
+        return {
+            "scene": str(scene.source) if scene.source else None,
+            "photons": self.photons,
+            "seed": self.seed,
+            "partial": self.partial,
+            "image": {"width": scene.camera.width, "height": scene.camera.height},
+            "gate": {
+                "start_ns": scene.gate.start * 1e9,
+                "bin_width_ps": scene.gate.bin_width * 1e12,
+                "bins": scene.gate.bins,
+                "path_m": [float(self.path_edges[0]), float(self.path_edges[-1])],
+            },
+            "medium": {
+                "absorption": scene.medium.absorption,
+                "scattering": scene.medium.scattering,
+                "extinction": scene.medium.extinction,
+                "albedo": scene.medium.albedo,
+                "phase_function": scene.medium.phase_function,
+                **scene.medium.phase_parameters,
+                "group_index": scene.medium.group_index,
+                **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
+            },
+            "collected_fraction": dict(zip(COMPONENTS, map(float, fractions), strict=True)),
+            "detections_per_pulse": float(fractions.sum() * scene.laser.photons_per_pulse * scene.detector.pde),
+            "pixels_with_return": int(np.count_nonzero(self.tallies.any(axis=(0, 3)))),
+            "truth": {
+                "pixels": int(seen.sum()),
+                "depth_m": [float(truth[seen].min()), float(truth[seen].max())] if seen.any() else None,
+            },
+            "ledger": self.ledger_report(),
+            "counters": dict(self.counters),
+            "timing": dict(self.timing),
+            "provenance": dict(self.provenance),
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Writes everything to one HDF5 file that `spadwarp.load_result` reads back bit for bit; returns its path."""
+        from spadwarp.result.file import save_result
+
+        return save_result(self, path)
+
+
+def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
+    at least."""
+    shape = (scene.camera.height, scene.camera.width)
+    if scene.scan_positions == 1:
+        return np.full(shape, float(sum(stop - start for start, stop in photon_ranges)))
+    pixels = shape[0] * shape[1]
+    position = np.arange(pixels)
+    count = np.zeros(pixels)
+    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
+        count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
+    return np.maximum(count, 1.0).reshape(shape)
+
+
+def pixel_directions(camera: Camera) -> NDArray[np.float64]:
+    """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
+    from spadwarp.scene.intrinsics import image_tangents
+
+    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
+    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def scan_axes(scene: Scene) -> NDArray[np.float64]:
+    """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
+
+    From the laser to the point of the line of sight at `scan.distance`; parallel to it where that is infinite.
+    """
+    view = pixel_directions(scene.camera)
+    if math.isinf(scene.scan.distance):
+        return view
+    axes = scene.scan.distance * view - np.asarray(scene.beam.position)
+    return axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+
+
+def range_from_path(path: ArrayLike, directions: ArrayLike, laser_position: ArrayLike) -> NDArray[np.float64]:
+    """Distance along a line of sight at which light has gone `path` from the laser by the target to the lens.
+
+    The points of one path lie on an ellipsoid with laser p and lens 0 as foci. |r·u − p| + r = L has one solution along
+    u: r = (L² − |p|²) / (2 (L − u·p)). For a laser in the lens it is L/2.
+
+    Args:
+        path: Geometric path L [m], any shape.
+        directions: Unit vectors u from the lens, `[..., 3]`, broadcast against `path`.
+        laser_position: p [m], `[3]`.
+
+    Returns:
+        Range r [m]; NaN where L is NaN or too short to go from laser to lens.
+    """
+    length = np.asarray(path, dtype=np.float64)
+    laser = np.asarray(laser_position, dtype=np.float64)
+    baseline = np.linalg.norm(laser)
+    possible = length > baseline
+    safe = np.where(possible, length, baseline + 1.0)  # keeps the unused branch free of 0/0
+    distance = (safe - baseline) * (safe + baseline) / (2.0 * (safe - np.asarray(directions) @ laser))
+    return np.where(possible, distance, np.nan)

@@ -1,0 +1,1 @@
+"""Run directories, and files of any kind that spadwarp writes."""

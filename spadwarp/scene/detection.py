@@ -1,0 +1,82 @@
+"""The sections `detector` and `gate`."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field, field_validator
+
+from spadwarp.scene.sections import Section, Whole
+
+
+class Detector(Section):
+    """The SPAD array and its timing electronics."""
+
+    section: ClassVar[str] = "detector"
+    preset: str | None = Field(None, description="a named detector, see `spadwarp presets detector`")
+    pdp: float = Field(0.247, ge=0, le=1, description="photon detection probability of the active area")
+    fill_factor: float = Field(0.2, gt=0, le=1, description="active part of a pixel's area, microlenses included")
+    jitter_fwhm_ps: float = Field(200.0, ge=0, description="timing jitter, full width at half maximum [ps]")
+    irf: str = Field(
+        "gaussian",
+        description='instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file',
+    )
+    irf_tail_ps: float = Field(100.0, gt=0, description="time constant of the exponential tail [ps]")
+    dark_count_rate: float = Field(100.0, ge=0, description="median dark counts per second and pixel [1/s]")
+    dark_count_spread: float = Field(
+        0.0, ge=0, description="relative (log-normal) spread of the dark count rate over pixels"
+    )
+    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="part of the pixels that are hot")
+    hot_pixel_rate: float = Field(1e4, ge=0, description="dark count rate of a hot pixel [1/s]")
+    ambient_rate: float = Field(0.0, ge=0, description="detected background counts per second and pixel [1/s]")
+    mode: Literal["first_photon", "free_running"] = Field(
+        "first_photon", description="one count a pulse, or as many as come"
+    )
+    dead_time_ns: float = Field(0.0, ge=0, description="dead time after a count, free-running [ns]")
+    afterpulsing_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count causes another")
+    afterpulsing_time_constant_ns: float = Field(50.0, gt=0, description="decay time of afterpulsing [ns]")
+    crosstalk_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count fires a neighbour")
+    fold: bool = Field(True, description="fold time modulo the pulse period, as a detector sees it")
+    pulses: Whole = Field(20_000, ge=1, le=2**63 - 1, description="pulses in one exposure")
+    counter_depth: Whole = Field(
+        0, ge=0, le=2**31 - 1, description="largest count a histogram bin holds; 0 is unlimited"
+    )
+
+    @field_validator("irf")
+    @classmethod
+    def _known_irf(cls, value: str) -> str:
+        if value not in (names := ("gaussian", "exponentially_modified_gaussian")) and not value.lower().endswith(
+            ".csv"
+        ):
+            raise ValueError("choice", names, "the path of a .csv file")
+        return value
+
+    @property
+    def pde(self) -> float:
+        """Photon detection efficiency: PDP × fill factor."""
+        return self.pdp * self.fill_factor
+
+
+class Gate(Section):
+    """The time bins after the pulse leaves the laser."""
+
+    section: ClassVar[str] = "gate"
+    preset: str | None = Field(None, description="named electronics, see `spadwarp presets gate`")
+    start_ns: float = Field(0.0, ge=0, description="begin of the first bin [ns]")
+    bin_width_ps: float = Field(..., gt=0, description="width of a bin [ps]")
+    bins: Whole = Field(..., ge=1, le=1_000_000, description="number of bins")
+
+    @property
+    def start(self) -> float:
+        """Begin of the first bin [s]."""
+        return self.start_ns * 1e-9
+
+    @property
+    def bin_width(self) -> float:
+        """[s]."""
+        return self.bin_width_ps * 1e-12
+
+    @property
+    def stop(self) -> float:
+        """End of the last bin [s]."""
+        return self.start + self.bins * self.bin_width

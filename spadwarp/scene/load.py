@@ -1,0 +1,270 @@
+"""How a scene's tables are put together: presets, file, overrides; and how they are written back.
+
+Everything here works on plain dicts as `tomllib` gives them. A later layer wins field by field, except where fields
+exclude each other: there a later one displaces the earlier ones (`merge_section`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from spadwarp.errors import ConfigError
+from spadwarp.scene.presets import PRESETS
+
+Table = dict[str, Any]
+Key = tuple[str | int, ...]
+
+COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
+
+# Overriding one coefficient of a complete medium keeps this other one.
+_KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
+
+_INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
+
+# Setting a field in a later layer drops these fields of the earlier ones.
+_DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
+    "medium": {
+        **dict.fromkeys(COEFFICIENTS, ("chlorophyll",)),
+        "chlorophyll": (*COEFFICIENTS, "preset"),
+        "temperature": ("phase_index", "group_index"),
+        "salinity": ("phase_index", "group_index"),
+        "phase_function": ("g1", "g2", "alpha", "phase_table"),
+    },
+    "camera": {
+        "horizontal_fov_deg": ("pixel_pitch_um", *_INTRINSICS),
+        "pixel_pitch_um": ("horizontal_fov_deg", *_INTRINSICS),
+        "fx": ("horizontal_fov_deg", "pixel_pitch_um"),
+        "calibration": ("horizontal_fov_deg", "pixel_pitch_um", *_INTRINSICS, "distortion"),
+        "aperture_diameter": ("f_number",),
+        "f_number": ("aperture_diameter",),
+    },
+    "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
+}
+
+
+def complete_medium(pair: Mapping[str, Any]) -> Table:
+    """All four coefficients from exactly two of them, the given ones as they are.
+
+    With `albedo = "paper"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
+    Raises `ValueError` whose text names field, value and range, without the section.
+    """
+    if len(pair) != 2:
+        given = ", ".join(pair) or "none"
+        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
+    a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
+    if albedo == "paper":
+        if c is None:
+            raise ValueError("albedo = 'paper' goes with extinction only")
+        return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
+    if albedo is not None:
+        if c is None:
+            rest = albedo if a is None else 1.0 - albedo
+            if rest <= 0.0:
+                raise ValueError(f"albedo = {albedo} leaves the extinction undetermined; give extinction and albedo")
+            c = (b if a is None else a) / rest
+        a = c * (1.0 - albedo) if a is None else a
+        b = c * albedo if b is None else b
+    elif c is None:
+        c = a + b
+    else:
+        part, value = ("scattering", b) if a is None else ("absorption", a)
+        if value > c:
+            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
+        a = c - b if a is None else a
+        b = c - a if b is None else b
+    if not c > 0.0:
+        raise ValueError(f"extinction = {c} is outside (0, inf)")
+    return {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c if albedo is None else albedo}
+
+
+def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any]) -> Table:
+    """`layer` on top of `base`; a preset in the layer stands for the fields that it gives, beneath the layer's own.
+
+    A value of None takes the field back to its default.
+    """
+    preset = PRESETS.get(section, {}).get(str(layer.get("preset")))
+    if preset is not None:
+        base = merge_section(section, base, preset.values)
+    merged = dict(base)
+    if section == "medium":
+        _merge_coefficients(merged, layer)
+    displaces = _DISPLACES.get(section, {})
+    for name, value in layer.items():
+        if value is not None:
+            for displaced in displaces.get(name, ()):
+                merged.pop(displaced, None)
+    merged.update(layer)
+    dropped = [name for name, value in layer.items() if value is None]
+    for name in dropped:
+        del merged[name]
+    current = PRESETS.get(section, {}).get(str(merged.get("preset")))
+    if current is not None and any(name in current.values for name in dropped):
+        del merged["preset"]  # no longer that preset
+    return merged
+
+
+def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:
+    """Drops from `merged` the coefficients that the layer replaces; a clash is left for validation to report."""
+    new = [name for name in COEFFICIENTS if layer.get(name) is not None]
+    old = {name: merged[name] for name in COEFFICIENTS if name in merged}
+    keep = {}
+    if len(new) == 1:
+        kept = _KEEPS[new[0]]
+        if len(old) < 2 or (old.get("albedo") == "paper" and kept not in old and new[0] not in old):
+            return
+        try:
+            keep[kept] = old[kept] if kept in old else complete_medium(old)[kept]
+        except (TypeError, ValueError):
+            return
+    if new:
+        for name in old:
+            del merged[name]
+        merged.update(keep)
+
+
+def merge_scene(base: Mapping[str, Any], layer: Mapping[str, Any]) -> Table:
+    """`layer` on top of `base`, section by section; `targets` may be a list, which replaces, or `{index: fields}`.
+
+    Raises `ConfigError` for an index that is neither a target's nor the next free one.
+    """
+    merged = dict(base)
+    for section, fields in layer.items():
+        old = merged.get(section)
+        if section == "targets" and isinstance(fields, Mapping):
+            targets = list(old) if isinstance(old, Sequence) else []
+            for index, target in sorted(fields.items()):
+                if index > len(targets):
+                    raise ConfigError(f"targets[{index}] does not exist; the scene has {len(targets)}")
+                targets[index : index + 1] = [merge_section("targets", dict(*targets[index : index + 1]), target)]
+            merged[section] = targets
+        elif isinstance(fields, Mapping):
+            whole = merge_section(section, {}, old) if isinstance(old, Mapping) else {}  # its own preset first
+            merged[section] = merge_section(section, whole, fields)
+        else:
+            merged[section] = fields
+    return merged
+
+
+def parse_override(text: str) -> tuple[Key, Any]:
+    """The key and the value of one `section.field=value`.
+
+    The value is in TOML syntax; what is not TOML is taken as a bare string. Targets are written
+    `targets[0].reflectance` or `targets.0.reflectance`. `parse_override("medium.extinction=0.9")` is
+    `(("medium", "extinction"), 0.9)`. Raises `ConfigError`.
+    """
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals or not value:
+        raise ConfigError(f"override {text!r} is not of the form section.field=value")
+    return parse_key(name), _parse_value(value, text)
+
+
+def parse_key(name: str) -> Key:
+    """`("targets", 0, "reflectance")` from `targets[0].reflectance` or `targets.0.reflectance`.
+
+    Raises `ConfigError`.
+    """
+    parts = re.sub(r"\[(\d+)\]", r".\1", name).split(".")
+    if not all(re.fullmatch(r"\w+", part) for part in parts) or parts[0].isdigit():
+        raise ConfigError(f"override {name!r} does not name a field; write section.field or targets[0].field")
+    return tuple(int(part) if part.isdigit() else part for part in parts)
+
+
+def _parse_value(value: str, text: str) -> Any:
+    try:
+        table = tomllib.loads(f"value = {value}")
+    except tomllib.TOMLDecodeError as error:
+        if re.fullmatch(r"[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?", value):
+            return float(value)  # .9 and 5. are not TOML, but nobody means text by them
+        if value[0] in "\"'[{":
+            raise ConfigError(f"override {text!r}: the value is not valid TOML: {error}") from None
+        return value
+    return table["value"] if len(table) == 1 else value
+
+
+def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> Table:
+    """A layer for `merge_scene` from `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings.
+
+    Raises `ConfigError`.
+    """
+    if isinstance(overrides, str):
+        overrides = [overrides]
+    pairs: Iterator[tuple[Key, Any]]
+    if isinstance(overrides, Mapping):
+        pairs = ((parse_key(str(name)), value) for name, value in overrides.items())
+    else:
+        pairs = (parse_override(text) for text in overrides)
+    layer: Table = {}
+    for key, value in pairs:
+        for leaf, leaf_value in _leaves(key, value):
+            _insert(layer, leaf, leaf_value)
+    return layer
+
+
+def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:
+    """The fields of a value that may be a section, a target or all targets as nested mappings."""
+    if isinstance(value, Mapping) and len(key) < (3 if key[0] == "targets" else 2):
+        for name, inner in value.items():
+            yield from _leaves((*key, int(name) if str(name).isdigit() else str(name)), inner)
+    else:
+        yield key, value
+
+
+def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
+    shape = tuple(map(type, key))
+    if shape == (str,):
+        layer[key[0]] = value
+        return
+    fields = layer.setdefault(key[0], {})
+    if shape == (str, int, str) and key[0] == "targets" and isinstance(fields, dict):
+        fields.setdefault(key[1], {})[key[2]] = value
+    elif shape == (str, str) and key[0] != "targets" and isinstance(fields, dict):
+        fields[key[1]] = value
+    else:
+        raise ConfigError(f"override {key_text(key)!r} does not name a field; write section.field or targets[0].field")
+
+
+def key_text(key: Sequence[str | int]) -> str:
+    """`targets[0].reflectance` from `("targets", 0, "reflectance")`."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).removeprefix(".")
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """TOML of a scene: flat tables, and lists of flat tables for `targets` and `medium.layers`."""
+    return "\n\n".join(block for section, fields in tables.items() for block in _toml_blocks(section, fields)) + "\n"
+
+
+def _toml_blocks(section: str, fields: Any) -> Iterator[str]:
+    tables, header = (fields, f"[[{section}]]") if isinstance(fields, list) else ([fields], f"[{section}]")
+    for table in tables:
+        inner = {name: value for name, value in table.items() if isinstance(value, list) and _are_tables(value)}
+        yield "\n".join([header, *(f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner)])
+        for name, value in inner.items():
+            yield from _toml_blocks(f"{section}.{name}", value)
+
+
+def _are_tables(value: list[Any]) -> bool:
+    return bool(value) and all(isinstance(one, Mapping) for one in value)
+
+
+def toml_value(value: Any) -> str:
+    """A boolean, number, string or list as TOML writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + "".join(_ESCAPES.get(char) or _escape(char) for char in value) + '"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)  # inf, -inf, nan are TOML's own words
+    return repr(value)
+
+
+_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+
+
+def _escape(char: str) -> str:
+    return f"\\u{ord(char):04x}" if ord(char) < 0x20 or ord(char) == 0x7F else char

@@ -1,0 +1,266 @@
+"""The sections `medium` and `medium.layers`."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
+
+from spadwarp.scene import load as _layers
+from spadwarp.scene.optics import Laser
+from spadwarp.scene.presets import PHASE_TABLES, PRESETS, WATER_INDICES
+from spadwarp.scene.sections import Section, Vector, listed
+
+
+class _Water(Section):
+    """What water does to light: two of four coefficients, or chlorophyll, from which they follow."""
+
+    section: ClassVar[str] = "medium"
+    preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
+    absorption: float = Field(0.0, ge=0, description="absorption coefficient a [1/m]")
+    scattering: float = Field(0.0, ge=0, description="scattering coefficient b [1/m]")
+    extinction: float = Field(0.0, gt=0, description="extinction (beam attenuation) coefficient c = a + b [1/m]")
+    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["paper"] = Field(
+        0.0,
+        description='single-scattering albedo b/c, or "paper": uniform in (0, 0.97) at each collision',
+    )
+    chlorophyll: float | None = Field(
+        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        if self.chlorophyll is None:
+            self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
+        elif self.given or self.preset is not None:
+            raise ValueError(f"chlorophyll = {self.chlorophyll} goes without {', '.join(self.given or ['preset'])}")
+        return self
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Names of the two coefficients that define the water, none with chlorophyll; the others follow."""
+        return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
+
+    @property
+    def attenuation_length(self) -> float:
+        """1/c [m]."""
+        return 1.0 / self.extinction
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again: of the coefficients the given ones."""
+        hidden = set(_layers.COEFFICIENTS) - set(self.given)
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
+
+
+class Layer(_Water):
+    """Water from a plane on, up to the next layer; given as a medium is."""
+
+    start: float = Field(..., description="where it begins along `layer_axis`, the world's z if not given [m]")
+    anisotropy: float | None = Field(
+        None,
+        gt=-1,
+        lt=1,
+        description="henyey_greenstein: mean cosine of the scattering angle; default: the medium's",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        whole = _layers.merge_section(cls.section, {}, fields)
+        # A preset has indices, but one pair of them holds for all layers: the medium's.
+        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
+
+
+# Fields that a phase function needs and no other takes.
+_PHASE_FIELDS = {"two_term_henyey_greenstein": ("g1", "g2", "alpha"), "tabulated": ("phase_table",)}
+
+
+class Medium(_Water):
+    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
+
+    What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene). With
+    `layers` it is the water before the first of them.
+    """
+
+    phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = Field(
+        "henyey_greenstein", description="law of the scattering angle"
+    )
+    anisotropy: float = Field(
+        0.924, gt=-1, lt=1, description="henyey_greenstein: mean cosine g of the scattering angle"
+    )
+    g1: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the first term")
+    g2: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the second term")
+    alpha: float | None = Field(None, ge=0, le=1, description="two_term_henyey_greenstein: weight of the first term")
+    particle_index: float = Field(
+        1.10, gt=1, le=1.35, description="fournier_forand: index n of the particles over that of the water"
+    )
+    junge_slope: float = Field(3.5835, ge=3.05, lt=5, description="fournier_forand: slope µ of the size distribution")
+    phase_table: str | None = Field(
+        None,
+        description="tabulated: the path of a .csv file of angle [°] and value of any scale, or "
+        + " or ".join(f'"{name}"' for name in PHASE_TABLES),
+    )
+    group_index: float = Field(
+        WATER_INDICES["seawater"][1],
+        ge=1,
+        le=3,
+        description='index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566',
+    )
+    phase_index: float = Field(
+        WATER_INDICES["seawater"][0],
+        ge=1,
+        le=3,
+        description='refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350',
+    )
+    temperature: float | None = Field(
+        None, ge=0, le=30, description="gives the indices that are not given, with salinity 35 [°C]"
+    )
+    salinity: float | None = Field(None, ge=0, le=40, description="the same, with temperature 20 [g/kg]")
+    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = Field(
+        (), description="other waters further along `layer_axis`, in its order"
+    )
+    layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers, in the world; not 0")
+    _molecular_share: float = PrivateAttr(0.0)
+
+    @field_validator("phase_index", "group_index", mode="before")
+    @classmethod
+    def _named_index(cls, value: Any, info: Any) -> Any:
+        if isinstance(value, str):
+            if value not in WATER_INDICES:
+                raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
+            return WATER_INDICES[value][info.field_name == "group_index"]
+        return value
+
+    @field_validator("phase_table")
+    @classmethod
+    def _known_table(cls, value: str | None) -> str | None:
+        if value is not None and value not in PHASE_TABLES and not value.lower().endswith(".csv"):
+            raise ValueError("choice", tuple(PHASE_TABLES), "the path of a .csv file")
+        return value
+
+    @model_validator(mode="after")
+    def _fields_of_the_phase_function(self) -> Self:
+        for law, names in _PHASE_FIELDS.items():
+            missing = [name for name in names if getattr(self, name) is None]
+            if law == self.phase_function and missing:
+                raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
+            if law != self.phase_function and len(missing) < len(names):
+                given = next(name for name in names if name not in missing)
+                raise ValueError(f"{given} = {getattr(self, given)!r} goes with phase_function = {law!r} only")
+        return self
+
+    @model_validator(mode="after")
+    def _resolved(self) -> Self:
+        if not any(self.layer_axis):
+            raise ValueError(f"layer_axis = {list(self.layer_axis)} has no length")
+        for i, layer in enumerate(self.layers):
+            if i and layer.start <= self.layers[i - 1].start:
+                before = self.layers[i - 1].start
+                raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
+            if (layer.albedo == "paper") != (self.albedo == "paper"):
+                raise ValueError(
+                    f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
+                )
+            # A preset may bring one with it, which is no more than what the medium's own preset may.
+            own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
+            if self.phase_function != "henyey_greenstein" and layer.anisotropy not in (None, own):
+                raise ValueError(
+                    f"layers[{i}].anisotropy = {layer.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
+                    " layers share any other"
+                )
+        self._follow(Laser.model_fields["wavelength_nm"].default)
+        return self
+
+    def _follow(self, wavelength_nm: float) -> None:
+        """Sets what depends on the wavelength."""
+        from spadwarp.water.seawater import water_optics
+
+        temperature = 20.0 if self.temperature is None else self.temperature
+        salinity = 35.0 if self.salinity is None else self.salinity
+
+        self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
+        for water in self.waters:
+            names = [] if water.chlorophyll is None else [*_layers.COEFFICIENTS]
+            if water is self and self.follows_wavelength:
+                names += [name for name in ("phase_index", "group_index") if name not in self.model_fields_set]
+            if not names:
+                continue
+            optics = water_optics(
+                wavelength_nm, chlorophyll=water.chlorophyll or 0.0, temperature=temperature, salinity=salinity
+            )
+            water.__dict__.update({name: getattr(optics, name) for name in names})
+            if water is self and self.chlorophyll is not None and not self.layers:
+                self._molecular_share = optics.water_scattering / optics.scattering
+
+    @property
+    def phase_parameters(self) -> dict[str, float | str]:
+        """The fields that `phase_function` takes."""
+        names = {"henyey_greenstein": ("anisotropy",), "fournier_forand": ("particle_index", "junge_slope")}
+        return {name: getattr(self, name) for name in {**names, **_PHASE_FIELDS}[self.phase_function]}
+
+    @property
+    def molecular_share(self) -> float:
+        """Part of the scattering that is the water's own, beside `phase_function`, which is then of particles alone.
+
+        Known with chlorophyll, 0 without it; 0 with layers too, which share one phase function.
+        """
+        return self._molecular_share
+
+    @property
+    def has_phase_table(self) -> bool:
+        """Whether scattering is drawn from a table rather than from Henyey and Greenstein's formula."""
+        return self.phase_function != "henyey_greenstein" or self.molecular_share > 0.0
+
+    @property
+    def follows_wavelength(self) -> bool:
+        """Whether the indices that are not given follow from the laser's wavelength."""
+        return any(value is not None for value in (self.chlorophyll, self.temperature, self.salinity))
+
+    def at_wavelength(self, wavelength_nm: float) -> Medium:
+        """The medium as light of a vacuum wavelength [nm] meets it.
+
+        Raises `ValueError` outside [400, 700] if anything depends on it.
+        """
+        medium = self.model_copy()
+        medium._follow(wavelength_nm)
+        return medium
+
+    @property
+    def waters(self) -> tuple[Medium | Layer, ...]:
+        """Itself and its layers, in the order of `layer_axis`."""
+        return (self, *self.layers)
+
+    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
+        """∫c ds on the straight way between two points of the world [m]."""
+        length = math.dist(begin, end)
+        if not self.layers or length == 0.0:
+            return self.extinction * length
+        scale = math.hypot(*self.layer_axis)
+        first, last = sorted(
+            sum(a * x for a, x in zip(self.layer_axis, point, strict=True)) / scale for point in (begin, end)
+        )
+        edges = [-math.inf, *(layer.start for layer in self.layers), math.inf]
+        if first == last:
+            return length * self.waters[bisect.bisect_right(edges, first) - 1].extinction
+        parts = (
+            water.extinction * max(0.0, min(high, last) - max(low, first))
+            for water, (low, high) in zip(self.waters, itertools.pairwise(edges), strict=True)
+        )
+        return length / (last - first) * math.fsum(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""
+        hidden = {"layers", "layer_axis"}
+        if self.follows_wavelength:
+            hidden |= {"phase_index", "group_index"} - self.model_fields_set
+        fields = {name: value for name, value in super().to_dict().items() if name not in hidden}
+        if self.layers:
+            fields |= {"layer_axis": self.layer_axis, "layers": [layer.to_dict() for layer in self.layers]}
+        return fields

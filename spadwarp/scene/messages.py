@@ -1,0 +1,173 @@
+"""pydantic's errors as lines that name field, value and allowed range."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from spadwarp.scene.load import Key, key_text
+
+# What people write for a field's name, beyond misspellings.
+_SYNONYMS = {
+    "g": "anisotropy",
+    "a": "absorption",
+    "b": "scattering",
+    "c": "extinction",
+    "omega": "albedo",
+    "fov": "horizontal_fov_deg",
+}
+
+_KINDS = {
+    "float_type": "a number",
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "bool_type": "true or false",
+    "string_type": "a string",
+    "tuple_type": "a list",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+}
+
+
+_LIMITS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
+
+
+def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[str, Any]) -> list[str]:
+    """One line for each field that `error` complains about; `overrides` is the layer set from outside the file."""
+    lines: dict[Key, str] = {}
+    for problem in error.errors(include_url=False):
+        key, info = _locate(model, problem["loc"])
+        lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
+    return list(dict.fromkeys(lines.values()))  # a list that is too short misses each item
+
+
+def _locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, FieldInfo | None]:
+    """The part of `loc` that names a field or a list's item, without pydantic's branch names, and the field."""
+    key: list[str | int] = []
+    info: FieldInfo | None = None
+    inner: type[BaseModel] | None = model
+    for part in loc:
+        if isinstance(part, int):
+            key.append(part)
+        elif inner is not None:
+            key.append(part)
+            info = inner.model_fields.get(part)
+            inner = next(_models(info.annotation), None) if info is not None else None
+    return tuple(key), info
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        yield from _models(argument)
+
+
+def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel], overridden: bool) -> str:
+    name = key_text(key)
+    kind, value = problem["type"], problem["input"]
+    if kind == "extra_forbidden":
+        siblings = _fields(model, key[:-1])
+        hint = _suggest(str(key[-1]), siblings) or f"; known are {', '.join(siblings)}"
+        return f"{name} is not a known {'field' if len(key) > 1 else 'section'}{hint}"
+    if kind == "missing" and not isinstance(key[-1], int):
+        return f"{name} is missing" + (f" ({info.description})" if info is not None and info.description else "")
+    cause = problem.get("ctx", {}).get("error")
+    if kind in ("missing", "too_short", "too_long"):  # of a list
+        name = key_text(key[: max(i for i, part in enumerate(key) if isinstance(part, str)) + 1])
+        return f"{name} = {_shown(value)} has the wrong number of values"
+    shown = f"{name} = {_shown(value)}" + (" (an override)" if overridden else "")
+    if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
+        whole_table = isinstance(value, (Mapping, BaseModel))
+        text = cause.args[0]
+        if not key:  # of the scene as a whole
+            return text
+        if not whole_table:
+            return f"{shown} {text}"
+        return f"{name} {text}" if text.startswith("needs") else f"{name}.{text}"
+    choices = _choices(info, cause)
+    if kind in _LIMITS and info is not None:
+        return f"{shown} is outside {_interval(info)}" + "".join(f" and not {word!r}" for word in choices)
+    if choices and kind in _KINDS and isinstance(value, str):
+        return f"{shown} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
+    if choices:
+        others = [cause.args[2]] if cause is not None and len(cause.args) > 2 else []
+        listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
+        return f"{shown} is not one of {listed}{_suggest(str(value), choices)}"
+    if kind in _KINDS:
+        return f"{shown} is not {_KINDS[kind]}"
+    message = problem["msg"]
+    return f"{shown}: {message[0].lower()}{message[1:]}"
+
+
+def _fields(model: type[BaseModel], key: Key) -> list[str]:
+    """Names of the fields of the table at `key`."""
+    for part in key:
+        if isinstance(part, str):
+            model = next(_models(model.model_fields[part].annotation))
+    return list(model.model_fields)
+
+
+def _suggest(name: str, known: Sequence[str]) -> str:
+    close = [_SYNONYMS[name]] if _SYNONYMS.get(name) in known else []
+    close = close or [one for one in known if one.lower().startswith(name.lower())]
+    close = close or difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {' or '.join(map(repr, close[:2]))}?" if close else ""
+
+
+def _shown(value: Any) -> str:
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _choices(info: FieldInfo | None, cause: Any) -> tuple[str, ...]:
+    """The words that a field takes: those of its literal type, or those that a validator names."""
+    if isinstance(cause, ValueError) and len(cause.args) > 1:
+        return tuple(cause.args[1])
+    return tuple(_literals(info.annotation)) if info is not None else ()
+
+
+def _literals(annotation: Any) -> Iterator[str]:
+    if typing.get_origin(annotation) is typing.Literal:
+        yield from typing.get_args(annotation)
+    else:
+        for argument in typing.get_args(annotation):
+            yield from _literals(argument)
+
+
+def _interval(info: FieldInfo) -> str:
+    """The range of a numeric field, such as `(0, 1]`."""
+    low, high, left, right = -math.inf, math.inf, "(", ")"
+    for bound in _bounds(info):
+        for name, value in (("gt", "("), ("ge", "[")):
+            if getattr(bound, name, None) is not None:
+                low, left = getattr(bound, name), value
+        for name, value in (("lt", ")"), ("le", "]")):
+            if getattr(bound, name, None) is not None:
+                high, right = getattr(bound, name), value
+    return f"{left}{low}, {high}{right}"
+
+
+def _bounds(holder: Any) -> Iterator[Any]:
+    if isinstance(holder, FieldInfo):
+        yield from holder.metadata
+        yield from _bounds(holder.annotation)
+    for inner in (*getattr(holder, "__metadata__", ()), *typing.get_args(holder)):
+        yield from _bounds(inner)
+
+
+def _is_overridden(key: Key, layer: Mapping[str, Any]) -> bool:
+    place: Any = layer
+    if not key:
+        return False
+    for part in key[: 3 if key[0] == "targets" else 2]:
+        if not isinstance(place, Mapping) or part not in place:
+            return False
+        place = place[part]
+    return True

@@ -1,0 +1,247 @@
+"""The sections `laser`, `camera` and `scan`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from spadwarp.scene.sections import PLANCK, SPEED_OF_LIGHT, Brown, Section, Vector, Whole
+
+
+class Laser(Section):
+    """The pulsed source. Photons leave it at the middle of the pulse, time 0."""
+
+    section: ClassVar[str] = "laser"
+    preset: str | None = Field(None, description="a named laser, see `spadwarp presets laser`")
+    position: Vector = Field((0.0, 0.0, 0.0), description="place [m]")
+    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0; a scan aims it itself")
+    frame: Literal["camera", "world"] = Field(
+        "camera", description="frame of position and direction: a laser moves with the camera, or stands in the world"
+    )
+    profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = Field(
+        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"
+    )
+    profile_image: str | None = Field(
+        None, description="irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"
+    )
+    half_angle_deg: float = Field(
+        15.0,
+        gt=0,
+        le=180,
+        description="half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]",
+    )
+    beam_radius: float = Field(0.0, ge=0, description="radius of the collimated beam [m]; 0 is a pencil beam")
+    wavelength_nm: float = Field(532.0, gt=0, description="vacuum wavelength [nm]")
+    pulse_energy: float = Field(37.5e-9, gt=0, description="energy of one pulse [J]")
+    repetition_rate: float = Field(20e6, gt=0, description="pulses per second [Hz]")
+    pulse_fwhm_ps: float = Field(85.0, ge=0, description="pulse duration, full width at half maximum [ps]")
+
+    @model_validator(mode="after")
+    def _has_a_beam(self) -> Self:
+        if not any(self.direction):
+            raise ValueError(f"direction = {list(self.direction)} has no length")
+        if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
+            raise ValueError(
+                f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a {self.profile} profile"
+            )
+        if (self.profile == "measured") != (self.profile_image is not None):
+            raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
+        return self
+
+    @property
+    def half_angle(self) -> float:
+        """θ [rad]."""
+        return math.radians(self.half_angle_deg)
+
+    @property
+    def axis(self) -> tuple[float, float, float]:
+        """`direction` as a unit vector."""
+        x, y, z = self.direction
+        length = math.hypot(x, y, z)
+        return (x / length, y / length, z / length)
+
+    @property
+    def photons_per_pulse(self) -> float:
+        """E0·λ/(hc)."""
+        return self.pulse_energy * self.wavelength_nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
+
+
+class Camera(Section):
+    """A view through a round aperture: a pinhole's, or a thin lens's where `focus_distance` is given.
+
+    The view is given by `horizontal_fov_deg`, by `focal_length` with `pixel_pitch_um`, or by OpenCV's `fx` (with `fy`,
+    `cx`, `cy`), which `calibration` reads from a file; the aperture by `aperture_diameter`, or by `f_number` with
+    `focal_length`.
+    """
+
+    section: ClassVar[str] = "camera"
+    preset: str | None = Field(None, description="a named camera, see `spadwarp presets camera`")
+    width: Whole = Field(..., ge=1, le=16384, description="pixels in a row")
+    height: Whole = Field(..., ge=1, le=16384, description="rows")
+    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180, description="full horizontal field of view [°]")
+    focal_length: float | None = Field(None, gt=0, description="focal length [m]")
+    pixel_pitch_um: float | None = Field(None, gt=0, description="side of a pixel [µm]")
+    fx: float | None = Field(None, gt=0, description="focal length along rows [pixels], as OpenCV writes it")
+    fy: float | None = Field(None, gt=0, description="focal length along columns [pixels]; fx if not given")
+    cx: float | None = Field(
+        None,
+        description="column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle",
+    )
+    cy: float | None = Field(None, description="row of the optical axis, likewise")
+    distortion: Brown = Field((0.0,) * 5, description="Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
+    calibration: str | None = Field(
+        None,
+        description="OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place",
+    )
+    aperture_diameter: float | None = Field(None, gt=0, description="diameter of the entrance aperture [m]")
+    f_number: float | None = Field(None, gt=0, description="focal length over aperture diameter")
+    focus_distance: float | None = Field(
+        None,
+        gt=0,
+        le=math.inf,
+        allow_inf_nan=True,
+        description="thin lens: depth that is imaged sharply [m], inf is infinity; not given: pinhole, all of it sharp",
+    )
+    position: Vector = Field((0.0, 0.0, 0.0), description="lens centre in the world [m]")
+    rotation_deg: Vector = Field(
+        (0.0, 0.0, 0.0), description="turns from the world's axes about x, the turned y, then z [°]"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_calibration(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping) or not isinstance(fields.get("calibration"), str):
+            return fields
+        from spadwarp.scene.calibration import load_calibration
+
+        read = load_calibration(fields["calibration"])
+        for name in ("width", "height"):
+            if fields.get(name, read.get(name)) != read.get(name, fields.get(name)):
+                raise ValueError(f"{name} = {fields[name]} is not {read[name]}, the image's of the calibration")
+        return {**read, **{name: value for name, value in fields.items() if name != "calibration"}}
+
+    @model_validator(mode="after")
+    def _determined(self) -> Self:
+        given = [name for name in ("horizontal_fov_deg", "pixel_pitch_um", "fx") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                "needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length"
+                + (f"; given: {', '.join(given)}" if given else "")
+            )
+        if (self.aperture_diameter is None) == (self.f_number is None):
+            raise ValueError("needs either aperture_diameter or f_number with focal_length")
+        if self.focal_length is None and (self.pixel_pitch_um is not None or self.f_number is not None):
+            raise ValueError(
+                f"focal_length is missing; {'pixel_pitch_um' if self.f_number is None else 'f_number'} needs it"
+            )
+        for name in ("fy", "cx", "cy"):
+            if self.fx is None and getattr(self, name) is not None:
+                raise ValueError(f"{name} = {getattr(self, name)} goes with fx only")
+        if self.focus_distance is not None and self.focus_distance <= (self.focal_length or 0.0):
+            raise ValueError(
+                f"focus_distance = {self.focus_distance} is outside ({self.focal_length}, inf], beyond the focal length"
+            )
+        if any(self.distortion):
+            from spadwarp.scene.intrinsics import is_invertible
+
+            if not is_invertible(self):
+                raise ValueError(
+                    f"distortion = {list(self.distortion)} folds the image: some of its {self.width} x {self.height} "
+                    "pixels show no direction, or two"
+                )
+        return self
+
+    @property
+    def focal_pixels(self) -> tuple[float, float]:
+        """Focal length in pixels along rows and columns, fx and fy: image distance over pixel pitch."""
+        if self.fx is not None:
+            return self.fx, self.fy or self.fx
+        tangent = self.pixel_tangent
+        return 1.0 / tangent, 1.0 / tangent
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Image coordinates (column, row) of the optical axis, (0.5, 0.5) being the first pixel's centre."""
+        return (
+            self.width / 2.0 if self.cx is None else self.cx + 0.5,
+            self.height / 2.0 if self.cy is None else self.cy + 0.5,
+        )
+
+    @property
+    def pixel_tangent(self) -> float:
+        """Pixel pitch over image distance; the geometric mean of both directions where fx and fy differ.
+
+        The image distance is the focal length or, where a thin lens is focused nearer than infinity, 1/(1/f − 1/d).
+        """
+        if self.horizontal_fov_deg is not None:
+            return 2.0 * math.tan(math.radians(self.horizontal_fov_deg) / 2.0) / self.width
+        if self.fx is not None:
+            return 1.0 / math.sqrt(self.fx * (self.fy or self.fx))
+        assert self.pixel_pitch_um is not None and self.focal_length is not None
+        return self.pixel_pitch_um * 1e-6 / self.focal_length * (1.0 - self.focal_length * self.inverse_focus)
+
+    @property
+    def inverse_focus(self) -> float:
+        """1 over the depth that is imaged sharply [1/m]; 0 for a pinhole, and for a lens focused at infinity."""
+        return 0.0 if self.focus_distance is None else 1.0 / self.focus_distance
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a pinhole with square pixels about the optical axis and without distortion."""
+        fx, fy = self.focal_pixels
+        middle = (self.width / 2.0, self.height / 2.0)
+        return fx == fy and self.principal_point == middle and not any(self.distortion) and self.focus_distance is None
+
+    @property
+    def view_box(self) -> tuple[float, float, float, float]:
+        """Least and largest tangents (left, top, right, bottom) of what the image shows."""
+        if any(self.distortion):
+            from spadwarp.scene.intrinsics import view_box
+
+            return view_box(self)
+        (fx, fy), (cx, cy) = self.focal_pixels, self.principal_point
+        return -cx / fx, -cy / fy, (self.width - cx) / fx, (self.height - cy) / fy
+
+    @property
+    def horizontal_fov(self) -> float:
+        """Full horizontal field of view [rad]."""
+        left, _, right, _ = self.view_box
+        return math.atan(right) - math.atan(left)
+
+    @property
+    def vertical_fov(self) -> float:
+        """Full vertical field of view [rad]."""
+        _, top, _, bottom = self.view_box
+        return math.atan(bottom) - math.atan(top)
+
+    @property
+    def aperture_radius(self) -> float:
+        """Radius of the entrance aperture [m]."""
+        if self.aperture_diameter is not None:
+            return self.aperture_diameter / 2.0
+        assert self.focal_length is not None and self.f_number is not None
+        return self.focal_length / self.f_number / 2.0
+
+    @property
+    def aperture_area(self) -> float:
+        """Area of the entrance aperture [m²]."""
+        return math.pi * self.aperture_radius**2
+
+
+class Scan(Section):
+    """How the beam moves over the scene."""
+
+    section: ClassVar[str] = "scan"
+    mode: Literal["none", "confocal"] = Field(
+        "none", description="confocal: the beam visits the pixels in turn and each sees its own light alone"
+    )
+    distance: float = Field(
+        math.inf,
+        gt=0,
+        le=math.inf,
+        allow_inf_nan=True,
+        description="range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel",
+    )

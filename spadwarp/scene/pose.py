@@ -1,0 +1,113 @@
+"""Where a camera stands and looks: between the world, the camera's own frame and OpenCV's way to write a pose.
+
+The world has the axes of a camera without a pose: +x right, +y down, +z forward. A camera at `position` whose own axes
+are the columns of R sees the world's point X at Rᵀ(X − position); R = Rx·Ry·Rz of `rotation_deg`, as for targets.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Camera
+
+__all__ = ["look_at", "opencv_pose", "rotation_matrix", "to_camera", "to_world"]
+
+Vector = tuple[float, float, float]
+
+
+def rotation_matrix(rotation_deg: ArrayLike) -> NDArray[np.float64]:
+    """Rx·Ry·Rz `[3, 3]`: turns about x, then about the turned y, then about the twice turned z [°]."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_x @ about_y @ about_z
+
+
+def rotation_angles(matrix: ArrayLike) -> Vector:
+    """`rotation_deg` [°] of a rotation matrix: `rotation_matrix` undone, with 0 for the last turn where ry is ±90°."""
+    m = np.asarray(matrix, np.float64)
+    y = math.asin(min(max(m[0, 2], -1.0), 1.0))
+    if abs(m[0, 2]) < 1.0 - 1e-12:
+        x, z = math.atan2(-m[1, 2], m[2, 2]), math.atan2(-m[0, 1], m[0, 0])
+    else:
+        x, z = math.atan2(m[2, 1], m[1, 1]), 0.0
+    return math.degrees(x), math.degrees(y), math.degrees(z)
+
+
+def to_camera(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
+    """Points of the world `[..., 3]` [m] in the camera's frame."""
+    return (np.asarray(points, np.float64) - camera.position) @ rotation_matrix(camera.rotation_deg)
+
+
+def to_world(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
+    """Points of the camera's frame `[..., 3]` [m] in the world."""
+    return np.asarray(points, np.float64) @ rotation_matrix(camera.rotation_deg).T + camera.position
+
+
+def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
+    """`position` and `rotation_deg` of the camera that OpenCV calls (rvec, tvec), as `solvePnP` returns them.
+
+    OpenCV maps a point X of the world to R·X + t of the camera, with R the rotation about rvec by |rvec| radians
+    (Rodrigues); the camera so stands at −Rᵀt and its axes are the rows of R.
+
+    Args:
+        rvec: Rotation vector [rad], 3 numbers, or the rotation matrix R `[3, 3]`.
+        tvec: t [m], 3 numbers.
+
+    Returns:
+        Fields of the scene's `camera` section.
+
+    Raises:
+        ValueError: Another number of values, or a matrix that is no rotation.
+    """
+    turn, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
+    if turn.shape != (3, 3):
+        turn = turn.ravel()
+    if turn.shape not in ((3,), (3, 3)) or shift.shape != (3,):
+        raise ValueError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
+    if turn.shape == (3,):
+        angle = float(np.linalg.norm(turn))
+        x, y, z = turn / angle if angle > 0 else turn
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        matrix = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    else:
+        matrix = turn
+        if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
+            raise ValueError(f"rvec = {matrix.tolist()} is not a rotation matrix")
+    return {"position": _vector(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
+
+
+def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.0, 0.0)) -> dict[str, Vector]:
+    """`position` and `rotation_deg` of a camera at a place of the world that looks at a point.
+
+    Args:
+        position: Where it stands [m].
+        point: What is on its optical axis [m].
+        down: Direction of the world that is downwards in the image, as far as the view allows.
+
+    Returns:
+        Fields of the scene's `camera` section.
+
+    Raises:
+        ValueError: Two of the points coincide, or the camera looks along `down`.
+    """
+    place = np.asarray(position, np.float64)
+    end = np.asarray(point, np.float64)
+    forward = end - place
+    right = np.cross(np.asarray(down, np.float64), forward)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
+        level = np.asarray(down).tolist()
+        raise ValueError(f"a camera at {place.tolist()} that looks at {end.tolist()} has no horizon: down = {level}")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    axes = np.column_stack([right, np.cross(forward, right), forward])
+    return {"position": _vector(place), "rotation_deg": rotation_angles(axes)}
+
+
+def _vector(values: NDArray[np.float64]) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,194 @@
+"""A scene of all its sections, and the file that it comes from."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
+
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.scene import load as _layers
+from spadwarp.scene.detection import Detector, Gate
+from spadwarp.scene.medium import Medium
+from spadwarp.scene.messages import describe
+from spadwarp.scene.methods import Analytic, Output, Transport
+from spadwarp.scene.optics import Camera, Laser, Scan
+from spadwarp.scene.sections import SPEED_OF_LIGHT, listed
+from spadwarp.scene.surroundings import Domain, Target
+
+Overrides = Mapping[str, Any] | Sequence[str]
+
+
+class Scene(BaseModel):
+    """Everything a run depends on, checked and frozen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    medium: Medium
+    laser: Laser = Laser()
+    camera: Camera
+    scan: Scan = Scan()
+    detector: Detector = Detector()
+    gate: Gate
+    targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
+    domain: Domain = Domain()
+    transport: Transport = Transport()
+    output: Output = Output()
+    analytic: Analytic = Analytic()
+    _source: Path | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _water_at_the_lasers_wavelength(self) -> Self:
+        try:
+            self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
+        except ValueError as error:
+            raise ValueError(f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold") from None
+        return self
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Scene:
+        """A scene from tables as TOML gives them; relative paths in them start at `source`'s folder.
+
+        Raises `ConfigError` with a line for each problem.
+        """
+        return _build(dict(tables), source=source)
+
+    @property
+    def source(self) -> Path | None:
+        """The file that the scene came from."""
+        return self._source
+
+    @property
+    def scan_positions(self) -> int:
+        """Places that the beam visits: photon i leaves at place i modulo this."""
+        return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
+
+    @property
+    def beam(self) -> Laser:
+        """The laser with position and direction in the camera frame."""
+        laser, camera = self.laser, self.camera
+        if laser.frame == "camera" or not any((*camera.position, *camera.rotation_deg)):
+            return laser
+        from spadwarp.scene.pose import rotation_matrix, to_camera
+
+        place, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
+        moved = {"position": tuple(map(float, place)), "direction": tuple(map(float, axis)), "frame": "camera"}
+        return laser.model_copy(update=moved)
+
+    def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
+        """∫c ds on the straight way between two points of the camera frame [m]."""
+        if self.medium.layers and any((*self.camera.position, *self.camera.rotation_deg)):
+            from spadwarp.scene.pose import to_world
+
+            begin, end = to_world(self.camera, [begin, end]).tolist()
+        return self.medium.optical_depth(begin, end)
+
+    @property
+    def path_limit(self) -> float:
+        """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
+        gate_end = SPEED_OF_LIGHT / self.medium.group_index * self.gate.stop
+        return min(self.transport.max_path or gate_end, gate_end)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Tables from which `from_dict` makes an equal scene."""
+        tables: dict[str, Any] = {}
+        for name, section in self:
+            tables[name] = [one.to_dict() for one in section] if name == "targets" else section.to_dict()
+        if not tables["targets"]:
+            del tables["targets"]
+        return tables
+
+    def to_toml(self) -> str:
+        """The full text that `load_scene` reads back to an equal scene."""
+        return _layers.toml_text(self.to_dict())
+
+    def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
+        """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
+
+        Overrides act as in `load_scene`. Raises `ConfigError`.
+        """
+        changed = self
+        for one in (overrides, sections):
+            if one:
+                changed = _build(changed.to_dict(), overrides=one, source=self.source, resolve=False)
+        return changed
+
+    def __eq__(self, other: object) -> bool:
+        """Equal in every field; where it came from does not matter."""
+        return isinstance(other, Scene) and self.__dict__ == other.__dict__
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.__dict__.values()))
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Scene:
+    """Read a scene file.
+
+    `overrides` lie over the file: `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings, None
+    for a field's default. A medium is given by two coefficients; overriding one keeps another: extinction keeps the
+    albedo, albedo the extinction, absorption the scattering, scattering the absorption; overriding two replaces both.
+    Relative paths start at the file's folder, those in overrides at the working directory.
+    Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
+    """
+    try:
+        text = Path(path).read_bytes().decode()
+        tables = tomllib.loads(text)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+    return _build(tables, overrides=overrides, source=path)
+
+
+def _build(
+    tables: dict[str, Any],
+    *,
+    overrides: Overrides | None = None,
+    source: str | os.PathLike[str] | None = None,
+    resolve: bool = True,
+) -> Scene:
+    name = None if source is None else str(source)
+    layer: dict[str, Any] = {}
+    try:
+        if source is not None and resolve:
+            tables = _with_paths(tables, Path(source).absolute().parent)
+        if overrides:
+            layer = _layers.override_layer(overrides)
+            tables = _layers.merge_scene(tables, _with_paths(layer, Path.cwd()))
+        scene = Scene.model_validate(tables)
+    except ConfigError as error:
+        raise ConfigError(error.problems, source=name) from None
+    except ValidationError as error:
+        raise ConfigError(describe(error, Scene, layer), source=name) from None
+    scene._source = None if source is None else Path(source)
+    return scene
+
+
+def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The tables with relative paths of files made absolute."""
+
+    def absolute(fields: Any, name: str, ending: str = "") -> Any:
+        value = fields.get(name) if isinstance(fields, Mapping) else None
+        if isinstance(value, str) and value.lower().endswith(ending):
+            return {**fields, name: str(folder / Path(value).expanduser())}
+        return fields
+
+    changed = dict(tables)
+    targets = tables.get("targets")
+    if isinstance(targets, Mapping):
+        changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
+    elif isinstance(targets, (list, tuple)):
+        changed["targets"] = [absolute(target, "mesh") for target in targets]
+    for section, name, ending in (
+        ("medium", "phase_table", ".csv"),
+        ("detector", "irf", ".csv"),
+        ("camera", "calibration", ""),
+        ("laser", "profile_image", ""),
+    ):
+        if section in tables:
+            changed[section] = absolute(tables[section], name, ending)
+    return changed

@@ -1,0 +1,71 @@
+"""What all sections of a scene have in common: strictness, presets, and types of fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+
+from spadwarp.scene import load as _layers
+from spadwarp.scene.presets import PRESETS
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], vacuum
+PLANCK = 6.626_070_15e-34  # [J s]
+
+
+def _whole(value: Any) -> Any:
+    """TOML writes 2e9 as a float; a whole one is as good as an integer."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def listed(value: Any) -> Any:
+    """TOML has lists; what is frozen holds tuples."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _padded(value: Any) -> Any:
+    """Four coefficients of distortion lack k3, as OpenCV allows."""
+    value = listed(value)
+    return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
+
+
+def _sized(value: Any) -> Any:
+    return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else listed(value)
+
+
+def _three(value: Any) -> Any:
+    return (value,) * 3 if isinstance(value, (int, float)) and not isinstance(value, bool) else listed(value)
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
+Vector = Annotated[tuple[float, float, float], BeforeValidator(listed)]
+Brown = Annotated[tuple[float, float, float, float, float], BeforeValidator(_padded)]
+Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
+Corner = Annotated[tuple[Bound, Bound, Bound], BeforeValidator(_three)]
+Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_sized), Field(min_length=1, max_length=3)]
+Scale = Annotated[tuple[float, float, float], BeforeValidator(_three)]
+
+
+class Section(BaseModel):
+    """One table of a scene: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=())
+    section: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, fields: Any) -> Any:
+        return _layers.merge_section(cls.section, {}, fields) if isinstance(fields, Mapping) else fields
+
+    @field_validator("preset", check_fields=False)
+    @classmethod
+    def _known_preset(cls, name: str | None) -> str | None:
+        if name is not None and name not in PRESETS[cls.section]:
+            raise ValueError("preset", tuple(PRESETS[cls.section]))
+        return name
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again, without those that are None."""
+        return {name: value for name, value in self if value is not None}

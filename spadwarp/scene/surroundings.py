@@ -1,0 +1,89 @@
+"""The sections `targets` and `domain`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from spadwarp.scene.sections import Corner, Scale, Section, Size, Vector, Whole
+
+
+class Target(Section):
+    """One mesh: sized and scaled, then rotated, then moved."""
+
+    section: ClassVar[str] = "targets"
+    builtin: str | None = Field(None, min_length=1, description='a mesh that comes with spadwarp, such as "staircase"')
+    mesh: str | None = Field(None, description="path of a mesh file, relative to the scene file")
+    size: Size | None = Field(
+        None, description="extent of plane, box, sphere; one number, two for x and y, or three [m]"
+    )
+    subdivisions: Whole = Field(0, ge=0, le=12, description="times that every face is split into four")
+    scale: Scale = Field((1.0, 1.0, 1.0), description="factor, one or three; mesh units to metres")
+    rotation_deg: Vector = Field(
+        (0.0, 0.0, 0.0), description="turns about the target's own x, then the turned y, then z [°]"
+    )
+    translation: Vector = Field(
+        (0.0, 0.0, 0.0), description="shift in the world [m], the camera's frame if it has no pose"
+    )
+    reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = Field(
+        0.5, description='Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file'
+    )
+    reflectance_scale: float = Field(1.0, gt=0, description='factor on the reflectance "from_file"')
+    colour_encoding: Literal["srgb", "linear"] = Field(
+        "srgb", description='how the file\'s colours and images stand for reflectance; "linear" is proportional'
+    )
+    specular: float = Field(
+        0.0, ge=0, le=1, description="reflectance of the facets of a rough specular lobe; 0 is none"
+    )
+    roughness: float = Field(0.2, ge=0.01, le=1, description="width of that lobe: GGX parameter α")
+
+    @model_validator(mode="after")
+    def _one_mesh(self) -> Self:
+        if (self.builtin is None) == (self.mesh is None):
+            raise ValueError("needs either builtin or mesh")
+        if not all(self.scale):
+            raise ValueError(f"scale = {list(self.scale)} holds a zero")
+        if self.size is not None and self.builtin is None:
+            raise ValueError(f"size = {list(self.size)} goes with builtin only; a mesh file takes scale")
+        if self.reflectance == "from_file":
+            if self.mesh is None:
+                raise ValueError("reflectance = 'from_file' goes with mesh only; a builtin takes a number")
+        elif self.reflectance + self.specular > 1:
+            raise ValueError(
+                f"specular = {self.specular:g} and reflectance = {self.reflectance:g} reflect more than arrives:"
+                " their sum is outside [0, 1]"
+            )
+        elif self.reflectance_scale != 1:
+            raise ValueError(f"reflectance_scale = {self.reflectance_scale:g} goes with reflectance = 'from_file' only")
+        return self
+
+
+class Domain(Section):
+    """Where the water is, in the world. A photon that leaves it is gone; camera and laser must be inside."""
+
+    section: ClassVar[str] = "domain"
+    shape: Literal["unbounded", "slab", "box"] = Field(
+        "unbounded", description="slab: bounded in z; box: in x, y and z"
+    )
+    lower: Corner = Field(
+        (-math.inf,) * 3, description="lower corner [m]; one number stands for all three, a slab uses z"
+    )
+    upper: Corner = Field(
+        (math.inf,) * 3, description="upper corner [m]; one number stands for all three, a slab uses z"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for axis, low, high in zip("xyz", *self.bounds, strict=True):
+            if not low < high:
+                raise ValueError(f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}")
+        return self
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner as they act [m]; infinite where the shape has no bound."""
+        free = {"unbounded": 3, "slab": 2, "box": 0}[self.shape]
+        low, high = (-math.inf,) * free + self.lower[free:], (math.inf,) * free + self.upper[free:]
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])

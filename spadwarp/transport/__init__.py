@@ -1,0 +1,1 @@
+"""Photon transport: a scene in, a `Result` out."""

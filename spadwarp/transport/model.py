@@ -1,0 +1,315 @@
+"""From a scene to what the kernels take: parameter structs, the mesh's BVH, the unit of the tallies."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spadwarp.device import physical_memory, pick_device
+from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.result.result import COMPONENTS, Truth, pixel_directions, scan_axes
+from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.scene.beam_profile import load_profile, profile_extent
+from spadwarp.scene.intrinsics import pixel_views, view_box
+from spadwarp.scene.phase_function import phase_function
+from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.transport.tally_scale import tally_scale
+
+if TYPE_CHECKING:
+    import warp as wp
+
+    from spadwarp.mesh.targets import TriangleMesh
+    from spadwarp_kernels import Model
+
+# The paper's albedo is uniform in (0, 0.97).
+PAPER_ALBEDO = 0.97
+
+_UNLIMITED = 1.0e30
+
+
+def build_model(
+    scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: float = 1
+) -> Model:
+    """The scene on a device.
+
+    Args:
+        scene: What to simulate.
+        device: From `pick_device`.
+        mesh: From `spadwarp.mesh.targets.build_mesh`.
+        copies: Histograms that the run will hold on the device, for the check of its memory.
+        camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
+
+    Raises:
+        ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
+            the phase function's table is not one.
+        FileError: That table or the beam's profile cannot be read.
+        DeviceError: The device has too little memory.
+    """
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    _check_domain(scene, camera)
+    medium = sk.Medium()
+    medium.extinction = scene.medium.extinction
+    medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
+    medium.anisotropy = scene.medium.anisotropy
+    medium.axis_threshold = scene.transport.axis_threshold
+    if scene.medium.has_phase_table:
+        medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
+
+    laser, lens = _laser(scene, device), _camera(scene)
+
+    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    gate = sk.Gate()
+    gate.start, gate.stop = scene.gate.start * speed, scene.gate.stop * speed
+    gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)
+    gate.bins = scene.gate.bins
+
+    limits = sk.Limits()
+    lower, upper = np.array(scene.domain.bounds)
+    if _is_turned(scene):
+        limits.rotation = wp.mat33(*rotation_matrix(scene.camera.rotation_deg).ravel())
+        limits.origin = wp.vec3(*scene.camera.position)
+    else:
+        lower, upper = lower - scene.camera.position, upper - scene.camera.position
+    limits.lower = wp.vec3(*np.maximum(lower, -_UNLIMITED))
+    limits.upper = wp.vec3(*np.minimum(upper, _UNLIMITED))
+    limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
+    limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
+    # What arrives by a longer path than histories may have lies outside the gate for every estimator.
+    gate.stop = min(gate.stop, limits.max_path)
+    limits.weight_cutoff = scene.transport.weight_cutoff
+    limits.max_collisions = scene.transport.max_collisions
+
+    # Measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long. Each event divides the weight of
+    # light that was left alone by 1 - probability, so that thick water, where events are many, wants less.
+    there = [p + 0.5 * limits.max_path * u for p, u in zip(scene.beam.position, scene.beam.axis, strict=True)]
+    depth = scene.medium.extinction * limits.max_path
+    if scene.medium.layers:
+        depth = 2.0 * scene.optical_depth(scene.beam.position, there)
+    thickness = max(depth, 1e-6)
+    guiding = sk.Guiding()
+    guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))
+    guiding.surface_probability = 0.3
+    guiding.anisotropy = 0.97
+    guiding.return_probability = 0.1 * min(1.0, 5.0 / thickness)
+    guiding.return_anisotropy = 0.5
+
+    device_mesh, surfaces = None, sk.make_surfaces(None, device=device)
+    if mesh is not None:
+        device_mesh = wp.Mesh(
+            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+            wp.array(mesh.faces.ravel(), dtype=int, device=device),
+            # The fastest to traverse, by measurement.
+            bvh_constructor="cubql" if device.is_cuda else None,
+            bvh_leaf_size=1 if device.is_cuda else 2,
+        )
+        surfaces = sk.make_surfaces(
+            device_mesh,
+            wp.array(mesh.reflectance, dtype=float, device=device),
+            camera=lens if camera else None,
+            **_appearance(mesh, device),
+        )
+    scale = tally_scale(scene, mesh)
+    model = sk.Model(device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, scale)
+    if scene.medium.layers:
+        model = dataclasses.replace(model, layers=_layers(scene, device))
+    if scene.scan.mode != "none":
+        model = dataclasses.replace(model, scan=_scan(scene, device))
+    if camera:
+        _check_size(scene, model, copies)
+    return model
+
+
+def _appearance(mesh: TriangleMesh, device: wp.Device) -> dict[str, Any]:
+    """What `make_surfaces` takes beyond one reflectance a face."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    arrays: dict[str, Any] = {}
+    if mesh.specular is not None and mesh.roughness is not None:
+        arrays["specular"] = wp.array(mesh.specular, dtype=float, device=device)
+        arrays["roughness"] = wp.array(mesh.roughness, dtype=float, device=device)
+    if mesh.pattern is not None:
+        arrays["corner_reflectance"] = wp.array(mesh.pattern.corners, dtype=wp.vec3, device=device)
+        if mesh.pattern.images:
+            arrays["textures"] = sk.make_textures(
+                mesh.pattern.texture, mesh.pattern.coordinates, mesh.pattern.images, device=device
+            )
+    return arrays
+
+
+def _layers(scene: Scene, device: wp.Device) -> Any:
+    """The medium and its layers as the kernels take them."""
+    import spadwarp_kernels as sk
+
+    medium, camera = scene.medium, scene.camera
+    axis = np.array(medium.layer_axis) / math.hypot(*medium.layer_axis)
+    shift = float(axis @ camera.position)
+    return sk.make_layers(
+        [-_UNLIMITED, *(layer.start - shift for layer in medium.layers)],
+        [water.extinction for water in medium.waters],
+        [PAPER_ALBEDO if water.albedo == "paper" else water.albedo for water in medium.waters],
+        [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
+        axis=(axis @ rotation_matrix(camera.rotation_deg)).tolist(),
+        device=device,
+    )
+
+
+def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
+    """The compile-time choices of a scene; `choices` override them."""
+    import spadwarp_kernels as sk
+
+    spec = sk.TransportSpec(
+        estimator=scene.transport.estimator,
+        phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
+        paper_albedo=scene.medium.albedo == "paper",
+        mesh=mesh is not None,
+        few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,
+        bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),
+        roulette=scene.transport.termination == "roulette",
+        pattern=mesh is not None and mesh.pattern is not None,
+        specular=mesh is not None and mesh.specular is not None,
+        layered=bool(scene.medium.layers),
+        lens=sk.PINHOLE if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED,
+        measured_beam=scene.laser.profile == "measured",
+        confocal=scene.scan.mode == "confocal",
+        turned=_is_turned(scene),
+    )
+    return spec._replace(**choices)
+
+
+def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
+    """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
+    from spadwarp.mesh.targets import build_mesh
+
+    mesh = build_mesh(scene)
+    return trace_truth(scene, build_model(scene, pick_device(device), mesh, camera=False))
+
+
+def trace_truth(scene: Scene, model: Model) -> Truth:
+    """`truth_maps` for a model that is already on its device."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    shape = (scene.camera.height, scene.camera.width)
+    if model.mesh is None:
+        nothing = np.full(shape, np.nan, np.float32)
+        return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
+    directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
+    if not scene.camera.is_plain:
+        directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
+    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
+    normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
+    wp.launch(
+        sk.truth_kernel,
+        dim=shape,
+        inputs=[model.camera, model.surfaces, directions],
+        outputs=[depth, distance, normal, reflectance],
+        device=model.device,
+    )
+    return Truth(depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy())
+
+
+def _source(scene: Scene) -> str | None:
+    return None if scene.source is None else str(scene.source)
+
+
+def _laser(scene: Scene, device: wp.Device) -> Any:
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    beam = scene.beam
+    laser = sk.Laser()
+    laser.position = wp.vec3(*beam.position)
+    laser.axis = wp.vec3(*beam.axis)
+    if beam.profile == "measured":
+        rows, columns = sk.profile_tables(load_profile(beam))
+        laser.rows = wp.array(rows, dtype=float, device=device)
+        laser.columns = wp.array(columns, dtype=float, device=device)
+        laser.extent = wp.vec2(*profile_extent(beam))
+        return laser
+    laser.profile = sk.LASER_PROFILES.index(beam.profile)
+    if beam.profile == "gaussian":
+        laser.spread = math.tan(beam.half_angle) ** 2
+    else:
+        laser.spread = 2.0 * math.sin(0.5 * beam.half_angle) ** 2
+    laser.radius = beam.beam_radius
+    return laser
+
+
+def _camera(scene: Scene) -> Any:
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    camera = scene.camera
+    k1, k2, p1, p2, k3 = camera.distortion
+    lens = sk.Camera()
+    lens.width, lens.height = camera.width, camera.height
+    lens.pixel_tangent = camera.pixel_tangent
+    lens.aperture_radius, lens.aperture_area = camera.aperture_radius, camera.aperture_area
+    lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
+    lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
+    lens.view = wp.vec4(*view_box(camera))
+    lens.thin = 0.0 if camera.focus_distance is None else 1.0
+    lens.inverse_focus = camera.inverse_focus
+    return lens
+
+
+def _scan(scene: Scene, device: wp.Device) -> Any:
+    """A raster over the pixels: the beam goes through the middle of each."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
+    scan = sk.Scan()
+    scan.count = len(axes)
+    scan.axis = wp.array(axes.astype(np.float32), dtype=wp.vec3, device=device)
+    scan.view = wp.array(views.astype(np.float32), dtype=wp.vec4, device=device)
+    return scan
+
+
+def _is_turned(scene: Scene) -> bool:
+    """Whether the domain has faces that are not parallel to the camera's axes."""
+    return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
+
+
+def _check_domain(scene: Scene, camera: bool) -> None:
+    places = {"laser.position": to_world(scene.camera, scene.beam.position)}
+    if camera:
+        places["camera.position"] = np.array(scene.camera.position)
+    for name, point in places.items():
+        for axis, place, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
+            if not low <= place <= high:
+                problem = f"{name}: {axis} = {place} is outside [{low}, {high}], the domain"
+                raise ConfigError(problem, source=_source(scene))
+
+
+def _check_size(scene: Scene, model: Model, copies: float) -> None:
+    """Refuses what cannot fit before anything is computed."""
+    shape = (
+        f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    )
+    if model.tally_size >= 2**31:
+        problem = f"camera and gate: {shape} = {model.tally_size} is outside [1, {2**31 - 1}]"
+        raise ConfigError(problem, source=_source(scene))
+    needed = 8 * model.tally_size * copies
+    if model.device.is_cuda:
+        there: int | None = model.device.free_memory
+    else:
+        # Counts on the device, their copy in the result, and the total of the components.
+        needed *= 2
+        there = physical_memory()
+    if there is not None and needed > there:
+        raise DeviceError(
+            f"{shape} need {needed / 2**30:.1f} GiB on {model.device.alias}; there are {there / 2**30:.1f} GiB"
+        )

@@ -1,0 +1,172 @@
+"""Photon records: how each photon ended, traced and kept in HDF5."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.device import pick_device
+from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.transport.model import build_model, transport_spec
+from spadwarp.transport.passes import CPU_PASS, CUDA_PASS, Lane, check_range
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+    from spadwarp.transport.simulate import Progress
+
+__all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
+
+FORMAT = "spadwarp records"
+FORMAT_VERSION = 1
+
+_ARRAYS = ("id", "position", "direction", "weight", "path", "collisions", "reason")
+_READ_ME = (
+    "One row a photon, as its history ended: position [m] and direction in the camera frame (+x right, +y down, "
+    "+z forward), weight, geometric path [m], collisions (surfaces included), reason (index into reasons)."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonRecords:
+    """How each photon ended.
+
+    Attributes:
+        id: uint64 `[N]`.
+        position: float32 `[N, 3]`, where it ended [m].
+        direction: float32 `[N, 3]`, unit vector of its last flight.
+        weight: float32 `[N]`, what was left of it.
+        path: float32 `[N]`, geometric path [m].
+        collisions: int32 `[N]`, events, surfaces included.
+        reason: int32 `[N]`, index into `reasons`.
+        reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
+        ledger: As in `Result`, with its unit.
+    """
+
+    id: NDArray[np.uint64]
+    position: NDArray[np.float32]
+    direction: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    path: NDArray[np.float32]
+    collisions: NDArray[np.int32]
+    reason: NDArray[np.int32]
+    reasons: tuple[str, ...]
+    ledger: dict[str, int]
+    ledger_unit: float
+
+    def ended(self, *names: str) -> NDArray[np.bool_]:
+        """Mask of the photons that ended for one of the named reasons."""
+        return np.isin(self.reason, [self.reasons.index(name) for name in names])
+
+
+def trace(
+    scene: Scene,
+    *,
+    photons: int | None = None,
+    seed: int | None = None,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> PhotonRecords:
+    """Walks photons without a camera and returns the terminal state of each.
+
+    Positions and directions are those of the world. Path is limited by `transport.max_path` alone; the gate plays no
+    part. A photon takes 44 bytes.
+
+    Args and raises: as `simulate`.
+    """
+    import spadwarp_kernels as sk
+    from spadwarp.mesh.targets import build_mesh
+
+    photons = scene.transport.photons if photons is None else photons
+    seed = scene.transport.seed if seed is None else seed
+    check_range("photons", photons, 1, 2**31 - 1)
+    check_range("seed", seed, 0, 2**64 - 1)
+    mesh = build_mesh(scene)
+    model = build_model(scene, pick_device(device), mesh, camera=False)
+    if progress is not None:
+        progress("compile", 0, 0)
+    lane = Lane(model, transport_spec(scene, mesh, estimator="none", records=True), seed=seed)
+    size = CUDA_PASS if model.device.is_cuda else CPU_PASS
+    parts: list[dict[str, NDArray[Any]]] = []
+    for first in range(0, photons, size):
+        stop = min(first + size, photons)
+        lane.data.records = sk.make_records(stop - first, device=model.device)
+        lane.launch(first, stop)
+        names = ("position", "direction", "weight", "path", "collisions", "reason")
+        parts.append({name: getattr(lane.data.records, name).numpy() for name in names})
+        if progress is not None:
+            progress("trace", stop, photons)
+    ledger, _ = sk.read_ledger(lane.data)
+    if any((*scene.camera.position, *scene.camera.rotation_deg)):
+        for part in parts:
+            part["position"] = to_world(scene.camera, part["position"]).astype(np.float32)
+            part["direction"] = (part["direction"] @ rotation_matrix(scene.camera.rotation_deg).T).astype(np.float32)
+    return PhotonRecords(
+        id=np.arange(photons, dtype=np.uint64),
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        reasons=sk.LEDGER_ENTRIES,
+        ledger=ledger,
+        ledger_unit=sk.LEDGER_UNIT,
+    )
+
+
+def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | None = None) -> Path:
+    """Writes the terminal states of photons to one HDF5 file; returns its path.
+
+    Args:
+        records: From `spadwarp.trace`.
+        path: The file; an existing one is replaced when the new one is whole.
+        scene: What they were traced in, to be kept beside them.
+
+    Raises:
+        FileError: The file cannot be written.
+    """
+
+    with hdf5_file(path) as file:
+        file.attrs.update(
+            {
+                "format": FORMAT,
+                "format_version": FORMAT_VERSION,
+                "read_me": _READ_ME,
+                "reasons": list(records.reasons),
+                "ledger_unit": records.ledger_unit,
+            }
+        )
+        for name in _ARRAYS:
+            file.create_dataset(name, data=getattr(records, name), compression="gzip", compression_opts=1, shuffle=True)
+        file.create_dataset("ledger", data=json.dumps(records.ledger))  # integers without limit
+        if scene is not None:
+            file.create_dataset("config", data=scene.to_toml())
+    return Path(path)
+
+
+def load_records(path: str | Path) -> PhotonRecords:
+    """Reads what `save_records` wrote.
+
+    Raises:
+        FileError: No such file, not photon records, or damaged; says which.
+    """
+    import h5py
+
+    if not Path(path).is_file() or not h5py.is_hdf5(path):
+        raise FileError(f"{path}: {'not an HDF5 file' if Path(path).is_file() else 'no such file'}")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT or file.attrs["format_version"] > FORMAT_VERSION:
+                raise FileError(f"{path}: not photon records of format version {FORMAT_VERSION} or older")
+            return PhotonRecords(
+                **{name: file[name][...] for name in _ARRAYS},
+                reasons=tuple(file.attrs["reasons"]),
+                ledger=json.loads(file["ledger"].asstr()[()]),
+                ledger_unit=float(file.attrs["ledger_unit"]),
+            )
+    except SpadwarpError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error

@@ -1,0 +1,227 @@
+"""Cases with a camera or a mesh, from histograms and from the energy ledger."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.validate import references as known
+from spadwarp.validate.runs import Case, Run, point_source, scene
+from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means
+
+__all__ = ["CASES", "scattered_once"]
+
+_WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924}
+_CAMERA = {
+    "width": 32,
+    "height": 32,
+    "horizontal_fov_deg": 10.0,
+    "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
+}
+
+
+def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
+    """The scene of `references.SINGLE_SCATTER` in any water."""
+    laser = {"position": [-0.1, 0.0, 0.0], "profile": "uniform_cone", "half_angle_deg": 2.5}
+    return scene(medium, laser, camera=_CAMERA, path_edges=(2.0, 7.0, 5), max_collisions=1, estimator="guided")
+
+
+def _single_scatter(run: Run) -> list[Quantity]:
+    tables = scattered_once(_WATER)
+    sums = [
+        [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in known.SINGLE_SCATTER.values()]
+        for result in run.results(tables)
+    ]
+    estimates = batch_means(np.reshape(sums, (len(sums), -1)))
+    names = [(where, k, v) for where, (_, _, bins) in known.SINGLE_SCATTER.items() for k, v in enumerate(bins)]
+    return [
+        Quantity(f"path {k + 2}–{k + 3} m, {where}", estimate, reference)
+        for (where, k, reference), estimate in zip(names, estimates, strict=True)
+    ]
+
+
+def _lambertian(run: Run) -> list[Quantity]:
+    laser = {"position": [0.1, -0.05, 0.0], "profile": "uniform_cone", "half_angle_deg": 10.0}
+    plane = {"builtin": "plane", "size": [20.0, 20.0], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
+    tables = scene(_WATER, laser, camera=_CAMERA, path_edges=(0.0, 12.0, 12), targets=[plane], max_collisions=1)
+    sums = [
+        [result.component("ballistic")[rows, columns].sum() for rows, columns, _ in known.LAMBERTIAN.values()]
+        for result in run.results(tables)
+    ]
+    return [
+        Quantity(f"reflected once, {where}", estimate, reference)
+        for (where, (_, _, reference)), estimate in zip(known.LAMBERTIAN.items(), batch_means(sums), strict=True)
+    ]
+
+
+def _ledger(run: Run) -> list[Quantity]:
+    """A scene in which every way to end occurs."""
+    laser = {"profile": "uniform_cone", "half_angle_deg": 15.0}
+    target = {"builtin": "staircase", "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
+    common: dict[str, Any] = {
+        "camera": _CAMERA,
+        "path_edges": (0.0, 15.0, 15),
+        "targets": [target],
+        "domain": {"shape": "box", "lower": [-4.0, -4.0, -1.0], "upper": [4.0, 4.0, 6.0]},
+        "lateral_limit": 3.5,
+        "max_collisions": 20,
+        "axis_threshold": 0.9998,
+    }
+    water = {"extinction": 0.6, "albedo": "paper", "anisotropy": 0.924}
+    quantities = []
+    for estimator in ("analog", "next_event", "guided"):
+        for termination, cutoff in (("cutoff", 0.05), ("roulette", 0.3)):
+            rules: dict[str, Any] = {"estimator": estimator, "termination": termination, "weight_cutoff": cutoff}
+            missing, gains = 0, []
+            for result in run.results(scene(water, laser, **common, **rules)):
+                emitted = result.photons / result.ledger_unit
+                entries = {name: value for name, value in result.ledger.items() if name != "emitted"}
+                missing += abs(round(emitted) - sum(entries.values()))
+                gains.append([entries.get(name, 0) / emitted for name in ("roulette", "directed")])
+            name = f"{estimator}, {termination}"
+            quantities.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
+            for entry, gain, possible in zip(
+                ("roulette", "directed"),
+                batch_means(gains),
+                (termination == "roulette", estimator == "guided"),
+                strict=True,
+            ):
+                if possible:
+                    quantities.append(Quantity(f"mean {entry} entry per photon, {name}", gain, 0.0))
+    return quantities
+
+
+def _reciprocity(run: Run) -> list[Quantity]:
+    """Laser and camera change places: cones of equal half-angle, a box in the beams, many scatterings."""
+    half_angle, pixels = 6.0, 64
+    diameter = 1e-3
+    camera = {
+        "width": pixels,
+        "height": pixels,
+        "horizontal_fov_deg": 2 * half_angle,
+        "aperture_diameter": diameter,
+    }
+    position, direction = np.array([-0.8, 0.3, -0.4]), np.array([0.22, -0.05, 1.0])
+    direction /= np.linalg.norm(direction)
+    centre = np.array([0.25, 0.1, 3.2])
+    turn = _turn_onto_z(direction)
+    weights = _disc_weights(math.radians(half_angle), pixels)
+
+    def measured(at: NDArray, along: NDArray, placement: NDArray, turned: NDArray) -> list[Estimate]:
+        laser = {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle}
+        block = {
+            "builtin": "box",
+            "size": [0.7, 0.5, 0.6],
+            "rotation_deg": _intrinsic_angles(turned),
+            "translation": placement.tolist(),
+        }
+        tables = scene(
+            {**_WATER, "extinction": 0.6},
+            laser,
+            camera=camera,
+            path_edges=(5.0, 13.0, 4),
+            targets=[block],
+            max_collisions=20,
+            estimator="guided",
+        )
+        return batch_means([np.einsum("ijt,ij->t", r.histogram, weights) for r in run.results(tables)])
+
+    # In the other's frame, x' = turn·(x − position), this laser looks along +z from the origin and serves as the
+    # camera.
+    forward = measured(position, direction, centre, np.eye(3))
+    backward = measured(turn @ -position, turn @ np.array([0.0, 0.0, 1.0]), turn @ (centre - position), turn)
+    return [
+        Quantity(f"path {5 + 2 * k}–{7 + 2 * k} m, laser and camera swapped", one, other.value, other.standard_error)
+        for k, (one, other) in enumerate(zip(forward, backward, strict=True))
+    ]
+
+
+def _mean_path(run: Run) -> list[Quantity]:
+    """White walls make cosine-law light of any light shut in by them: its mean path from wall to wall is 4V/S."""
+    quantities = []
+    bodies = {
+        "box 1 × 2 × 3 m": {"builtin": "box", "size": [1.0, 2.0, 3.0]},
+        "sphere of 2 m": {"builtin": "sphere", "size": [2.0]},
+    }
+    waters = {
+        "clear": {"extinction": 1e-6, "albedo": 1.0},
+        "c 1 1/m, g 0.924": {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924},
+        "c 2 1/m, g −0.5": {"extinction": 2.0, "albedo": 1.0, "anisotropy": -0.5},
+    }
+    # The light has to forget where it started: with c 2 1/m and g −0.5 the slowest even mode of the box decays as
+    # exp(−0.49 path), which left 1.5e-4 of the mean path after 15 m.
+    early, late = 30.0, 50.0
+    for body, target in bodies.items():
+        targets = [{**target, "reflectance": 1.0}]
+        expected = _four_volumes_per_area(targets[0])
+        for water, medium in waters.items():
+            means = ScoreMeans()
+            until = [
+                scene(medium, point_source(0.1, 0.2, 0.3), targets=targets, max_path=path) for path in (early, late)
+            ]
+            for first, last in zip(*(run.records(tables, key=body + water) for tables in until), strict=True):
+                # Events of one photon between two moments of its life: walls at the rate 1/⟨path⟩, water at the rate c.
+                means.add((last.collisions - first.collisions).astype(np.float64))
+            (events,) = means.estimates()
+            walls = events.value - medium["extinction"] * (late - early)
+            path = (late - early) / walls
+            estimate = Estimate(path, path / walls * events.standard_error)
+            quantities.append(Quantity(f"mean path [m], {body}, {water}", estimate, expected))
+    return quantities
+
+
+def _four_volumes_per_area(target: dict[str, Any]) -> float:
+    """4V/S [m] of a closed convex target about the origin."""
+    from spadwarp.mesh.targets import load_target
+    from spadwarp.scene import Target
+
+    mesh = load_target(Target(**target))
+    corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume = abs(np.einsum("fi,fi->", corners[:, 0], cross)) / 6.0
+    return 4.0 * volume / (np.linalg.norm(cross, axis=1).sum() / 2.0)
+
+
+def _turn_onto_z(direction: NDArray) -> NDArray:
+    """A rotation matrix that takes a unit vector to +z."""
+    right = np.cross([0.0, 1.0, 0.0], direction)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(direction, right), direction])
+
+
+def _intrinsic_angles(rotation: NDArray) -> list[float]:
+    """Angles [°] about x, y, z of a rotation Rx·Ry·Rz."""
+    return np.degrees(
+        [
+            math.atan2(-rotation[1, 2], rotation[2, 2]),
+            math.asin(np.clip(rotation[0, 2], -1.0, 1.0)),
+            math.atan2(-rotation[0, 1], rotation[0, 0]),
+        ]
+    ).tolist()
+
+
+def _disc_weights(half_angle: float, pixels: int, inner: int = 16) -> NDArray[np.float64]:
+    """What makes a square camera see like a laser's uniform cone: 1/cosψ inside it, 0 outside, `[pixels, pixels]`."""
+    fine = pixels * inner
+    tangent = ((np.arange(fine) + 0.5) / fine * 2.0 - 1.0) * math.tan(half_angle)
+    squared = tangent[:, None] ** 2 + tangent**2
+    weight = np.sqrt(1.0 + squared) * (squared < math.tan(half_angle) ** 2)
+    return weight.reshape(pixels, inner, pixels, inner).mean(axis=(1, 3))
+
+
+CASES = (
+    Case(
+        "single-scatter", "Light scattered once, by path and pixel: quadrature over the same geometry", _single_scatter
+    ),
+    Case("lambertian", "Light reflected once by a plane, by pixel: quadrature", _lambertian),
+    Case("ledger", "Emitted weight is accounted for to the last unit; signed entries have mean zero", _ledger),
+    Case("reciprocity", "Laser and camera change places before a target in turbid water", _reciprocity),
+    Case(
+        "mean-path",
+        "Mean path 4V/S in a closed convex mesh, whatever the scattering (Blanco & Fournier 2003)",
+        _mean_path,
+    ),
+)

@@ -1,0 +1,1 @@
+"""Pictures, pages and videos: arrays in, images out."""

@@ -1,0 +1,184 @@
+"""Light in flight as a moving picture: `video`."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import FileError
+from spadwarp.io.atomic import atomic_path
+from spadwarp.result.file import load_result
+from spadwarp.result.result import Result
+
+__all__ = ["video"]
+
+_DECADES = 4.0  # of the logarithmic colour scale
+_DPI = 100
+
+
+def video(
+    source: Result | str | Path,
+    path: str | Path = "light.gif",
+    *,
+    window_ns: tuple[float, float] | None = None,
+    pictures: int = 120,
+    fps: float = 12.0,
+    scale: Literal["log", "linear"] = "log",
+    frame: int = 0,
+) -> Path:
+    """Writes what each pixel receives, bin after bin, as an animated GIF or an MP4; returns its path.
+
+    Every picture is a time of flight: light that is scattered back on the way out, then the target, lit from near to
+    far. The colour scale is one for all pictures, its upper end the 99.9th percentile of what is not zero.
+
+    Args:
+        source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
+        path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install imageio-ffmpeg`.
+        window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
+        pictures: At most; bins are merged so that there are no more.
+        fps: Pictures per second.
+        scale: "log" over four decades, or "linear".
+        frame: Of frames, which one, from 0.
+
+    Raises:
+        ValueError: An argument out of range, or another ending.
+        FileError: A file cannot be read or written, or ffmpeg is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
+    if pictures < 1 or not 0 < fps <= 50:
+        raise ValueError(f"pictures = {pictures} and fps = {fps:g} are not in [1, inf) and (0, 50]")
+    cube, edges, label, metres_per_ns = _light(source, frame)
+    kept = _window(cube, edges, window_ns)
+    cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
+    merged = -(-cube.shape[2] // pictures)
+    starts = np.arange(0, cube.shape[2], merged)
+    cube = np.add.reduceat(cube, starts, axis=2)
+    edges = np.append(edges[starts], edges[-1])
+    label += " and picture" if merged > 1 else " and bin"
+    drawn = _pictures(cube, edges, label, metres_per_ns, scale)
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    with atomic_path(path) as temporary:
+        write(drawn, temporary, fps)
+    return path
+
+
+def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
+    """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
+    import h5py
+
+    from spadwarp.frames.measured import frames_scene
+    from spadwarp.scene import SPEED_OF_LIGHT
+    from spadwarp.viz.viewer import find_run, holds_frames
+
+    if not isinstance(source, Result):
+        place = find_run(source)
+        if holds_frames(place):
+            with h5py.File(place, "r") as file:
+                count = file["counts"].shape[0]
+                if not 0 <= frame < count:
+                    raise ValueError(f"frame = {frame} is outside [0, {count}), the frames of {place}")
+                edges = 1e9 * (float(file.attrs["gate_start"]) + file["edges"][...])
+                speed = SPEED_OF_LIGHT / frames_scene(file).medium.group_index
+                return file["counts"][frame].astype(np.float64), edges, "counts per pixel", 1e-9 * speed
+        source = load_result(place)
+    return source.detections, 1e9 * source.bin_edges, "detections per pulse, pixel", 1e-9 * source.water_speed
+
+
+def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
+    """The bins of a window [ns], or those from the first to the last with light in them."""
+    if window_ns is not None:
+        first, last = (int(np.searchsorted(edges, time, side="right")) - 1 for time in window_ns)
+        first, last = max(first, 0), min(max(last, 0), len(edges) - 2)
+        if not window_ns[0] < window_ns[1] or window_ns[0] >= edges[-1] or window_ns[1] <= edges[0]:
+            raise ValueError(f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns")
+        return slice(first, last + 1)
+    lit = np.flatnonzero(cube.any(axis=(0, 1)))
+    return slice(int(lit[0]), int(lit[-1]) + 1) if len(lit) else slice(0, cube.shape[2])
+
+
+def _pictures(
+    cube: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    label: str,
+    metres_per_ns: float,
+    scale: str,
+) -> Iterator[NDArray[np.uint8]]:
+    """RGB pictures, one after the other."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.figure import Figure
+
+    height, width = cube.shape[:2]
+    lit = cube[cube > 0]
+    top = float(np.percentile(lit, 99.9)) if lit.size else 1.0
+    norm = LogNorm(top * 10.0**-_DECADES, top) if scale == "log" else Normalize(0.0, top)
+    colours = matplotlib.colormaps["inferno"].with_extremes(bad="black", under="black")
+    tall = float(np.clip(5.0 * height / width, 1.5, 9.0))
+    figure = Figure(figsize=(5.4, tall + 1.5), dpi=_DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes, bar = figure.subplots(2, 1, height_ratios=[tall, 0.15])
+    axes.set(xticks=[], yticks=[])
+    image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm, interpolation="nearest")
+    figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
+    title = axes.set_title(" ", fontsize=11)
+    for index in range(cube.shape[2]):
+        image.set_data(cube[:, :, index])
+        middle = 0.5 * (edges[index] + edges[index + 1])
+        title.set_text(f"{middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+        canvas.draw()
+        if index == 0:
+            figure.set_layout_engine("none")  # measured once, so that nothing moves
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    from PIL import Image
+
+    frames: list[Any] = []
+    palette = None
+    for picture in pictures:
+        image = Image.fromarray(picture)
+        # One palette for all, from the colour bar in the first: colours must not flicker.
+        palette = image.quantize(255) if palette is None else palette
+        frames.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
+    frames[0].save(
+        path, format="GIF", save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False
+    )
+
+
+def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    program = shutil.which("ffmpeg")
+    if program is None:
+        try:
+            from imageio_ffmpeg import get_ffmpeg_exe
+        except ImportError as error:
+            raise FileError("an MP4 needs ffmpeg: pip install imageio-ffmpeg, or write a .gif") from error
+        program = get_ffmpeg_exe()
+    first = next(pictures)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps)]
+    # Players want even sides and colours at half resolution.
+    command += ["-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command += ["-f", "mp4", str(path)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None and process.stderr is not None
+    try:
+        process.stdin.write(first.tobytes())
+        for picture in pictures:
+            process.stdin.write(picture.tobytes())
+        process.stdin.close()
+    except BrokenPipeError:
+        pass  # what ffmpeg says follows
+    said = process.stderr.read().decode(errors="replace").strip()
+    process.stderr.close()
+    if process.wait() != 0:
+        raise FileError(f"{path}: ffmpeg failed: {said}")

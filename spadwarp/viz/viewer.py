@@ -1,0 +1,320 @@
+"""A run as one HTML file that shows itself in any browser, without a network: `view`."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import FileError
+from spadwarp.io.atomic import atomic_path, file_within
+from spadwarp.result.file import load_result
+from spadwarp.result.result import COMPONENTS, Result, pixel_directions
+
+if TYPE_CHECKING:
+    from spadwarp.frames.response import InstrumentResponse
+    from spadwarp.scene import Scene
+
+__all__ = ["HISTOGRAM_BYTES", "view"]
+
+HISTOGRAM_BYTES = 5_000_000
+"""What the packed histograms may take [bytes]; with plotly and the images the page stays below 15 MB."""
+
+_DECADES = 7.0
+# Blocks of pixels and of bins that are added up until the histograms fit, the finest first.
+_STEPS = ((1, 1), (1, 2), (1, 4), (2, 2), (2, 4), (2, 8), (4, 4), (4, 8), (4, 16), (8, 16), (16, 16), (32, 32))
+_COLOURS = {"ballistic": "#0072B2", "forward_scattered": "#E69F00", "backscatter": "#009E73"}
+_LABELS = {
+    "ballistic": "target, ballistic",
+    "forward_scattered": "target, forward-scattered",
+    "backscatter": "water, backscatter",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Layer:
+    """Histograms of one kind: `cube` `[H, W, T]`, times `factor` what is shown."""
+
+    label: str
+    colour: str
+    cube: NDArray[Any]
+    factor: float
+    filled: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Page:
+    """What a page is made of, from a result or from frames of a camera."""
+
+    title: str
+    caption: str
+    scene: Scene
+    depth: NDArray[np.float64]
+    method: str
+    truth: NDArray[np.float64]
+    reflectance: NDArray[np.float64] | None
+    intensity: NDArray[np.float64]
+    intensity_label: str
+    layers: list[_Layer]
+    edges: NDArray[np.float64]
+    unit: str
+    response: InstrumentResponse
+
+
+def view(
+    source: Result | str | Path,
+    path: str | Path = "view.html",
+    *,
+    method: str | None = None,
+    frame: int = 0,
+    device: Any = None,
+) -> Path:
+    """Writes one self-contained HTML file; returns its path.
+
+    It shows the depth frame as a point cloud coloured by its error, the depth frame, its truth, error and intensity as
+    images, and the histogram of the pixel that is clicked on: a result's components, or counts of a frame with their
+    expectation and background, with the instrument response. `view.html#row,column` opens on a pixel. Histograms are
+    kept to 7 decades and 7 %, counts exactly; where they would take more than `HISTOGRAM_BYTES`, bins and then blocks
+    of pixels are averaged, and the page says so.
+
+    Args:
+        source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
+        path: The file to write.
+        method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
+        frame: Of frames, which one, from 0.
+        device: Warp device for the depth frame.
+
+    Raises:
+        FileError: plotly is not installed, or a file cannot be read or written.
+        ValueError: No such frame or method.
+    """
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
+    page = _of_result(source, method, device) if isinstance(source, Result) else _of_file(source, method, frame, device)
+    template = (Path(__file__).parent / "viewer.html").read_text(encoding="utf-8")
+    filled = {
+        "__TITLE__": html.escape(page.title),
+        "__CAPTION__": html.escape(page.caption),
+        "__DATA__": json.dumps(_data(page)).replace("</", "<\\/"),
+        "__PLOTLY__": get_plotlyjs(),
+    }
+    text = re.sub("|".join(filled), lambda mark: filled[mark.group()], template)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+# Sources
+
+
+def find_run(place: str | Path) -> Path:
+    """The file of a result or of frames, or the one that a directory holds; raises `FileError` where it is not one."""
+    return file_within(place, ("frames.h5", "result.h5"))
+
+
+def _of_file(place: str | Path, method: str | None, frame: int, device: Any) -> _Page:
+    import h5py
+
+    path = find_run(place)
+    if holds_frames(path):
+        with h5py.File(path, "r") as file:
+            return _of_frames(file, path, method, frame)
+    return _of_result(load_result(path), method, device)
+
+
+def holds_frames(path: Path) -> bool:
+    """Whether a file holds frames of a camera."""
+    import h5py
+
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return False
+    with h5py.File(path, "r") as file:
+        return bool(file.attrs.get("format") == "spadwarp frames")
+
+
+def _of_result(result: Result, method: str | None, device: Any) -> _Page:
+    from spadwarp.frames.measured import scene_response
+
+    scene = result.scene
+    per_pulse = scene.laser.photons_per_pulse * scene.detector.pde
+    # In a scan the positions' numbers of photons differ by one at most.
+    scale = float(result.tally_value.mean()) * per_pulse
+    chosen: Any = method or "centroid"
+    photons = f"{result.photons:,}".replace(",", " ")
+    return _Page(
+        title=_name(scene),
+        caption=f"{photons} photons, seed {result.seed}, {scene.transport.estimator}"
+        + (", stopped early" if result.partial else "")
+        + "; expected histograms, before the instrument response",
+        scene=scene,
+        depth=result.depth(method=chosen, device=device),
+        method=chosen,
+        truth=result.truth.depth.astype(np.float64),
+        reflectance=result.truth.reflectance.astype(np.float64),
+        intensity=result.intensity * per_pulse,
+        intensity_label="detections per pulse",
+        layers=[
+            _Layer(label=_LABELS[name], colour=_COLOURS[name], cube=cube, factor=scale)
+            for name, cube in zip(COMPONENTS, result.tallies, strict=True)
+        ],
+        edges=result.bin_edges,
+        unit="detections per pulse and bin",
+        response=scene_response(scene),
+    )
+
+
+def _of_frames(file: Any, path: Path, method: str | None, frame: int) -> _Page:
+    from spadwarp.frames.measured import frames_response, frames_scene
+
+    about, methods = file.attrs, list(file["depth"])
+    frames = file["counts"].shape[0]
+    if not 0 <= frame < frames:
+        raise ValueError(f"frame = {frame} is outside [0, {frames}), the frames of {path}")
+    if method is not None and method not in methods:
+        raise ValueError(f"method = {method!r} is not one of {', '.join(methods)}, which {path} holds")
+    chosen = method or next(name for name in ("likelihood", "matched", "centroid", "peak") if name in methods)
+    scene, pulses = frames_scene(file), int(about["pulses"])
+    counts, expected = file["counts"][frame], file["expected"][...]
+    background = np.broadcast_to(file["background"][...], counts.shape)
+    said = f"{pulses:,}".replace(",", " ")
+    return _Page(
+        title=_name(scene),
+        caption=f"frame {frame} of {frames}: {said} pulses, {scene.detector.mode.replace('_', '-')}, seed"
+        f" {about['seed']}; expectations before pile-up",
+        scene=scene,
+        depth=file[f"depth/{chosen}"][frame].astype(np.float64),
+        method=chosen,
+        truth=file["truth/depth"][...].astype(np.float64),
+        reflectance=None,
+        intensity=file["intensity"][frame].astype(np.float64),
+        intensity_label="counts in the frame",
+        layers=[
+            _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
+            _Layer(label="expected", colour="#0072B2", cube=expected, factor=pulses),
+            _Layer(label="of that, background", colour="#009E73", cube=background, factor=pulses),
+        ],
+        edges=float(about["gate_start"]) + file["edges"][...],
+        unit="counts per bin",
+        response=frames_response(file),
+    )
+
+
+def _name(scene: Scene) -> str:
+    return "spadwarp" if scene.source is None else Path(scene.source).stem
+
+
+# What the page carries
+
+
+def _data(page: _Page) -> dict[str, Any]:
+    """Everything for the script, arrays packed."""
+    from spadwarp.scene import SPEED_OF_LIGHT
+
+    scene = page.scene
+    directions, laser = pixel_directions(scene.camera), np.asarray(scene.beam.position, dtype=np.float64)
+    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    distance = page.truth / directions[..., 2]
+    arrival = (np.linalg.norm(distance[..., None] * directions - laser, axis=-1) + distance) / speed
+    cloud = (page.depth / directions[..., 2])[..., None] * directions
+    histograms, block, merged = _histograms(page.layers)
+    edges = page.edges[::merged]
+    if edges[-1] != page.edges[-1]:
+        edges = np.append(edges, page.edges[-1])
+    images = {"depth": page.depth, "truth": page.truth, "error": page.depth - page.truth, "intensity": page.intensity}
+    if page.reflectance is not None:
+        images["reflectance"] = page.reflectance
+    return {
+        "shape": list(page.depth.shape),
+        "images": {name: _packed(image, "<f4") for name, image in images.items()},
+        "cloud": [_packed(cloud[..., axis], "<f4") for axis in range(3)],
+        "arrival": _packed(1e9 * arrival, "<f4"),
+        "towards": _packed(directions @ laser, "<f4"),
+        "laser": float(laser @ laser),
+        "speed": 1e-9 * speed,
+        "method": page.method,
+        "intensityLabel": page.intensity_label,
+        "histograms": histograms,
+        "block": block,
+        "merged": merged,
+        "edges": [round(1e9 * float(edge), 6) for edge in edges],
+        "unit": page.unit,
+        "response": _response(page.response),
+        "first": _first_pixel(page),
+    }
+
+
+def _histograms(layers: list[_Layer]) -> tuple[list[dict[str, Any]], int, int]:
+    """The layers packed within `HISTOGRAM_BYTES`, pixels in a block's side and bins that were merged."""
+    for block, merged in _STEPS:
+        rows = max(layers[0].cube.shape[0] // 16, block) // block * block
+        trial = sum(len(_pack(_reduced(layer.cube[:rows], block, merged), layer)["codes"]) for layer in layers)
+        if trial * layers[0].cube.shape[0] / rows > 1.5 * HISTOGRAM_BYTES:
+            continue  # far from it: the whole need not be packed to know
+        packed = [_pack(_reduced(layer.cube, block, merged), layer) for layer in layers]
+        if sum(len(one["codes"]) for one in packed) <= HISTOGRAM_BYTES / 3 * 4:
+            break
+    return packed, block, merged
+
+
+def _reduced(cube: NDArray[Any], block: int, merged: int) -> NDArray[Any]:
+    """Sums over blocks of pixels and bins, what is left over at the ends included."""
+    for axis, step in ((2, merged), (1, block), (0, block)):
+        if step > 1:
+            cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], step), axis=axis)
+    return cube
+
+
+def _pack(values: NDArray[Any], layer: _Layer) -> dict[str, Any]:
+    """Whole numbers below 65536 as they are, others as the logarithm in 254 steps; deflated."""
+    about = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
+    high = float(values.max())
+    if layer.filled and high < 65536:
+        return {**about, "kind": "whole", "codes": _deflated(values.astype("<u2"))}
+    lowest = high * 10.0**-_DECADES
+    codes = np.zeros(values.shape, dtype=np.uint8)
+    there = values > lowest
+    if there.any():
+        codes[there] = 1 + np.round(254.0 / _DECADES * np.log10(values[there] / lowest)).astype(np.uint8)
+    return {**about, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _deflated(codes)}
+
+
+def _packed(values: NDArray[Any], kind: str) -> str:
+    return _deflated(values.astype(kind))
+
+
+def _deflated(values: NDArray[Any]) -> str:
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode("ascii")
+
+
+def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
+    """The response over the delay [ns], its peak 1; None without width."""
+    low, high = response.support
+    if not high > low or (response.times is None and response.sigma == response.tail == 0.0):
+        return None
+    delays = np.linspace(low, high, 241)
+    density = response.density(delays)
+    kept = density > 1e-3 * density.max()
+    return {
+        "delay": [round(1e9 * float(delay), 6) for delay in delays[kept]],
+        "value": [round(float(value), 5) for value in density[kept] / density.max()],
+    }
+
+
+def _first_pixel(page: _Page) -> list[int]:
+    """The pixel that the page opens on: of those with a depth, the one of median intensity."""
+    known = np.flatnonzero(np.isfinite(page.depth) & np.isfinite(page.truth))
+    if not len(known):
+        known = np.arange(page.depth.size)
+    order = known[np.argsort(page.intensity.ravel()[known], kind="stable")]
+    row, column = divmod(int(order[(len(order) - 1) // 2]), page.depth.shape[1])
+    return [row, column]

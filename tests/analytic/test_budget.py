@@ -1,0 +1,148 @@
+"""Budgets and sweeps: the numbers an experimenter asks first."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helpers.scenes import scene
+from spadwarp.analytic.budget import BudgetRow, DepthErrorRow, budget, parse_vary, plot_budget, plot_sweep, sweep
+from spadwarp.analytic.model import simulate_analytic
+from spadwarp.errors import ConfigError
+
+SCENE = scene(
+    medium={"extinction": 0.3, "albedo": 0.7},
+    laser={"half_angle_deg": 10.0, "position": [0.0, 0.0, 0.0]},
+    camera={"width": 8, "height": 8, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01},
+    gate={"start_ns": 5.0, "bin_width_ps": 50.0, "bins": 400},
+)
+
+
+def test_a_row_is_the_analytic_model_on_the_axis():
+    row = budget(SCENE, ranges=[2.2])[0]
+    result = simulate_analytic(SCENE, frames=0)
+    assert row.signal == pytest.approx(result.signal[3:5, 3:5].mean(), rel=2e-3)
+    assert row.sigma_depth == pytest.approx(result.sigma_depth[3:5, 3:5].mean(), rel=2e-3)
+    assert row.background == pytest.approx((result.backscatter + 100.0 * 2e-8)[3:5, 3:5].mean(), rel=2e-2)
+    assert row.alpha == pytest.approx(row.signal + row.background, rel=1e-6)
+    assert row.optical_depth == pytest.approx(0.66)
+    assert (row.gate_start, row.gate_stop) == (SCENE.gate.start, SCENE.gate.stop)
+    assert row.sigma_depth / row.sigma_time == pytest.approx(0.5 * 299_792_458.0, rel=1e-9)  # index 1
+
+
+def test_rows_run_over_waters_and_ranges_and_the_gate_follows():
+    ranges = [1.0, 4.0, 9.0]
+    rows = budget(SCENE, ranges=ranges, media=["uwoc-clear", "uwoc-harbour"])
+    assert [(row.medium, row.range) for row in rows] == [(w, r) for w in ("uwoc-clear", "uwoc-harbour") for r in ranges]
+    clear, harbour = rows[:3], rows[3:]
+    assert clear[0].extinction == pytest.approx(0.149) and harbour[0].extinction == pytest.approx(2.17)
+    for row in rows:
+        assert row.gate_start <= row.arrival <= row.gate_stop
+        assert row.gate_stop - row.gate_start == pytest.approx(2e-8)
+    for few, more in zip(harbour, clear, strict=True):
+        assert few.signal < more.signal and few.sigma_depth > more.sigma_depth
+        assert few.pulses_for_1cm > more.pulses_for_1cm and few.sbnr < more.sbnr
+    assert [row.signal for row in clear] == sorted((row.signal for row in clear), reverse=True)
+    named = budget(SCENE, ranges=[4.0], media={"tank": {"extinction": 1.0, "albedo": 0.9}})[0]
+    assert (named.medium, named.extinction) == ("tank", 1.0)
+
+
+@pytest.mark.parametrize("count_law", ["per_pulse", "per_frame", "per_frame_paper"])
+def test_the_pulses_needed_are_enough_and_not_too_many(count_law):
+    """With them the bound is within 1 cm and outliers are within 1 %; with a tenth less one of the two is not."""
+    one = SCENE.with_overrides(
+        {"analytic.count_law": count_law, "laser.pulse_energy": 1e-11, "detector.dark_count_rate": 2e4}
+    )
+    per_frame = 1 if count_law == "per_pulse" else one.analytic.exposure * one.laser.repetition_rate
+    for distance in (2.0, 8.0):
+        needed = budget(one, ranges=[distance])[0].pulses_for_1cm
+        assert 10 < needed < 1e15
+
+        def row(pulses):
+            field = "analytic.pulses" if count_law == "per_pulse" else "analytic.frames"
+            count = max(1, math.ceil(pulses / per_frame))
+            return budget(one.with_overrides({field: count}), ranges=[distance])[0]  # noqa: B023
+
+        enough, scarce = row(needed * 1.01), row(needed * 0.9)
+        assert enough.sigma_depth <= 0.0101 and enough.outlier_probability <= 0.0101
+        if needed > 20 * per_frame:
+            assert scarce.sigma_depth > 0.01 or scarce.outlier_probability > 0.01
+
+
+def test_where_nothing_comes_back_no_number_of_pulses_is_enough():
+    row = budget(SCENE, ranges=[50.0], media={"ink": {"extinction": 20.0, "albedo": 0.1}})[0]
+    assert row.pulses_for_1cm == math.inf and row.signal == 0.0
+    assert math.isnan(row.sigma_depth) and math.isnan(row.outlier_probability)
+
+
+@pytest.mark.parametrize(
+    "text, field, values",
+    [
+        ("medium.extinction=0.1:2:20", "medium.extinction", np.linspace(0.1, 2, 20)),
+        ("laser.pulse_energy = 1e-9:1e-7:3:log", "laser.pulse_energy", [1e-9, 1e-8, 1e-7]),
+        ("gate.bins=64,128", "gate.bins", [64, 128]),
+        ("targets[0].translation=[0, 0, 2], [0, 0, 3]", "targets[0].translation", [[0, 0, 2], [0, 0, 3]]),
+        ("medium.preset=uwoc-clear,uwoc-harbour", "medium.preset", ["uwoc-clear", "uwoc-harbour"]),
+    ],
+)
+def test_what_to_vary(text, field, values):
+    name, parsed = parse_vary(text)
+    assert name == field and len(parsed) == len(values)
+    for one, other in zip(parsed, values, strict=True):
+        assert one == (pytest.approx(other) if isinstance(other, float) else other)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["medium.extinction", "=1:2:3", "a.b=", "a.b=1:2", "a.b=1:2:0", "a.b=1:2:3:4", "a.b=-1:2:3:log", "a.b=1:x:3"],
+)
+def test_what_cannot_be_varied(text):
+    with pytest.raises(ValueError, match=r"vary = .* is not of the form section.field"):
+        parse_vary(text)
+
+
+def test_a_sweep_follows_the_lidar_equation():
+    """S falls as e^{−2cR} with the extinction and rises with the pulse energy; the field may be any of the scene."""
+    curves = sweep(SCENE, vary="medium.extinction=0.1:1.1:3")
+    assert isinstance(curves.rows[0], BudgetRow) and curves.values == pytest.approx((0.1, 0.6, 1.1))
+    signal, distance = curves.column("signal"), curves.rows[0].range
+    np.testing.assert_allclose(np.log(signal[:-1] / signal[1:]), 2 * 0.5 * distance, rtol=1e-6)
+    curves = sweep(SCENE, vary=("laser.pulse_energy", [1e-9, 3e-9]), of="depth-error")
+    first, second = curves.rows
+    assert isinstance(first, DepthErrorRow) and second.sigma_depth < first.sigma_depth <= first.sigma_depth_p90
+    assert first.estimate_fraction == 1.0
+    far = sweep(SCENE, vary="targets[0].translation=[0, 0, 2.0]")
+    assert far.rows[0].range == pytest.approx(2.0, rel=0.01)
+
+
+def test_bad_requests_are_named():
+    with pytest.raises(ValueError, match="of = 'depth' is not one of 'budget', 'depth-error'"):
+        sweep(SCENE, vary="medium.extinction=1", of="depth")
+    with pytest.raises(ConfigError, match=r"medium\.haze"):
+        sweep(SCENE, vary="medium.haze=1:2:2")
+    with pytest.raises(ConfigError, match="outside"):
+        sweep(SCENE, vary="medium.anisotropy=0.5:1.5:3")
+    with pytest.raises(ValueError, match=r"ranges = \[-1.0, 2.0\]"):
+        budget(SCENE, ranges=[2.0, -1.0])
+    with pytest.raises(ValueError, match="reflectance = 2"):
+        budget(SCENE, reflectance=2)
+    with pytest.raises(ConfigError, match="no target is in view"):
+        sweep(SCENE.with_overrides({"targets": []}), vary="medium.extinction=1")
+
+
+def test_pictures_are_written_whole(tmp_path):
+    rows = budget(SCENE, ranges=[1, 3, 9], media=["uwoc-clear", "uwoc-harbour"])
+    figure = plot_budget(rows, tmp_path / "budget.png")
+    assert len(figure.axes) == 4
+    assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["1", "3", "9"]
+    assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == [
+        "uwoc-clear (0.149/m)",
+        "uwoc-harbour (2.17/m)",
+    ]
+    for of in ("budget", "depth-error"):
+        figure = plot_sweep(sweep(SCENE, vary="medium.extinction=0.1:2:3", of=of), tmp_path / f"{of}.pdf")
+        assert all(axis.get_xlabel() == "medium.extinction [1/m]" for axis in figure.axes)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["budget.pdf", "budget.png", "depth-error.pdf"]
+    assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "budget.pdf").read_bytes().startswith(b"%PDF")

@@ -1,0 +1,365 @@
+"""The analytic simulator on scenes: maps, frames, files, errors; agreement with Monte Carlo; bounds of histograms."""
+
+import dataclasses
+import math
+
+import h5py
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.scenes import scene
+from reference import crlb
+from spadwarp.analytic.model import simulate_analytic
+from spadwarp.errors import ConfigError
+from spadwarp.frames.cramer_rao import crlb_from_histogram, crlb_map
+from spadwarp.frames.response import InstrumentResponse
+from spadwarp.result.result import Truth
+
+GATE = {"start_ns": 5.0, "bin_width_ps": 100.0, "bins": 200}
+
+
+def lidar_scene(**sections):
+    """16 x 12 pixels on a tilted plate at 2.2 m that leaves the view's right edge empty; a GPU is not needed."""
+    target = {"builtin": "plane", "size": [1.6, 3.0], "translation": [-0.3, 0.0, 2.2], "rotation_deg": [10, 25, 0]}
+    return scene(
+        **{
+            "medium": {"extinction": 0.2, "albedo": 0.3},
+            "laser": {"half_angle_deg": 35.0, "position": [-0.2, 0.05, 0.0]},
+            "camera": {"width": 16, "height": 12, "horizontal_fov_deg": 50.0, "aperture_diameter": 0.02},
+            "detector": {"pdp": 0.2, "fill_factor": 0.1, "jitter_fwhm_ps": 150.0},
+            "gate": GATE,
+            "targets": [{**target, "reflectance": 0.6}],
+            **sections,
+        }
+    )
+
+
+def flat_truth(one, depth=2.2, reflectance=0.5):
+    shape = (one.camera.height, one.camera.width)
+    from spadwarp.result.result import pixel_directions
+
+    z = np.full(shape, depth, np.float32)
+    return Truth(
+        depth=z,
+        range=(z / pixel_directions(one.camera)[..., 2]).astype(np.float32),
+        normal=np.tile(np.array([0, 0, -1], np.float32), (*shape, 1)),
+        reflectance=np.full(shape, reflectance, np.float32),
+    )
+
+
+def test_maps_and_frames_fit_together():
+    one = lidar_scene()
+    result = simulate_analytic(one, frames=200, seed=3)
+    hit = ~np.isnan(result.truth.depth)
+    assert 0.3 < hit.mean() < 1
+    for name in ("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth", "sbnr"):
+        assert getattr(result, name).shape == (12, 16)
+    seen = result.fisher > 0
+    assert (seen == (result.signal > 0)).all() and seen.sum() == hit.sum()
+    assert np.isnan(result.sigma_time[~seen]).all() and np.isfinite(result.sigma_time[seen]).all()
+    # 200 frames of the depth that was asked for, with the deviation of the bound; NaN where there is no estimate.
+    assert result.depth.dtype == np.float32 and result.depth.shape == result.labels.shape == (200, 12, 16)
+    assert np.isnan(result.depth[:, ~seen]).all() and np.isfinite(result.depth[:, seen]).all()
+    z = (result.depth - result.truth.depth)[:, seen] / result.sigma_depth[seen]
+    assert abs(z.mean()) < 4 / math.sqrt(z.size) and z.std() == pytest.approx(1, abs=4 / math.sqrt(2 * z.size))
+    # Path of the return: laser to point to lens.
+    speed = 299_792_458.0 / one.medium.group_index
+    points = result.truth.depth[..., None] * np.stack(
+        [*np.meshgrid(*[(np.arange(n) + 0.5 - n / 2) * one.camera.pixel_tangent for n in (16, 12)]), np.ones((12, 16))],
+        axis=-1,
+    )
+    path = np.linalg.norm(points, axis=-1) + np.linalg.norm(points - one.laser.position, axis=-1)
+    np.testing.assert_allclose(result.arrival[hit], path[hit] / speed, rtol=1e-6)
+    # Moving a point by dz along its line of sight moves its arrival by dz·σ_t/σ_z.
+    near, far = (simulate_analytic(one, truth=flat_truth(one, depth=z), frames=0) for z in (2.2, 2.201))
+    slope = (far.arrival - near.arrival) / 0.001
+    np.testing.assert_allclose(slope, near.sigma_time / near.sigma_depth, rtol=2e-3)
+
+
+def test_frames_of_a_seed_do_not_depend_on_how_they_are_drawn():
+    one = lidar_scene(analytic={"backscatter_fraction": 0.2})
+    result = simulate_analytic(one, frames=9, seed=2**63 + 1)
+    for first, count in [(0, 4), (3, 3), (8, 1)]:
+        depth, labels = result.sample(count, first=first)
+        np.testing.assert_array_equal(depth, result.depth[first : first + count])
+        np.testing.assert_array_equal(labels, result.labels[first : first + count])
+    assert not np.array_equal(result.sample(9, seed=5)[0], result.depth, equal_nan=True)
+
+
+@pytest.mark.parametrize("backscatter", ["constant", "single_scatter", "monte_carlo"])
+def test_the_given_part_of_the_pixels_reports_backscatter(backscatter):
+    """The paper's BS, with depths between the gate's ends, and never behind the target for single scattering."""
+    one = lidar_scene(analytic={"backscatter": backscatter, "backscatter_fraction": 0.3})
+    profile = np.where(np.arange(200) < 60, 1e-4, 0.0) if backscatter == "monte_carlo" else None
+    result = simulate_analytic(one, frames=400, seed=1, backscatter_profile=profile)
+    seen = result.fisher > 0
+    labels = result.labels[:, seen]
+    assert abs(labels.mean() - 0.3) < 4 * math.sqrt(0.21 / labels.size)
+    assert not result.labels[:, ~seen].any()
+    stray = result.depth[result.labels]
+    assert (stray >= 0).all() and (stray < 0.5 * 299_792_458.0 * 25.1e-9).all()
+    beyond = (result.depth > result.truth.depth + 0.1) & result.labels
+    if backscatter == "single_scatter":
+        assert not beyond.any()
+    if backscatter == "constant":
+        assert beyond.sum() > 0.2 * result.labels.sum()
+    if backscatter == "monte_carlo":  # bins 0 to 59: paths of up to 11 ns
+        assert stray.max() < 0.5 * 299_792_458.0 * 11.01e-9 * 1.05
+
+
+def test_without_a_given_part_outliers_come_from_the_background_as_often_as_a_fit_would_lock_on_it():
+    """A faint return in dark counts that are flat over the gate."""
+    one = lidar_scene(
+        analytic={"backscatter": "constant", "pulses": 1_000_000},
+        laser={"pulse_energy": 2e-17, "half_angle_deg": 35.0},
+        detector={"pdp": 0.2, "fill_factor": 0.1, "dark_count_rate": 4000.0},
+    )
+    result = simulate_analytic(one, truth=flat_truth(one), frames=500, seed=2)
+    p = result.outlier_probability
+    assert p.min() > 0.02 and p.max() < 0.98 and p.max() > 0.3
+    assert abs((result.labels.mean(axis=0) - p).mean()) < 4 * math.sqrt(0.25 / result.labels.size)
+    from scipy import stats
+
+    x = np.array(
+        [result.depth[:, row, column][result.labels[:, row, column]].mean() for row, column in [(5, 7), (6, 8)]]
+    )
+    assert (np.abs(x - 0.5 * 299_792_458.0 * 15e-9) < 0.3).all()  # the middle of the gate
+    assert stats.binomtest(int(result.labels[:, 5, 7].sum()), 500, p[5, 7]).pvalue > 1e-3
+
+
+def test_no_backscatter_is_an_infinite_ratio_and_no_stray_pixels():
+    one = lidar_scene(analytic={"backscatter": "constant"}, detector={"dark_count_rate": 0.0})
+    result = simulate_analytic(one, frames=3)
+    seen = result.fisher > 0
+    assert np.isinf(result.sbnr[seen]).all() and np.isnan(result.sbnr[~seen]).all()
+    assert (result.outlier_probability[seen] == 0).all() and not result.labels.any()
+
+
+def test_a_return_outside_the_gate_is_no_estimate_and_a_gate_without_any_is_an_error():
+    one = lidar_scene(gate={"start_ns": 0.0, "bin_width_ps": 100.0, "bins": 250})
+    depth = flat_truth(one)
+    far = depth.depth.copy()
+    far[:, 8:] = 9.0
+    result = simulate_analytic(
+        one, truth=dataclasses.replace(depth, depth=far, range=depth.range * far / depth.depth), frames=1
+    )
+    assert np.isfinite(result.sigma_time[:, :8]).all() and np.isnan(result.sigma_time[:, 8:]).all()
+    assert np.isnan(result.depth[0, :, 8:]).all() and (result.fisher[:, 8:] == 0).all()
+    with pytest.raises(ConfigError, match=r"gate \[0, 0.1\) ns holds no return; the target's arrive from 1\d.* ns"):
+        simulate_analytic(lidar_scene(gate={"start_ns": 0.0, "bin_width_ps": 100.0, "bins": 1}), frames=0)
+
+
+def test_bad_input_is_named():
+    one = lidar_scene()
+    good = flat_truth(one)
+
+    def fails(match, **changes):
+        with pytest.raises(ValueError, match=match):
+            simulate_analytic(one, truth=dataclasses.replace(good, **changes), frames=0)
+
+    fails("truth.depth is NaN in every pixel", depth=np.full_like(good.depth, np.nan))
+    wrong = good.depth.copy()
+    wrong[2, 3] = -1.0
+    fails(r"truth.depth = -1.0 at pixel \(2, 3\) is outside \(0, inf\)", depth=wrong)
+    wrong[2, 3] = np.inf
+    fails(r"truth.depth = inf at pixel \(2, 3\)", depth=wrong)
+    bright = good.reflectance.copy()
+    bright[1, 1] = 1.5
+    fails(r"truth.reflectance = 1.5 at pixel \(1, 1\) is outside \[0, 1\]", reflectance=bright)
+    unknown = good.range.copy()
+    unknown[0, 4] = np.nan
+    fails(r"truth.range = nan at pixel \(0, 4\)", range=unknown)
+    fails("truth.normal is not finite", normal=good.normal * np.nan)
+    with pytest.raises(ValueError, match=r"truth.depth has shape \(12, 16\); the camera's \(4, 4\) is needed"):
+        simulate_analytic(scene(), truth=good, frames=0)
+    with pytest.raises(ValueError, match="frames = -1"):
+        simulate_analytic(one, frames=-1)
+    mc = lidar_scene(analytic={"backscatter": "monte_carlo"})
+    for profile, match in [
+        (None, "backscatter_profile is missing"),
+        (np.zeros(7), r"shape \(7,\); \(200,\) or \(12, 16, 200\) is needed"),
+        (np.full(200, -1e-9), r"outside \[0, inf\)"),
+        (np.full(200, np.nan), r"outside \[0, inf\)"),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            simulate_analytic(mc, frames=0, backscatter_profile=profile)
+    for sections, match in [
+        (
+            {"analytic": {"form": "paper"}, "laser": {"profile": "gaussian", "half_angle_deg": 20.0}},
+            "form = 'paper' needs",
+        ),
+        ({"laser": {"profile": "collimated", "beam_radius": 0.5}}, "needs a diverging laser.profile"),
+        ({"detector": {"irf": "exponentially_modified_gaussian"}}, "the analytic model needs 'gaussian'"),
+        ({"detector": {"jitter_fwhm_ps": 0.0}, "laser": {"pulse_fwhm_ps": 0.0}}, "both 0"),
+        (
+            {"analytic": {"count_law": "per_frame_paper"}, "laser": {"pulse_energy": 1e-3, "half_angle_deg": 35.0}},
+            "'per_frame_paper' needs alpha < 1; it reaches",
+        ),
+    ]:
+        with pytest.raises(ConfigError, match=match):
+            simulate_analytic(lidar_scene(**sections), truth=good, frames=0)
+
+
+def test_paper_form_is_equation_7_in_every_pixel():
+    one = lidar_scene(
+        analytic={"form": "paper", "backscatter": "constant"},
+        laser={"half_angle_deg": 20.0, "position": [0.0, 0.0, 0.0]},
+    )
+    result = simulate_analytic(one, truth=flat_truth(one, depth=3.0, reflectance=0.3), frames=0)
+    f = 0.03  # cancels
+    for row, column in [(0, 0), (6, 8)]:
+        expected = crlb.eq7(
+            one.laser.pulse_energy, 532e-9, one.detector.pde, np.float32(0.3), 0.2, result.truth.range[row, column],
+            f * one.camera.pixel_tangent, f / 0.02, math.tan(math.radians(20.0)),
+        )  # fmt: skip
+        assert result.signal[row, column] == pytest.approx(expected, rel=1e-6)  # the truth is float32
+
+
+def test_a_file_holds_maps_frames_and_scene(tmp_path):
+    one = lidar_scene(analytic={"backscatter_fraction": 0.1})
+    result = simulate_analytic(one, frames=4, seed=2**64 - 1)
+    path = result.save(tmp_path / "deep" / "frames.h5")
+    assert [p.name for p in path.parent.iterdir()] == ["frames.h5"]
+    with h5py.File(path) as file:
+        for name in (
+            "signal",
+            "arrival",
+            "alpha",
+            "fisher",
+            "sigma_time",
+            "sigma_depth",
+            "sbnr",
+            "outlier_probability",
+        ):
+            np.testing.assert_array_equal(file[f"maps/{name}"][...], getattr(result, name))
+        np.testing.assert_array_equal(file["depth"][...], result.depth)
+        np.testing.assert_array_equal(file["labels"][...], result.labels)
+        np.testing.assert_array_equal(file["truth/normal"][...], result.truth.normal)
+        assert file.attrs["seed"] == str(2**64 - 1) and file.attrs["group_index"] == one.medium.group_index
+        assert file["maps/sigma_time"].attrs["unit"] == "s"
+        import tomllib
+
+        assert spadwarp.Scene.from_dict(tomllib.loads(file["config"].asstr()[()])) == one
+
+
+def test_agrees_with_monte_carlo_on_the_ballistic_return_and_on_single_backscatter():
+    """A tilted plate filling the field, its corners included: 1 % on the return; thin water: 2 % on the backscatter.
+
+    One collision or surface a photon, so that the Monte Carlo holds what the model claims to hold and nothing else.
+    """
+    one = scene(
+        medium={"extinction": 0.15, "albedo": 0.4, "anisotropy": 0.9},
+        laser={"half_angle_deg": 34.0, "position": [-0.3, 0.1, 0.0]},
+        camera={"width": 12, "height": 8, "horizontal_fov_deg": 50.0, "aperture_diameter": 0.02},
+        gate={"start_ns": 0.0, "bin_width_ps": 200.0, "bins": 400},
+        targets=[{"builtin": "plane", "size": [14, 14], "translation": [0, 0, 4], "rotation_deg": [10, 35, 0]}],
+        transport={"estimator": "next_event", "max_collisions": 1},
+    )
+    monte_carlo = spadwarp.simulate(one, photons=3_000_000, seed=2)
+    result = simulate_analytic(one, frames=0)
+    scale = one.laser.photons_per_pulse * one.detector.pde
+    ballistic = monte_carlo.component("ballistic").sum(axis=-1) * scale
+    blocks = [np.s_[:, :], np.s_[:4, :6], np.s_[:4, 6:], np.s_[4:, :6], np.s_[4:, 6:]]
+    for block in blocks:
+        assert ballistic[block].sum() == pytest.approx(result.signal[block].sum(), rel=0.01)
+    corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]  # 1.2 % of standard error each
+    for place in corners:
+        assert ballistic[place] == pytest.approx(result.signal[place], rel=0.05)
+    backscatter = monte_carlo.component("backscatter").sum(axis=-1) * scale
+    assert backscatter.sum() == pytest.approx(result.backscatter.sum(), rel=0.02)
+
+
+# Bounds of histograms
+
+
+def gaussian_cube(sigma_bins, counts=300.0, level=1.5, bins=240, mu=120.0):
+    edges = np.arange(bins + 1.0)
+    return counts * crlb.binned_signal(edges, mu, sigma_bins), np.full(bins, level)
+
+
+def test_bound_of_a_histogram_is_the_continuous_bound_where_bins_are_fine():
+    """300 photons of σ = 100 ps on 150 a σ: 12.898 ps, in bins of 0.1 σ 12.906 ps; pulses divide."""
+    signal, level = gaussian_cube(10.0, level=15.0)
+    signal = np.stack([signal, np.zeros_like(signal)])[None]
+    sigma = crlb_from_histogram(signal, level, bin_width=1e-11, pulses=1)
+    assert sigma.shape == (1, 2) and np.isnan(sigma[0, 1])
+    assert round(sigma[0, 0] * 1e12, 3) == pytest.approx(12.906, abs=2e-3)
+    fewer = crlb_from_histogram(signal / 400, level / 400, bin_width=1e-11, pulses=400)
+    assert fewer[0, 0] == pytest.approx(sigma[0, 0], rel=1e-6)
+
+
+def test_the_response_is_applied_exactly():
+    """A cube before the response gives the bound of the cube after it, by FWHM and by samples."""
+    before, _ = gaussian_cube(6.0)
+    sigma = math.hypot(6.0, 8.0)
+    after, _ = gaussian_cube(math.sqrt(sigma**2 + 1 / 12))
+    expected = crlb_from_histogram(after, 2.0, bin_width=1e-11, pulses=1)
+    fwhm = 8.0 * 2 * math.sqrt(2 * math.log(2)) * 1e-11
+    assert crlb_from_histogram(before, 2.0, bin_width=1e-11, pulses=1, irf=fwhm) == pytest.approx(expected, rel=2e-3)
+    samples = crlb.binned_signal(np.arange(-50.5, 51), 0.0, 8.0)
+    assert crlb_from_histogram(before, 2.0, bin_width=1e-11, pulses=1, irf=samples) == pytest.approx(expected, rel=2e-3)
+
+
+def test_an_exponential_tail_is_applied_as_the_response_says():
+    """Taps from the response's integrals against the same response by quadrature over each bin."""
+    before, _ = gaussian_cube(3.0)
+    irf = InstrumentResponse(sigma=4e-11, tail=1e-10)
+    light = np.repeat(before, 100) / 100  # in hundredths of a bin
+    response = irf.density(np.arange(-300, 6000) * 1e-13) * 1e-13
+    after = np.convolve(light, response)[300 : 300 + 24000].reshape(240, 100).sum(axis=1)
+    bound = crlb_from_histogram(before, 2.0, bin_width=1e-11, pulses=1, irf=irf)
+    assert bound == pytest.approx(crlb_from_histogram(after, 2.0, bin_width=1e-11, pulses=1), rel=2e-3)
+
+
+def test_pile_up_loses_information():
+    signal, level = gaussian_cube(5.0, counts=2.0, level=0.01)
+    poisson = crlb_from_histogram(signal, level, bin_width=1e-11, pulses=100)
+    first = crlb_from_histogram(signal, level, bin_width=1e-11, pulses=100, law="first_photon")
+    assert first > 1.2 * poisson
+    faint = [
+        crlb_from_histogram(signal * 1e-5, level * 1e-5, bin_width=1e-11, pulses=1, law=law)
+        for law in ("poisson", "first_photon")
+    ]
+    assert faint[0] == pytest.approx(faint[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "changes, match",
+    [
+        ({"signal_cube": [-1.0, 1.0]}, r"signal_cube holds a value outside \[0, inf\)"),
+        ({"background_cube": [np.nan, 1.0]}, r"background_cube holds a value outside"),
+        ({"background_cube": np.zeros(3)}, r"background_cube has shape \(3,\)"),
+        ({"bin_width": 0.0}, r"bin_width = 0.0 is outside"),
+        ({"pulses": -1}, r"pulses = -1 is outside"),
+        ({"irf": -1.0}, r"irf = -1.0 s is outside"),
+        ({"irf": [1.0, 1.0]}, "odd number"),
+        ({"irf": InstrumentResponse(tail=1e-10)}, "irf has no width"),
+        ({"law": "coates"}, "law = 'coates' is not one of"),
+    ],
+)
+def test_bad_histograms_are_named(changes, match):
+    with pytest.raises(ValueError, match=match):
+        crlb_from_histogram(
+            **{"signal_cube": [1.0, 2.0], "background_cube": 0.0, "bin_width": 1e-10, "pulses": 1, **changes}
+        )
+
+
+def test_the_bound_of_a_monte_carlo_result_is_the_analytic_one_in_clear_water():
+    """Little scattering, a plate square to the axis: both know the same return."""
+    one = lidar_scene(
+        medium={"extinction": 0.02, "albedo": 0.01},
+        laser={"half_angle_deg": 30.0, "position": [0.0, 0.0, 0.0]},
+        detector={"pdp": 0.2, "fill_factor": 0.1, "jitter_fwhm_ps": 400.0},
+        camera={"width": 4, "height": 4, "horizontal_fov_deg": 4.0, "aperture_diameter": 0.02},
+        gate={"start_ns": 10.0, "bin_width_ps": 50.0, "bins": 200},
+        targets=[{"builtin": "plane", "size": [3, 3], "translation": [0, 0, 2.2], "reflectance": 1e-3}],
+        transport={"estimator": "next_event", "max_collisions": 4},
+    )
+    one = one.with_overrides({"laser.pulse_energy": 1e-12})
+    bound = crlb_map(spadwarp.simulate(one, photons=3_000_000, seed=1))
+    expected = simulate_analytic(one, frames=0).sigma_time
+    assert bound.shape == (4, 4)
+    # 600 photons land on a pixel's part of the plate: 2 % on the bound.
+    np.testing.assert_allclose(bound, expected, rtol=0.1)
+    assert np.median(bound / expected) == pytest.approx(1, abs=0.03)

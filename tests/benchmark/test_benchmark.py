@@ -1,0 +1,233 @@
+"""The benchmark: that its cases are what they say, and that what it writes can be kept. Speed itself is not tested."""
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import spadwarp
+from spadwarp.benchmark.cases import CASES, GROUPS, load_report, ratios, report
+from spadwarp.cli import app
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.mesh.targets import build_mesh
+from spadwarp.scene import Scene
+
+PEERS = Path(__file__).parents[2] / "bench" / "peers"
+
+
+def scene(name):
+    return Scene.from_dict(CASES[name].scene)
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["bench", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def staircase():
+    (result,) = spadwarp.bench(["staircase_5m"], device="cpu", photons=4000, repeats=2)
+    return result
+
+
+@pytest.fixture
+def kept(staircase, tmp_path):
+    path = tmp_path / "kept.json"
+    path.write_text(json.dumps(report([staircase])))
+    return path
+
+
+def test_cases_have_the_faces_they_promise():
+    faces = {name: build_mesh(scene(name)) for name in ("water", "plane_5m", "staircase_5m", "staircase_5m_dense")}
+    assert faces["water"] is None
+    assert faces["plane_5m"].face_count == 2
+    assert faces["staircase_5m"].face_count == 120
+    assert faces["staircase_5m_dense"].face_count >= 100_000
+
+
+def test_a_million_faces_by_the_arithmetic_of_subdivision():
+    targets = scene("spheres").targets
+    assert sum(1280 * 4**target.subdivisions for target in targets) == pytest.approx(1e6, rel=0.02)
+
+
+def test_scenes_end_paths_with_the_gate():
+    for name in ("water_20m", "staircase_5m"):
+        assert scene(name).path_limit == pytest.approx(20.48, rel=1e-4)
+    assert scene("water").path_limit == pytest.approx(40.96, rel=1e-4)
+    assert scene("plane_5m").path_limit == pytest.approx(14.8, rel=1e-9)
+
+
+def test_plane_is_the_scene_that_comes_with_the_project():
+    shipped = spadwarp.load_scene(PEERS.parents[2] / "configs" / "scenes" / "plane_5m.toml")
+    ours = scene("plane_5m")
+    for section in ("medium", "laser", "targets"):
+        assert getattr(ours, section) == getattr(shipped, section)
+    assert ours.camera.aperture_area == pytest.approx(shipped.camera.aperture_area, rel=1e-12)
+    assert ours.gate.stop == pytest.approx(shipped.gate.stop, rel=1e-12)
+
+
+def test_rates_are_counts_over_the_fastest_run(staircase):
+    assert len(staircase.seconds) == 2
+    assert staircase.rates["photons"] == pytest.approx(4000 / min(staircase.seconds))
+    # At least one event a photon, bar those that leave; at most 64.
+    per_photon = staircase.rates["collisions"] / staircase.rates["photons"]
+    assert 1.0 < per_photon < 64.0
+    assert 0.0 < staircase.rates["queries"] < 2.0 * staircase.rates["collisions"]
+    assert staircase.tally_bytes == 3 * 8 * 64 * 64 * 1024
+    assert staircase.memory is None
+    assert 0.0 < staircase.error_per_root_second < math.inf
+
+
+def test_cube60_absorbs_what_mcx_says():
+    """17.69 % (MCX's own figure); 20 000 photons know it to 0.2 %."""
+    (result,) = spadwarp.bench(["cube60"], device="cpu", photons=20_000, repeats=1)
+    assert result.check["passed"]
+    assert result.check["standard_error"] < 0.003
+    # Optical depth of the mean path: 78 collisions a photon.
+    assert result.rates["collisions"] / result.rates["photons"] == pytest.approx(78, rel=0.05)
+
+
+def test_report_says_what_it_was_measured_on(staircase):
+    kept = json.loads(json.dumps(report([staircase])))
+    assert kept["format"] == "spadwarp bench"
+    made = kept["provenance"]
+    assert {"device", "device_name", "driver", "warp", "spadwarp", "numpy", "python", "commit", "date"} <= made.keys()
+    assert made["device"] == "cpu"
+    assert made["driver"] is None
+    (row,) = kept["results"]
+    assert row["case"] == "staircase_5m"
+    assert row["rates"] == pytest.approx(staircase.rates)
+
+
+def test_ratios_are_now_over_before(staircase, kept):
+    twice = replace(staircase, rates={unit: 2.0 * rate for unit, rate in staircase.rates.items()})
+    other = replace(staircase, case="water")
+    assert ratios([twice, other], load_report(kept)) == {
+        "staircase_5m": pytest.approx({"photons": 2.0, "collisions": 2.0, "queries": 2.0})
+    }
+
+
+def test_command_writes_and_compares(kept, tmp_path):
+    out = tmp_path / "new.json"
+    result = run(
+        "staircase_5m", "--device", "cpu", "--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept
+    )
+    assert result.exit_code == 0, result.output
+    assert "120" in result.output
+    assert "×" in result.output
+    again = load_report(out)
+    assert again["ratios"]["staircase_5m"]["photons"] > 0
+    assert again["results"][0]["size"] == {"photons": 4000}
+
+
+def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
+    check = {"name": "absorbed fraction", "value": 0.2, "standard_error": 1e-3, "reference": 0.1769, "passed": False}
+    cube60 = replace(staircase, case="cube60", check=check)
+    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", lambda *_, found, **__: found(cube60))
+    result = run("cube60")
+    assert result.exit_code == 1
+    assert "cube60: a mean is not what it should be" in result.output
+
+
+def test_an_interrupted_command_keeps_what_was_measured(monkeypatch, staircase, tmp_path):
+    def interrupted(*_, found, **__):
+        found(staircase)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", interrupted)
+    result = run("staircase_5m", "water", "--json", tmp_path / "part.json")
+    assert result.exit_code == 130
+    assert "staircase_5m" in result.stdout
+    assert [row["case"] for row in load_report(tmp_path / "part.json")["results"]] == ["staircase_5m"]
+
+
+def test_scaling_says_how_cost_grows(monkeypatch, staircase):
+    def grows(*_, found, **__):
+        for photons, rate in ((10**6, 4e8), (10**7, 8e8), (10**8, 8.8e8)):
+            name = f"photons_{photons}"
+            found(replace(staircase, case=name, size={"photons": photons}, rates={"photons": rate}, memory=1 << 30))
+
+    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", grows)
+    told = run("scaling").stdout
+    assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in told
+
+
+def test_unknown_case_is_named():
+    with pytest.raises(ConfigError, match=r"'staircase' is not one of water, .*scaling"):
+        spadwarp.bench(["staircase"])
+    assert run("staircase").exit_code == 2
+
+
+@pytest.mark.parametrize("option", ["photons", "repeats"])
+def test_numbers_out_of_range_are_named(option):
+    with pytest.raises(ConfigError, match=rf"{option} = 0 is outside \[1, "):
+        spadwarp.bench(["water"], **{option: 0})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{}", "not a file that `spadwarp bench --json` wrote"),
+        ("not json", "not JSON"),
+        ('{"format": "spadwarp bench", "format_version": 2, "results": []}', "format_version = 2 is not 1"),
+        ('{"format": "spadwarp bench", "format_version": 1, "results": [{}]}', "a result lacks one of"),
+    ],
+)
+def test_files_that_are_no_report_are_refused(tmp_path, text, said):
+    path = tmp_path / "other.json"
+    path.write_text(text)
+    with pytest.raises(FileError, match=rf"other\.json: .*{said}"):
+        load_report(path)
+    with pytest.raises(FileError, match=r"no\.json: cannot be read"):
+        load_report(tmp_path / "no.json")
+
+
+def test_scaling_spans_what_it_is_meant_to_show():
+    for cuda in (False, True):
+        cases = GROUPS["scaling"](cuda)
+        assert len({case.name for case in cases}) == len(cases)
+        assert [case.photons for case in cases if case.photons] == [10**power for power in range(5, 11 if cuda else 8)]
+        first, *_, last = [case for case in cases if case.name.startswith("faces_")]
+        assert build_mesh(Scene.from_dict(first.scene)).face_count == 12
+        assert 12 * 4 ** last.scene["targets"][0]["subdivisions"] == pytest.approx(1e6, rel=0.25)
+        for case in cases:
+            Scene.from_dict(case.scene)
+            assert not case.error  # nor batches in an image that barely fits
+
+
+def test_runs_are_repeated_until_enough():
+    case = replace(CASES["water"], error=False, enough=1e-9)
+    device = spadwarp.device.pick_device("cpu")
+    result = spadwarp.benchmark.cases._transport(case, device, 1000, 5)
+    assert len(result.seconds) == 1
+    assert result.error_per_root_second is None
+
+
+def test_cases_are_listed():
+    listed = run("--list").output
+    assert all(name in listed for name in [*CASES, "scaling"])
+
+
+@pytest.mark.parametrize("script", ["run_pmcx", "run_pmcxcl", "run_pmmc", "run_mitransient"])
+def test_a_peer_that_is_missing_is_said_and_is_no_failure(script, tmp_path):
+    for module in ("pmcx", "pmcxcl", "pmmc", "mitsuba"):
+        (tmp_path / f"{module}.py").write_text("raise ImportError('not here')")
+    done = subprocess.run(
+        [sys.executable, PEERS / f"{script}.py"],
+        capture_output=True,
+        text=True,
+        env={"PYTHONPATH": str(tmp_path)},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("not run: ")
+    assert "pip install" in done.stdout
+
+
+def test_kept_results_can_be_read():
+    for path in (PEERS.parent / "results").glob("*.json"):
+        assert load_report(path)["results"]

@@ -1,0 +1,227 @@
+"""The check's numbers against geometry done by hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spadwarp.checks.checks import CheckMessage, check, summary
+from spadwarp.mesh.targets import TriangleMesh
+from spadwarp.scene import SPEED_OF_LIGHT, Scene, load_scene
+
+SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
+
+BASE = Scene.from_dict(
+    {
+        "medium": {"extinction": 0.3, "albedo": 0.8, "group_index": "seawater"},
+        "laser": {"half_angle_deg": 15.0},
+        "camera": {"width": 32, "height": 24, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+        "gate": {"start_ns": 40.0, "bin_width_ps": 100.0, "bins": 100},
+        "targets": [{"builtin": "plane", "reflectance": 0.4}],
+    }
+)
+
+
+def plate(z: float, side: float = 1.0, x: float = 0.0, y: float = 0.0, target: int = 0) -> TriangleMesh:
+    """A square facing the camera: two triangles."""
+    h = side / 2
+    vertices = np.array([(x - h, y - h, z), (x + h, y - h, z), (x + h, y + h, z), (x - h, y + h, z)], dtype=np.float32)
+    faces = np.array([(0, 2, 1), (0, 3, 2)], dtype=np.int32)
+    return TriangleMesh(vertices, faces, np.full(2, 0.4, np.float32), np.full(2, target, np.int32))
+
+
+def find(messages: list[CheckMessage], field: str, level: str = "warning") -> CheckMessage:
+    (message,) = [one for one in messages if one.field == field and one.level == level]
+    return message
+
+
+def warnings(messages: list[CheckMessage]) -> list[str]:
+    return [str(one) for one in messages if one.level == "warning"]
+
+
+def test_a_target_in_view_beam_and_gate_is_no_matter_for_warnings():
+    assert warnings(check(BASE, plate(5.0))) == []
+
+
+@pytest.mark.parametrize("z", [5.0, 4.9])
+@pytest.mark.parametrize("side", [0.01, 1.0, 30.0, 3000.0])
+def test_arrival_times_are_those_of_the_nearest_and_farthest_point_in_view(z, side):
+    numbers = summary(BASE, plate(z, side))
+    half = min(side / 2, z * math.tan(math.radians(10)))
+    corner = math.sqrt(z**2 + half**2 + min(side / 2, 0.75 * z * math.tan(math.radians(10))) ** 2)
+    near, far = numbers["target_range"]
+    assert near == pytest.approx(z, rel=1e-3)  # the plate is sampled, not minimised over
+    assert far == pytest.approx(corner, rel=1e-6)
+    nanoseconds = 2e9 * 1.3638 / SPEED_OF_LIGHT
+    assert numbers["target_arrival_ns"] == pytest.approx((near * nanoseconds, far * nanoseconds))
+    assert numbers["optical_depth"] == pytest.approx(0.3 * near)
+
+
+@pytest.mark.parametrize("mesh", [plate(5.0, x=3.0), plate(5.0, y=-2.0), plate(5.0, side=4.0, x=3.0)])
+def test_a_target_outside_the_view(mesh):
+    message = find(check(BASE, mesh), "targets[0]")
+    assert "outside the view" in message.text
+    assert message.values["half_width"] == pytest.approx(5 * math.tan(math.radians(10)))
+    assert summary(BASE, mesh)["target_range"] is None
+
+
+def test_a_target_behind_the_camera():
+    assert find(check(BASE, plate(-5.0)), "targets[0]").text.startswith("behind the camera: spans x")
+    assert summary(BASE, plate(-5.0))["target_range"] is None
+
+
+def test_a_target_that_fills_the_view_without_a_corner_in_it_is_seen():
+    assert warnings(check(BASE, plate(5.0, side=100.0, x=10.0, y=-20.0))) == []
+
+
+@pytest.mark.parametrize("profile", ["uniform_cone", "gaussian"])
+def test_a_target_that_the_beam_misses(profile):
+    narrow = BASE.with_overrides(laser={"half_angle_deg": 2.0, "profile": profile})
+    message = find(check(narrow, plate(5.0, side=0.2, x=0.7)), "targets[0]")
+    # The nearest point that is seen lies 0.6 m off the axis.
+    assert message.values["nearest_angle_deg"] == pytest.approx(math.degrees(math.atan(0.6 / 5)), abs=1e-3)
+    assert "half angle is 2°" in message.text
+    assert warnings(check(narrow, plate(5.0, side=1.4))) == []
+
+
+def test_a_pencil_beam_hits_what_lies_on_its_line_only():
+    pencil = BASE.with_overrides(laser={"profile": "collimated", "beam_radius": 0.0})
+    assert warnings(check(pencil, plate(5.0))) == []
+    assert summary(pencil, plate(5.0))["target_range"] == pytest.approx((5.0, 5.0))
+    assert "the beam misses" in find(check(pencil, plate(5.0, side=0.2, x=0.7)), "targets[0]").text
+    aimed = pencil.with_overrides({"laser.direction": [0.7, 0, 5.0]})
+    assert warnings(check(aimed, plate(5.0, side=0.2, x=0.7))) == []
+
+
+def test_a_target_that_nobody_moved_away_from_the_lens():
+    assert "reaches the lens" in find(check(BASE), "targets[0]").text  # a plane at the origin
+    assert summary(BASE)["signal_per_pulse"] is None
+
+
+def test_a_lamp_that_shines_everywhere_lights_every_target():
+    assert (
+        warnings(check(BASE.with_overrides({"laser.half_angle_deg": 180.0, "transport.photons": 1e8}), plate(5.0)))
+        == []
+    )
+
+
+def test_a_target_outside_the_gate():
+    message = find(check(BASE, plate(2.0)), "targets[0]")
+    assert message.text.startswith("outside the gate")
+    assert message.values["first_ns"] == pytest.approx(4.0 * 1.3638 / SPEED_OF_LIGHT * 1e9, rel=1e-4)
+    assert (message.values["start_ns"], message.values["stop_ns"]) == pytest.approx((40.0, 50.0))
+    part = find(check(BASE.with_overrides({"gate.start_ns": 45.6}), plate(5.0)), "targets[0]")
+    assert part.text.startswith("partly outside the gate")
+
+
+def test_beyond_the_unambiguous_range():
+    fast = BASE.with_overrides({"laser.repetition_rate": 40e6})
+    message = find(check(fast, plate(5.0)), "laser.repetition_rate")
+    assert message.values["unambiguous_range"] == pytest.approx(SPEED_OF_LIGHT / (2 * 1.3638 * 40e6))
+    assert summary(fast, plate(5.0))["unambiguous_range"] == message.values["unambiguous_range"]
+    unfolded = check(fast.with_overrides({"detector.fold": False}), plate(5.0))
+    assert "ignored" in find(unfolded, "laser.repetition_rate", "note").text
+
+
+def test_bins_coarser_than_the_instrument_response():
+    coarse = BASE.with_overrides(
+        gate={"bin_width_ps": 300.0}, laser={"pulse_fwhm_ps": 30.0}, detector={"jitter_fwhm_ps": 40.0}
+    )
+    assert find(check(coarse, plate(5.0)), "gate.bin_width_ps", "note").values["irf_fwhm_ps"] == pytest.approx(50.0)
+
+
+def test_a_phase_index_in_place_of_the_group_index():
+    far = BASE.with_overrides({"medium.group_index": 1.33, "gate.start_ns": 130.0, "laser.repetition_rate": 1e6})
+    message = find(check(far, plate(15.0)), "medium.group_index")
+    assert message.values["error"] == pytest.approx(0.38, abs=0.005)
+    silent = Scene.from_dict({**BASE.to_dict(), "medium": {"extinction": 0.3, "albedo": 0.8}})
+    assert "not given" in find(check(silent, plate(5.0)), "medium.group_index", "note").text
+
+
+def test_less_absorption_than_pure_water():
+    clear = BASE.with_overrides({"medium": {"absorption": 0.01, "scattering": 0.1}})
+    assert find(check(clear, plate(5.0)), "medium.absorption", "note").values["pure_water"] == pytest.approx(
+        0.0447, abs=1e-3
+    )
+    assert not [one for one in check(BASE, plate(5.0)) if one.field == "medium.absorption"]
+
+
+def test_large_memory():
+    large = BASE.with_overrides({"camera": {"width": 1024, "height": 768}, "gate.bins": 1000})
+    assert find(check(large, plate(5.0)), "gate.bins").values["bytes"] == 3 * 8 * 1024 * 768 * 1000
+
+
+def test_what_ends_a_history_first():
+    # 0.8^n < 2e-4 at n = 39.
+    murky = BASE.with_overrides({"medium.extinction": 5.0})
+    message = find(check(murky, plate(5.0)), "transport.weight_cutoff", "note")
+    assert message.values["cutoff_collisions"] == 39
+    assert 0.8**39 < 2e-4 < 0.8**38
+    assert message.values["path_collisions"] == pytest.approx(5.0 * 50e-9 * SPEED_OF_LIGHT / 1.3638)
+    few = murky.with_overrides({"transport.max_collisions": 20})
+    assert "max_collisions = 20" in find(check(few, plate(5.0)), "transport.max_collisions").text
+    for free in ({"termination": "roulette"}, {"weight_cutoff": 0.0}):
+        capped = check(murky.with_overrides(transport={**free, "max_collisions": 1000}), plate(5.0))
+        assert not [
+            one for one in capped if one.field.startswith("transport.w") or one.field == "transport.max_collisions"
+        ]
+
+
+def test_limits_that_cut_the_target():
+    short = BASE.with_overrides({"transport.max_path": 9.0})
+    assert "max_path = 9 m" in find(check(short, plate(5.0)), "transport.max_path").text
+    thin = BASE.with_overrides({"transport.lateral_limit": 0.3})
+    assert find(check(thin, plate(5.0)), "transport.lateral_limit").values["side"] == pytest.approx(0.5)
+    slab = BASE.with_overrides(domain={"shape": "slab", "lower": -1, "upper": 4})
+    assert "nothing outside is hit" in find(check(slab, plate(5.0)), "targets[0]").text
+    dry = BASE.with_overrides(domain={"shape": "slab", "lower": 1, "upper": 9})
+    assert len([one for one in check(dry, plate(5.0)) if one.field == "domain" and one.level == "warning"]) == 2
+
+
+def test_expected_signal_of_a_plate_that_fills_a_pixel():
+    # Lidar equation: E0 λ/(hc) PDE · pixel solid angle / cone solid angle · exp(−2cR) · Γ A / (π R²).
+    numbers = summary(BASE, plate(5.0))
+    pixel = (2 * math.tan(math.radians(10)) / 32) ** 2
+    cone = 2 * math.pi * (1 - math.cos(math.radians(15)))
+    fraction = pixel / cone * math.exp(-3.0) * 0.4 * math.pi * 0.01**2 / (math.pi * 25.0)
+    assert numbers["signal_per_pulse"] == pytest.approx(
+        fraction * numbers["photons_per_pulse"] * numbers["pde"], rel=1e-3
+    )
+    assert numbers["samples_per_pixel"] == pytest.approx(1e6 * pixel / cone * math.exp(-1.5), rel=1e-3)
+
+
+@pytest.mark.parametrize("estimator", ["analog", "next_event"])
+def test_too_few_photons(estimator):
+    few = BASE.with_overrides(transport={"estimator": estimator, "photons": 100})
+    field = "transport.estimator" if estimator == "analog" else "transport.photons"
+    assert "of 100 photons" in find(check(few, plate(5.0)), field).text
+
+
+def test_a_scene_without_targets():
+    empty = BASE.with_overrides({"targets": []})
+    assert find(check(empty), "targets", "note")
+    assert summary(empty)["optical_depth"] is None
+
+
+def test_warnings_come_first():
+    levels = [one.level for one in check(BASE.with_overrides({"gate.start_ns": 90.0}), plate(5.0))]
+    assert levels == sorted(levels, reverse=True)
+
+
+def test_many_small_faces_agree_with_two_large_ones():
+    fine = BASE.with_overrides(
+        targets=[{"builtin": "plane", "size": [30, 30], "subdivisions": 7, "translation": [0, 0, 5]}]
+    )
+    coarse = fine.with_overrides({"targets[0].subdivisions": 0})
+    assert summary(fine)["target_range"] == pytest.approx(summary(coarse)["target_range"], rel=1e-3)
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_every_shipped_scene_is_free_of_warnings(path):
+    assert warnings(check(load_scene(path))) == []
+
+
+def test_a_specular_lobe_is_said_to_be_left_out_of_budgets():
+    shiny = BASE.with_overrides({"targets[0].specular": 0.3})
+    assert find(check(shiny, plate(5.0)), "targets[0].specular", "note").values == {"specular": 0.3}

@@ -1,0 +1,395 @@
+"""Datasets: what is drawn, what is written, what a kill or a bad file does to it, and what the readers give back."""
+
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+import spadwarp
+from helpers.datasets import BS, TABLES, checksums, recipe
+from spadwarp.cli import app
+from spadwarp.dataset.read import FIELDS
+from spadwarp.dataset.recipe import SPLITS
+from spadwarp.dataset.sampling import Plan
+from spadwarp.io.exr import write_exr
+from spadwarp.mesh.targets import build_mesh
+from spadwarp.scene import SPEED_OF_LIGHT
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("dataset") / "data"
+    spadwarp.make_dataset(recipe(), place, device="cpu")
+    return place
+
+
+def test_splits_share_neither_targets_nor_seeds(folder):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    splits = manifest["splits"]
+    assert splits["test"]["targets"] == ["staircase"] and splits["validation"]["targets"] == ["car"]
+    assert splits["train"]["targets"] == ["amphora"]
+    assert len({one["seed"] for one in splits.values()}) == 3
+    listed = [(folder / f"{name}.txt").read_text().split() for name in splits]
+    assert sorted(name for names in listed for name in names) == sorted(
+        path.name for path in folder.glob("frames-*.h5")
+    )
+    for name, files in zip(splits, listed, strict=True):
+        for file in files:
+            with h5py.File(folder / file) as shard:
+                assert shard.attrs["split"] == name
+                assert shard.attrs["target"] in splits[name]["targets"]
+
+
+def test_every_dataset_of_a_file_has_the_same_first_dimension(folder):
+    for path in [*folder.glob("frames-*.h5"), *folder.glob("scenes/*.h5"), folder / "scenes.h5"]:
+        with h5py.File(path) as file:
+            assert len({one.shape[0] for one in file.values()}) == 1
+            assert all(one.attrs["unit"] and one.attrs["description"] for one in file.values())
+
+
+def test_label_noisy_and_clean_depth_agree(folder):
+    deviations = []
+    for item in spadwarp.iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
+        noisy, clean, label, bound = (item[name][0] for name in ("noisy", "clean", "label", "bound"))
+        stray = label == 1
+        assert np.isin(label, (0, 1)).all()
+        # A stray pixel always reports something, in the water before what it looks at.
+        assert np.isfinite(noisy[stray]).all()
+        step = 1e-4
+        assert (noisy[stray & np.isfinite(clean)] <= clean[stray & np.isfinite(clean)] + step).all()
+        # Others report the target with the noise of the bound, or nothing where there is none.
+        assert (np.isnan(noisy) == np.isnan(bound))[~stray].all()
+        seen = ~stray & np.isfinite(bound)
+        deviations.append(((noisy - clean) / np.hypot(bound, step))[seen])
+    z = np.concatenate(deviations)
+    assert z.size > 5000
+    assert stats.kstest(z, "norm").pvalue > 1e-3
+
+
+def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
+    with h5py.File(folder / "scenes.h5") as file:
+        profiles, edges = file["backscatter_profile"][...], file["profile_edges"][...]
+    np.testing.assert_allclose((profiles * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
+    for item in spadwarp.iterate_dataset(folder, "train", fields=("noisy", "prior")):
+        noisy, prior = item["noisy"], item["prior"]
+        assert (np.isnan(noisy) == np.isnan(prior)).all()
+        bins = np.searchsorted(edges[item["scene"]], np.nan_to_num(noisy), side="right") - 1
+        near_an_edge = np.abs(noisy[..., None] - edges[item["scene"]]).min(axis=-1) < 1e-4
+        inside = (bins >= 0) & (bins < 64) & ~near_an_edge & np.isfinite(noisy)
+        assert inside.mean() > 0.2
+        np.testing.assert_array_equal(prior[inside], profiles[item["scene"]][bins[inside]])
+        assert (prior[(bins < 0) & np.isfinite(noisy) & ~near_an_edge] == 0).all()
+
+
+def test_realised_fraction_is_the_requested_one(folder):
+    values = []
+    for item in spadwarp.iterate_dataset(folder, "all", fields=("label",)):
+        label = item["label"]
+        values.append(stats.binomtest(int(label.sum()), label.size, float(item["backscatter_fraction"])).pvalue)
+        assert min(abs(item["backscatter_fraction"] - one) for one in BS) < 1e-6
+    assert min(values) > 1e-3 / len(values)
+
+
+def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
+    """Not its shard, not the number of scenes beside it, not the split of other targets changes a scene's frames."""
+    other = {**TABLES, "scenes_per_shard": 2, "targets": {**TABLES["targets"], "validation": []}}
+    spadwarp.make_dataset(spadwarp.Recipe.from_dict(other), tmp_path / "other", device="cpu")
+    first = {item["sample"]: item for item in spadwarp.FrameReader(folder, "test")}
+    second = {item["sample"]: item for item in spadwarp.FrameReader(tmp_path / "other", "test")}
+    assert first.keys() == second.keys()
+    for sample, item in first.items():
+        for name, value in item.items():
+            np.testing.assert_array_equal(value, second[sample][name])
+
+
+def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path):
+    place, whole = tmp_path / "data", recipe(**{"frames.per_scene": 1})
+    spadwarp.make_dataset(whole, place, device="cpu")
+    before = checksums(place)
+    (place / "frames-00001.h5").unlink()
+    damaged = bytearray((place / "frames-00002.h5").read_bytes())
+    damaged[-100] ^= 1
+    (place / "frames-00002.h5").write_bytes(damaged)
+    (place / "shards/00003.json").write_text("{")
+    (place / "scenes/scenes-00004.h5").write_bytes(b"")
+    wrong = "\n".join(spadwarp.verify_dataset(place))
+    for name in ("frames-00001.h5: missing", "frames-00002.h5: damaged", "scenes-00004.h5: damaged"):
+        assert name in wrong
+    report = spadwarp.make_dataset(whole, place, device="cpu")
+    assert report.made == tuple(f"frames-0000{k}.h5" for k in (1, 2, 3, 4)) and len(report.kept) == 2
+    assert checksums(place) == before and not spadwarp.verify_dataset(place)
+
+
+def test_parts_make_one_dataset(tmp_path):
+    whole = recipe(**{"frames.per_scene": 1})
+    spadwarp.make_dataset(whole, tmp_path / "one", device="cpu")
+    for part in (2, 1):
+        if part == 1:
+            with pytest.raises(spadwarp.FileError, match="not finished"):
+                spadwarp.FrameReader(tmp_path / "two")
+        report = spadwarp.make_dataset(whole, tmp_path / "two", device="cpu", shard=(part, 2))
+        assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
+    assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
+
+
+def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
+    torch = pytest.importorskip("torch")
+    images = [name for name in FIELDS if name not in ("counts", "expected")]
+    plain = spadwarp.FrameReader(folder, "train", fields=images)
+    tensors = spadwarp.SpadDataset(folder, "train", fields=images)
+    assert len(plain) == len(tensors) == 6
+    for name, value in plain[4].items():
+        assert torch.equal(torch.nan_to_num(tensors[4][name]), torch.nan_to_num(torch.as_tensor(value)))
+    cut = spadwarp.SpadDataset(folder, "train", crop=12, augment=True, repeats=20)
+    assert len(cut) == 120
+    item = cut[17]
+    assert item["noisy"].shape == (1, 12, 12)
+    np.testing.assert_array_equal(cut[17]["noisy"], item["noisy"])
+    cut.set_epoch(1)
+    assert not np.array_equal(cut[17]["noisy"], item["noisy"])
+    frame = plain[17 % 6]["noisy"][0]
+    windows = np.lib.stride_tricks.sliding_window_view(frame, (12, 12)).reshape(-1, 12, 12)
+    turned = [
+        np.rot90(one, k) for one in (item["noisy"][0].numpy(), item["noisy"][0].numpy()[:, ::-1]) for k in range(4)
+    ]
+    assert any(np.array_equal(np.nan_to_num(a), np.nan_to_num(b)) for a in windows for b in turned)
+
+
+ROOT = Path(__file__).parents[2]
+MAKE = """
+import sys, spadwarp
+spadwarp.make_dataset(spadwarp.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
+"""
+
+
+def start(recipe_path, out, **options):
+    paths = os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))
+    command = [sys.executable, "-c", MAKE, str(recipe_path), str(out)]
+    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, **options)
+
+
+def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
+    small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
+    (tmp_path / "recipe.toml").write_text(small.to_toml())
+    spadwarp.make_dataset(small, tmp_path / "whole", device="cpu")
+    out, generator = tmp_path / "cut", np.random.default_rng(5)
+    for shards in (2, 8):
+        process = start(tmp_path / "recipe.toml", out)
+        while len(list(out.glob("shards/*.json"))) < shards and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(generator.uniform(0.0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        before = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
+    spadwarp.make_dataset(small, out, device="cpu")
+    assert checksums(out) == checksums(tmp_path / "whole")
+    kept = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
+    assert before and all(kept[name] == when for name, when in before.items())
+
+
+def test_a_full_disk_is_told_and_loses_nothing_else(tmp_path):
+    """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
+    small = recipe(**{"frames.per_scene": 1})
+    (tmp_path / "recipe.toml").write_text(small.to_toml())
+    out = tmp_path / "data"
+    spadwarp.make_dataset(small, out, device="cpu", shard=(1, 6))
+    before = checksums(out)
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+
+    process = start(tmp_path / "recipe.toml", out, preexec_fn=limit)
+    last = process.communicate()[1].decode().splitlines()[-1]
+    assert process.returncode == 1
+    assert "FileError" in last and "cannot be written" in last and "-00001.h5" in last
+    assert checksums(out) == before and not list(out.rglob(".*.tmp"))
+
+
+def test_folders_that_will_not_do_are_refused(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used/thesis.txt").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file/below", tmp_path / "used"):
+        with pytest.raises(spadwarp.FileError, match=str(place)):
+            spadwarp.make_dataset(recipe(), place, device="cpu")
+    with pytest.raises(spadwarp.ConfigError, match="another recipe"):
+        spadwarp.make_dataset(recipe(seed=12), folder, device="cpu")
+    with pytest.raises(spadwarp.FileError, match="no dataset there"):
+        spadwarp.FrameReader(tmp_path)
+    with pytest.raises(spadwarp.FileError, match="no dataset there"):
+        spadwarp.verify_dataset(tmp_path)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_told(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(spadwarp.FileError, match="cannot be written"):
+        spadwarp.make_dataset(recipe(), tmp_path / "data", device="cpu")
+
+
+def test_traced_scenes_hold_their_histograms(tmp_path):
+    changes = {
+        "targets.builtin": ["staircase"],
+        "targets.validation": [],
+        "frames.per_scene": 2,
+        "monte_carlo.share": 1.0,
+        "monte_carlo.photons": 40_000,
+        "scene.camera.width": 12,
+        "scene.camera.height": 8,
+        "gate.bins": 64,
+        "scenes_per_target": 1,
+    }
+    totals = {}
+    for how in ("sparse", "dense"):
+        spadwarp.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
+        assert not spadwarp.verify_dataset(tmp_path / how)
+        fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
+        items = list(spadwarp.iterate_dataset(tmp_path / how, "test", fields=fields))
+        totals[how] = [item["counts"] for item in items]
+        for item in items:
+            counts, expected = item["counts"], item["expected"]
+            assert counts.shape == expected.shape == (64, 8, 12)
+            assert math.isnan(item["backscatter_fraction"])
+            # Without pile-up to speak of, counts are Poisson about their expectation.
+            chi2 = float(((counts.sum(axis=0) - expected.sum(axis=0)) ** 2 / expected.sum(axis=0)).sum())
+            assert 1e-3 < stats.chi2(96).sf(chi2) < 0.999
+            np.testing.assert_array_equal(np.minimum(item["intensity"][0], 255), np.minimum(counts.sum(axis=0), 255))
+            found = np.isfinite(item["noisy"][0])
+            assert (found == (counts.sum(axis=0) > 0)).all()
+            # What reports no background and looks past the target saw light that went astray on its way back.
+            right = found & (item["label"][0] == 0) & np.isfinite(item["clean"][0])
+            assert np.median(np.abs(item["noisy"] - item["clean"])[0][right]) < 0.05
+    for sparse, dense in zip(totals["sparse"], totals["dense"], strict=True):
+        np.testing.assert_array_equal(sparse, dense)
+
+
+def test_meshes_of_the_user_stand_with_their_centre_where_the_recipe_says(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (tmp_path / "meshes").mkdir()
+    block = trimesh.creation.box(bounds=[(1.0, 2.0, 3.0), (1.2, 2.4, 3.1)])
+    block.export(tmp_path / "meshes/block.stl")
+    tables = {**TABLES, "targets": {"meshes": ["meshes"], "mesh_size": 2.0}, "scenes_per_target": 3}
+    (tmp_path / "recipe.toml").write_text(spadwarp.Recipe.from_dict(tables).to_toml())
+    plan = Plan(spadwarp.load_recipe(tmp_path / "recipe.toml"))
+    assert [one.name for one in plan.targets] == ["block"]
+    for index in range(3):
+        mesh = build_mesh(plan.scene(index).scene)
+        np.testing.assert_allclose(mesh.bounds.mean(axis=0), [0.0, 0.0, 15.0], atol=1e-5)
+        turned = np.radians(plan.scene(index).scene.targets[0].rotation_deg[1])
+        assert np.ptp(mesh.bounds[:, 1]) == pytest.approx(2.0, rel=1e-5)
+        assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(np.cos(turned) + 0.5 * abs(np.sin(turned)), rel=1e-5)
+    filled = Plan(
+        spadwarp.load_recipe(tmp_path / "recipe.toml").with_overrides({"pose.fill": 0.5, "pose.yaw_deg": 0.0})
+    )
+    camera = filled.scene(0).scene.camera
+    height = np.ptp(build_mesh(filled.scene(0).scene).bounds[:, 1])
+    assert height == pytest.approx(0.5 * 15.0 * camera.pixel_tangent * camera.height, rel=1e-5)
+
+
+def test_depth_maps_of_an_engine_become_targets(tmp_path):
+    depth = np.full((24, 36), 65504.0, np.float16)
+    depth[4:20, 6:30] = 1500.0  # centimetres
+    (tmp_path / "exports").mkdir()
+    write_exr(tmp_path / "exports/wall_RGBD.EXR", {**dict.fromkeys("RGB", np.zeros_like(depth)), "A": depth})
+    write_exr(tmp_path / "exports/wall_Base_Col.EXR", dict.fromkeys("RGB", np.full_like(depth, 0.25)))
+    tables = {**TABLES, "targets": {"exports": ["exports"]}}
+    (tmp_path / "recipe.toml").write_text(spadwarp.Recipe.from_dict(tables).to_toml())
+    spadwarp.make_dataset(tmp_path / "recipe.toml", tmp_path / "data", device="cpu")
+    for item in spadwarp.iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
+        clean, there = item["clean"][0], depth < 60000
+        assert (np.isfinite(clean) == there).all() and item["distance"] == 15.0
+        assert np.abs(clean[there] - 15.0).max() < 1e-4 and (item["albedo"][0][there] == 0.25).all()
+        right = there & (item["label"][0] == 0)
+        assert np.abs(item["noisy"][0][right] - 15.0).max() < 0.05
+    traced = spadwarp.load_recipe(tmp_path / "recipe.toml").with_overrides({"monte_carlo.share": 0.5})
+    with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.share"):
+        Plan(traced)
+
+
+def test_recipes_that_cannot_be_are_told_field_by_field():
+    wrong = {
+        "pose": {"distance": -1.0, "yaw": 3.0},
+        "water": {"attenuation_lengths": {"low": 2.0, "high": 1.0}},
+        "frames": {"backscatter_fraction": [0.1, 1.5]},
+        "exposure": {"pulses": 5.0, "signal_photons": 5.0},
+    }
+    with pytest.raises(spadwarp.ConfigError) as caught:
+        spadwarp.Recipe.from_dict({**TABLES, **wrong})
+    text = str(caught.value)
+    for words in ("pose.distance", "(0.0, inf)", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
+        assert words in text
+    with pytest.raises(spadwarp.ConfigError, match=r"scene: camera\.pixels"):
+        spadwarp.Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
+    for names in ({"test": ["boat"]}, {"test": ["car"], "validation": ["car"]}, {"builtin": ["boat"]}):
+        with pytest.raises(spadwarp.ConfigError, match=r"targets\."):
+            Plan(spadwarp.Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs/datasets").glob("*.toml")), ids=lambda path: path.stem)
+def test_recipes_that_come_with_spadwarp(path):
+    given = spadwarp.load_recipe(path)
+    plan = Plan(given)
+    assert spadwarp.Recipe.from_dict(tomllib.loads(given.to_toml())) == given
+    splits = {split: {one.name for one in plan.targets if one.split == split} for split in SPLITS}
+    assert all(splits.values()) and "staircase" in splits["test"]
+    if path.stem in ("paper", "montecarlo"):
+        assert len(plan.targets) == 20 and plan.scene_count == 1000
+    codes = (np.array([1, 65535]) * plan.depth_step + plan.depth_offset).tolist()
+    for index in range(0, plan.scene_count, max(1, plan.scene_count // 7)):
+        drawn = plan.scene(index)
+        far = drawn.scene.gate.stop * SPEED_OF_LIGHT / drawn.scene.medium.group_index / 2.0
+        assert codes[0] < 0.97 * (far - 2.0) and far < codes[1]
+
+
+def test_commands(tmp_path):
+    (tmp_path / "recipe.toml").write_text(recipe().to_toml())
+    out = str(tmp_path / "data")
+    runner = CliRunner()
+
+    def run(*words, code=0):
+        outcome = runner.invoke(app, ["dataset", *words])
+        assert outcome.exit_code == code, outcome.output
+        return outcome.output
+
+    make = ["make", str(tmp_path / "recipe.toml"), "--out", out, "--device", "cpu", "--set", "frames.per_scene=1"]
+    told = run(*make, "--shard", "1/2")
+    assert "3 shards with 3 frames" in told and "3 shards that others are to make" in told
+    assert "frames-00001.h5: missing" in run("verify", out, code=1)
+    assert "3 shards that were there" in run(*make, "--json", str(tmp_path / "told.json"))
+    assert json.loads((tmp_path / "told.json").read_text())["frames"] == 3
+    assert "whole" in run("verify", out)
+    told = run("info", out)
+    assert "staircase" in told and "36 x 24 pixels" in told
+    run("preview", out, "--frames", "4", "--out", str(tmp_path / "sheet.png"))
+    assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
+    for wrong in (["--shard", "3/2"], ["--shard", "x"], ["--engine", "cloud"]):
+        run(*make, *wrong, code=2)
+
+
+def test_hugging_face_reads_the_frames(folder, tmp_path):
+    datasets = pytest.importorskip("datasets")
+    files = {split: [str(folder / name) for name in (folder / f"{split}.txt").read_text().split()] for split in SPLITS}
+    read = datasets.load_dataset("hdf5", data_files=files, cache_dir=str(tmp_path))
+    with h5py.File(files["test"][0]) as file:
+        np.testing.assert_array_equal(np.array(read["test"][1]["depth"]), file["depth"][1])
+        assert len(read["test"]) == 2 * len(file["depth"])
+
+
+def test_plan_needs_no_order():
+    plan = Plan(recipe())
+    assert plan.scene(3).scene == plan.scene(3).scene != plan.scene(2).scene
+    assert plan.scene(3).fractions == tuple(plan.fraction(9 + k) for k in range(3))
+    assert not math.isnan(plan.scene(0).fractions[0])

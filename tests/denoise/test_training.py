@@ -1,0 +1,260 @@
+"""Networks, the noise they learn from, and the loop that teaches them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from spadwarp import ConfigError, FileError
+from spadwarp.denoise import inference, networks
+from spadwarp.denoise import synthetic_noise as noise
+from spadwarp.denoise.histogram_features import CLUES
+from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
+from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch
+from spadwarp.denoise.training import fit, loss_of
+
+torch.set_num_threads(1)
+
+
+def scenes(count=4, size=64, hole=True):
+    """Tilted planes with a step, 14–15.5 m; a corner sees nothing."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, size), torch.linspace(0, 1, size), indexing="ij")
+    depth = torch.stack([14.0 + 0.3 * k * x + 0.5 * (y > 0.3 + 0.1 * k) for k in range(count)])
+    if hole:
+        depth[:, : size // 8, : size // 8] = torch.nan
+    gate = torch.tensor([13.5, 16.0]).expand(count, 2).contiguous()
+    profile = torch.linspace(1.8, 0.2, noise.BINS).expand(count, noise.BINS).contiguous()
+    return CleanScenes(depth, torch.full_like(depth, 0.002), gate, profile)
+
+
+# No other noise than what a test asks for.
+PLAIN = {
+    "sigma_scale": (1.0, 1.0),
+    "own_gate": 1.0,
+    "own_profile": 1.0,
+    "slanted_gate": 0.0,
+    "counting": 0.0,
+    "scattered": 0.0,
+    "dead": 0.0,
+    "unknown_water": 0.0,
+}
+
+
+def draw(plain, *, size=64, crop=64, seed=3, **options):
+    generator = torch.Generator().manual_seed(seed)
+    return draw_batch(scenes(), plain, size=size, crop=crop, generator=generator, always_replaced=True, **options)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("shape", [(32, 32), (33, 57), (192, 256)])
+def test_networks_keep_the_size(model, shape):
+    network = networks.build_network(model).eval()
+    with torch.inference_mode():
+        output = network(torch.rand(1, 3 + CLUES * networks.reads_histograms(network), *shape))
+    assert output.shape == (1, {"pyramid": 3, "histograms": 4}.get(model, 1), *shape)
+    assert torch.isfinite(output).all()
+
+
+def test_usdn_has_the_weights_of_dehazenet():
+    """8 240 for three channels of input; two of the three are not there."""
+    layers = [one for one in networks.USDN().modules() if isinstance(one, torch.nn.Conv2d)]
+    assert sum(one.weight.numel() for one in layers) + 2 * 5 * 5 * 16 == 8240
+
+
+def test_pyramid_costs_less_than_a_tenth_of_dncnn():
+    ours, theirs = (networks.multiply_adds(networks.build_network(name), 64, 64) for name in ("pyramid", "dncnn"))
+    assert theirs == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64)
+    assert ours < 0.1 * theirs
+
+
+def windows(image, radius):
+    """`[B, 1, H, W]` to `[B, H, W, (2 radius + 1)²]`, beyond the border too."""
+    size = 2 * radius + 1
+    padded = torch.nn.functional.pad(image, (radius,) * 4, mode="replicate")[:, 0]
+    return padded.unfold(1, size, 1).unfold(2, size, 1).flatten(3)
+
+
+def test_order_statistics_are_those_of_a_sort():
+    image = torch.rand(2, 1, 11, 9, generator=torch.Generator().manual_seed(1))
+    expected = windows(image, 1).sort(dim=-1).values
+    for rank, values in zip((2, 4, 6), networks._ranks(image), strict=True):
+        assert torch.equal(values[:, 0], expected[..., rank])
+
+
+def test_pyramid_weighs_the_depths_about_a_pixel_and_the_means_of_blocks_about_its_own():
+    """The same mean, pixel by pixel: 25 depths, nine means of 4×4, nine of 16×16 pixels, one value of the network's."""
+    generator = torch.Generator().manual_seed(4)
+    network = networks.PyramidNet().eval()
+    frame = torch.rand(2, 3, 48, 32, generator=generator)
+    frame[:, 1] = (frame[:, 1] > 0.2).float()
+    head = torch.randn(network.leave.bias.shape, generator=generator)
+    with torch.no_grad():
+        network.leave.weight.zero_()
+        network.leave.bias.copy_(head)
+        found = network(frame)
+    depth, reported = frame[:, :1], frame[:, 1:2]
+    head = head.view(-1, 2, 2).repeat(1, 24, 16)  # what it says of the four pixels of a block is the same everywhere
+    true = head[-1].expand(2, 1, -1, -1)
+    certainty = true.sigmoid() * reported
+    values, trusts = [windows(depth, 2)], [windows(certainty, 2)]
+    for side in (4, 16):
+        share = torch.nn.functional.avg_pool2d(certainty, side)
+        mean = torch.nn.functional.avg_pool2d(certainty * depth, side) / (share + 1e-6)
+        for parts, image in ((values, mean), (trusts, share + 1e-6)):
+            parts.append(windows(image, 1).repeat_interleave(side, dim=1).repeat_interleave(side, dim=2))
+    values.append((0.5 + head[-3]).expand(2, -1, -1)[..., None])
+    trusts.append(torch.ones_like(values[-1]))
+    weights = head[:44].exp().permute(1, 2, 0) * torch.cat(trusts, dim=-1)
+    expected = (weights * torch.cat(values, dim=-1)).sum(dim=-1) / weights.sum(dim=-1)
+    assert torch.allclose(found[:, 0], expected, atol=1e-5)
+    assert torch.equal(found[:, 2:], true)
+
+
+def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
+    """What stands in for their depth changes neither weights nor neighbours: it is shut out by the mask."""
+    network = networks.PyramidNet().eval()
+    frame = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(2))
+    frame[:, 1] = 0.0
+    with torch.no_grad():
+        network.leave.weight.zero_()
+        network.leave.bias.zero_()
+        assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
+
+
+@pytest.mark.parametrize("level", [0.042, 0.48])
+def test_the_share_of_backscatter_is_the_one_asked_for(level):
+    batch = draw(Noise(backscatter=(level, level), behind=1.0, **PLAIN))
+    seen = batch.hit > 0
+    off = (batch.frame[:, :1] - batch.clean).abs() > 5 * 0.002 / 2.5
+    missed = 2 * 5 * 0.002 / 2.5  # strays that fall upon the target by chance, at most twice the mean density
+    share, count = float(off[seen].float().mean()), int(seen.sum())
+    error = np.sqrt(level * (1 - level) / count)
+    assert level * (1 - 1.8 * missed) - 4 * error < share < level + 4 * error
+
+
+def test_backscatter_follows_the_profile_up_to_the_target():
+    batch = draw(Noise(backscatter=(1.0, 1.0), behind=0.0, **PLAIN))
+    seen = batch.hit > 0
+    reported, clean = batch.frame[:, :1][seen], batch.clean[seen]
+    assert (reported <= clean + 1e-5).all()
+    # Distribution of the profile 1.8 … 0.2: its integral to u is 1.8 u − 0.8 u².
+    share = (1.8 * reported - 0.8 * reported**2) / (1.8 * clean - 0.8 * clean**2)
+    counts = torch.histc(share, 20, 0.0, 1.0).numpy()
+    expected = len(share) / 20
+    chi2 = float(((counts - expected) ** 2 / expected).sum())
+    assert chi2 < 43.8  # p > 1e-3 at 19 degrees of freedom
+
+
+def test_the_network_is_told_the_density_at_the_reported_depth():
+    batch = draw(Noise(backscatter=(0.5, 0.5), **PLAIN))
+    there = batch.frame[:, 1] > 0
+    depth, told = batch.frame[:, 0][there], batch.frame[:, 2][there]
+    assert torch.allclose(told.exp(), 1.8 - 1.6 * depth.clamp(0, 1), atol=0.03)
+    assert (batch.frame[:, 0][~there] == 1.0).all() and (batch.frame[:, 2][~there] == 0.0).all()
+
+
+@pytest.mark.parametrize("photons", [4.0, 100.0])
+def test_frames_of_counts_reach_the_bound_where_background_is_rare(photons):
+    """Centroid of n photons: σ/√n, besides 1/12 of a bin's square; σ is 0.6 to 1.8 of 192 bins."""
+    plain = Noise(photons=(photons, photons), sbr=(8.0, 8.0), **{**PLAIN, "counting": 1.0})
+    batch = draw(plain, size=12)
+    inner = (batch.hit > 0) & (batch.frame[:, 1:2] > 0)
+    error = (batch.frame[:, :1] - batch.clean)[inner].abs() * 192
+    median = 0.6745 * np.sqrt((1.2**2 + 1 / 12) / photons)
+    assert 0.7 * median < float(error.median()) < 1.5 * median
+
+
+def test_one_seed_gives_one_batch():
+    first, again, other = (draw(Noise(), size=8, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(first.frame, again.frame) and torch.equal(first.clean, again.clean)
+    assert not torch.equal(first.frame, other.frame)
+
+
+def test_crops_without_a_target_teach_no_depth():
+    frame, clean, hit = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.4), torch.ones(2, 1, 32, 32)
+    hit[1] = 0.0
+    clean[1] = 1.0
+    output = torch.full((2, 1, 32, 32), 0.5)
+    alone = loss_of(output[:1], Batch(frame[:1], clean[:1], hit[:1]), kind="mse")
+    assert alone == pytest.approx(0.01, rel=1e-5)
+    assert loss_of(output, Batch(frame, clean, hit), kind="mse") == pytest.approx(0.01, rel=1e-5)
+
+
+def test_depth_that_was_chosen_teaches_what_is_the_targets():
+    """Of histograms: a depth that is right may not be called wrong because the pixel's own is."""
+    hit = torch.ones(1, 1, 32, 32)
+    batch = Batch(torch.zeros(1, 3 + CLUES, 32, 32), 0.5 * hit, hit)
+    right, wrong = (torch.cat([0.5 * hit, 9 * hit, 9 * hit, chosen * hit], dim=1) for chosen in (0.5, 0.1))
+    assert loss_of(right, batch, kind="mse") < 1e-3 < 0.1 < loss_of(wrong, batch, kind="mse")
+
+
+RECIPE = {
+    "model": "usdn",
+    "data": "none",
+    "seed": 4,
+    "optimiser": {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2},
+}
+
+
+def test_a_run_that_was_cut_short_ends_like_one_that_was_not(tmp_path):
+    recipe = TrainingRecipe.from_dict(RECIPE)
+    whole = fit(recipe, scenes(), scenes(), tmp_path / "whole", device="cpu")
+
+    class Cut(Exception):
+        pass
+
+    def cut(stage, done, total):
+        raise Cut
+
+    with pytest.raises(Cut):
+        fit(recipe, scenes(), scenes(), tmp_path / "parts", device="cpu", progress=cut)
+    parts = fit(recipe, scenes(), scenes(), tmp_path / "parts", device="cpu")
+    for name, values in load_file(whole.weights).items():
+        assert torch.equal(values, load_file(parts.weights)[name]), name
+    lines = [json.loads(line) for line in parts.log.read_text().splitlines()]
+    assert [line["step"] for line in lines] == [3, 6]
+    assert lines[-1]["mean_psnr"] == pytest.approx(whole.psnr, abs=1e-3)
+
+
+def test_histograms_are_learnt_from_the_weights_for_depth(tmp_path):
+    noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
+    recipe = TrainingRecipe.from_dict({**RECIPE, "model": "histograms", "start": "pyramid", "noise": noise})
+    done = fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
+    depth_alone, _ = inference.load_network("pyramid")
+    learnt = load_file(done.weights)
+    for name, values in depth_alone.state_dict().items():
+        assert torch.allclose(learnt[name].float(), values, atol=0.05), name  # six steps
+    assert "enter_clues.weight" in learnt
+    card = inference.weights_card("histograms", done.weights)
+    assert set(card["validation_psnr"]) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
+
+
+def test_a_folder_holds_one_recipe(tmp_path):
+    recipe = TrainingRecipe.from_dict(RECIPE)
+    fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
+    other = TrainingRecipe.from_dict({**RECIPE, "seed": 5})
+    with pytest.raises(ConfigError, match="another recipe"):
+        fit(other, scenes(), scenes(), tmp_path, device="cpu")
+    (tmp_path / "checkpoint.pt").write_bytes(b"no")
+    with pytest.raises(FileError, match="damaged"):
+        fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"model": "unet"}, "model"),
+        ({"noise": {"backscatter": [0.5, 1.2]}}, r"noise.backscatter"),
+        ({"noise": {"photons": [0.0, 3.0]}}, r"noise.photons"),
+        ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
+        ({"model": "histograms"}, r"noise.counting"),
+        ({"start": "pyramid"}, r"start"),
+    ],
+)
+def test_errors_in_a_recipe_name_the_field(tmp_path, change, said):
+    with pytest.raises(ConfigError, match=said):
+        TrainingRecipe.from_dict({**RECIPE, **change})
+    with pytest.raises(FileError, match="cannot be read"):
+        load_training_recipe(tmp_path / "none.toml")

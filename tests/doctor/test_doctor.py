@@ -1,0 +1,57 @@
+"""`spadwarp doctor`: it measures what is known, and says what is wrong."""
+
+import json
+import re
+
+import pytest
+import warp as wp
+from typer.testing import CliRunner
+
+import spadwarp
+from spadwarp.cli import app
+from spadwarp.doctor import diagnosis as health
+
+
+def run(*arguments, code=0):
+    outcome = CliRunner().invoke(app, ["doctor", *map(str, arguments)])
+    assert outcome.exit_code == code, outcome.output
+    return outcome
+
+
+def test_self_test_measures_what_is_known(tmp_path):
+    told = run("--device", "cpu", "--json", tmp_path / "report.json").stdout
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["healthy"] and not report["problems"]
+    for test in report["tests"]:
+        assert abs(test["value"] - test["reference"]) <= 4.5 * test["standard_error"] < 0.02
+        assert test["name"] in told
+    assert report["facts"]["Packages"]["warp-lang"] == wp.__version__
+    assert {"cpu"} <= set(report["facts"]["Devices"])
+    assert bool(report["gpu"]) == (not wp.is_cuda_available())
+
+
+def test_a_wrong_simulator_is_found_out(monkeypatch):
+    monkeypatch.setattr(health, "_TRANSMITTED", 0.67)
+    outcome = run("--device", "cpu", "--quiet", code=1)
+    assert "self-test: let through by the slab" in outcome.stderr and "FAILED" in outcome.stderr
+    assert outcome.stdout == ""
+
+
+def test_a_cache_that_cannot_be_written_is_a_problem(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file" / "cache"))
+    found = spadwarp.doctor.diagnosis.doctor(device="cpu", self_test=False)
+    assert not found.healthy and "set WARP_CACHE_PATH" in found.problems[0]
+
+
+@pytest.mark.parametrize(
+    ("version", "words"),
+    [(None, "no NVIDIA driver"), (12080, r"runs CUDA 12\.8; Warp needs 13\.0"), (13000, "nvidia-smi")],
+)
+def test_what_is_missing_for_a_gpu(version, words, monkeypatch):
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
+    monkeypatch.setattr(health, "_cuda_of_driver", lambda: version)
+    monkeypatch.setattr(health.Path, "exists", lambda self: False)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    [reason] = health._missing_for_a_gpu()
+    assert re.search(words, reason)

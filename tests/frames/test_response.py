@@ -1,0 +1,171 @@
+"""The instrument response against quadrature."""
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response, response_matrix
+
+PS = 1e-12
+
+
+def _measured():
+    times = np.array([-60.0, -10.0, 5.0, 40.0, 200.0, 390.0]) * PS
+    return InstrumentResponse(times=times, values=[0.0, 3.0, 10.0, 6.0, 1.0, 0.0])
+
+
+RESPONSES = {
+    "gaussian": InstrumentResponse(sigma=90 * PS),
+    "tail": InstrumentResponse(sigma=60 * PS, tail=150 * PS),
+    "short tail": InstrumentResponse(sigma=100 * PS, tail=3 * PS),
+    "long tail": InstrumentResponse(sigma=20 * PS, tail=900 * PS),
+    "exponential": InstrumentResponse(tail=120 * PS),
+    "measured": _measured(),
+    "delta": InstrumentResponse(),
+}
+
+
+def test_widths_of_pulse_and_jitter_add_in_quadrature():
+    irf = instrument_response(pulse_fwhm=85e-12, jitter_fwhm=200e-12)
+    assert irf.fwhm == pytest.approx(np.hypot(85e-12, 200e-12))
+    assert irf.sigma * FWHM_PER_SIGMA == pytest.approx(irf.fwhm)
+    half = irf.density(0.5 * irf.fwhm) / irf.density(0.0)
+    assert half == pytest.approx(0.5)
+
+
+def test_the_tail_is_the_convolution_of_both():
+    irf = RESPONSES["tail"]
+    law = stats.exponnorm(irf.tail / irf.sigma, scale=irf.sigma)
+    t = np.linspace(-500, 3000, 201) * PS
+    np.testing.assert_allclose(irf.density(t), law.pdf(t), rtol=1e-8, atol=1e-4)
+    np.testing.assert_allclose(irf.cumulative(t), law.cdf(t), atol=1e-12)
+    assert irf.mean == pytest.approx(law.mean())
+
+
+def test_a_vanishing_tail_is_a_gaussian():
+    t = np.linspace(-400, 400, 81) * PS
+    gaussian, tailed = InstrumentResponse(sigma=100 * PS), InstrumentResponse(sigma=100 * PS, tail=0.01 * PS)
+    np.testing.assert_allclose(tailed.cumulative(t + 0.01 * PS), gaussian.cumulative(t), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", [name for name in RESPONSES if name != "delta"])
+def test_density_cumulative_and_its_integral_are_one_curve(name):
+    irf = RESPONSES[name]
+    lower, upper = irf.support
+    t = np.linspace(lower, upper, 400_001)
+    density, cumulative = irf.density(t), irf.cumulative(t)
+    # The jump of an exponential costs the trapezoid half a step.
+    tolerance = density.max() * (t[1] - t[0]) if name == "exponential" else 1e-6
+    np.testing.assert_allclose(integrate.cumulative_trapezoid(density, t, initial=0), cumulative, atol=tolerance)
+    integral = integrate.cumulative_trapezoid(cumulative, t, initial=0)
+    np.testing.assert_allclose(integral, irf.cumulative_integral(t), atol=tolerance * (upper - lower))
+    assert 1 - 2e-7 < cumulative[-1] - cumulative[0] <= 1 + 1e-12
+    assert irf.mean == pytest.approx(integrate.trapezoid(t * density, t), rel=1e-3, abs=1e-15)
+    assert irf.density(irf.mode) == pytest.approx(density.max(), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", RESPONSES)
+@pytest.mark.parametrize("bin_width", [1 * PS, 55 * PS, 2000 * PS])
+def test_bins_hold_the_whole_response_wherever_the_light_arrives(name, bin_width):
+    irf = RESPONSES[name]
+    reach = int(np.ceil(max(map(abs, irf.support)) / bin_width)) + 2
+    edges = np.arange(-reach, reach + 1) * bin_width
+    for shift in (0.0, 0.31, 0.77):
+        fractions = irf.bin_fractions(edges, arrival=shift * bin_width)
+        assert (fractions >= -1e-15).all()
+        assert fractions.sum() == pytest.approx(1.0, abs=2e-7)
+        # Sub-bin accuracy: with bins narrower than the response, the mean moves with the light.
+        if irf.fwhm > 2 * bin_width:
+            centres = 0.5 * (edges[1:] + edges[:-1])
+            assert fractions @ centres == pytest.approx(irf.mean + shift * bin_width, abs=0.02 * bin_width)
+
+
+def _dense(matrix, bins, sources):
+    dense = np.zeros((bins, sources))
+    for k in range(bins):
+        entries = slice(matrix.row_start[k], matrix.row_start[k + 1])
+        np.add.at(dense[k], matrix.source_bin[entries], matrix.weight[entries])
+    return dense
+
+
+AXIS = dict(source_start=10e-9, source_width=100 * PS, source_bins=40)
+
+
+@pytest.mark.parametrize("name", RESPONSES)
+def test_matrix_is_the_average_over_each_source_bin(name):
+    irf = RESPONSES[name]
+    edges = 10e-9 + np.concatenate([[0.0], np.cumsum(np.random.default_rng(1).uniform(20, 180, 39))]) * PS
+    dense = _dense(response_matrix(irf, **AXIS, edges=edges), 39, 40)
+    points = (np.arange(4000) + 0.5) / 4000 * 100 * PS
+    for k in (0, 17, 39):
+        arrivals = 10e-9 + k * 100 * PS + points
+        expected = np.diff(irf.cumulative(edges[None, :] - arrivals[:, None]), axis=1).mean(0)
+        np.testing.assert_allclose(dense[:, k], expected, atol=5e-4 if name in ("delta", "exponential") else 1e-6)
+
+
+def test_a_delta_on_the_same_bins_changes_nothing():
+    edges = 10e-9 + np.arange(41) * 100 * PS
+    dense = _dense(response_matrix(InstrumentResponse(), **AXIS, edges=edges), 40, 40)
+    np.testing.assert_allclose(dense, np.eye(40), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["gaussian", "tail", "delta"])
+def test_folding_loses_nothing_when_the_window_is_the_period(name):
+    period = 1.73e-9  # neither a multiple of the bins nor a divisor of the source
+    edges = np.linspace(0, period, 23) + 3e-9
+    dense = _dense(response_matrix(RESPONSES[name], **AXIS, edges=edges, period=period), 22, 40)
+    np.testing.assert_allclose(dense.sum(0), 1.0, atol=1e-6)
+
+
+def test_folding_shifts_by_whole_periods():
+    irf, period = RESPONSES["tail"], 2e-9  # 20 source bins
+    edges = 10e-9 + np.arange(21) * 100 * PS
+    dense = _dense(response_matrix(irf, **AXIS, edges=edges, period=period), 20, 40)
+    np.testing.assert_allclose(dense[:, :20], dense[:, 20:], atol=1e-6)
+    # The detector sees a circle: each source bin's column is the one before it, turned.
+    np.testing.assert_allclose(np.roll(dense[:, 3], 1), dense[:, 4], atol=1e-6)
+
+
+def test_a_window_without_light_is_empty():
+    matrix = response_matrix(RESPONSES["gaussian"], **AXIS, edges=[1.0, 2.0, 3.0])
+    assert matrix.row_start.tolist() == [0, 0, 0] and matrix.weight.size == 0
+
+
+def test_csv(tmp_path):
+    path = tmp_path / "irf.csv"
+    path.write_text("# a measured response\ntime_ps,value\n-50,0\n0,4\n\n150,0\n")
+    irf = instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(path))
+    assert irf.mean == pytest.approx((-50 + 0 + 150) / 3 * PS)  # of a triangle
+    assert irf.mode == 0 and irf.fwhm == pytest.approx(100 * PS, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time_ps,value\n0,1\n1,x\n", "line 3"),
+        ("0,1\n1,-1\n", "not negative"),
+        ("0,1\n0,2\n", "ascending"),
+        ("0,1\n", "two or more"),
+        ("0,0\n1,0\n", "not all 0"),
+        ("0,1\n1,nan\n", "finite"),
+    ],
+)
+def test_a_bad_csv_is_named(tmp_path, text, message):
+    path = tmp_path / "irf.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(path))
+    assert "irf.csv" in str(error.value)
+
+
+def test_wrong_input_is_named():
+    with pytest.raises(ValueError, match="pulse_fwhm = -1"):
+        instrument_response(pulse_fwhm=-1, jitter_fwhm=0)
+    with pytest.raises(ValueError, match="tail = nan"):
+        instrument_response(pulse_fwhm=0, jitter_fwhm=0, tail=np.nan)
+    with pytest.raises(ValueError, match="neither a known shape nor a file"):
+        instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape="lorentzian")
+    with pytest.raises(ValueError, match="sigma = inf"):
+        InstrumentResponse(sigma=np.inf)
+    with pytest.raises(ValueError, match="no density"):
+        InstrumentResponse().density(0.0)

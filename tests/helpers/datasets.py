@@ -1,0 +1,33 @@
+"""A small dataset that the tests share."""
+
+import spadwarp
+from spadwarp.dataset.shards import checksum
+
+BS = (0.042, 0.183, 0.480)
+
+TABLES = {
+    "name": "test",
+    "seed": 11,
+    "scenes_per_target": 2,
+    "scenes_per_shard": 1,
+    "targets": {"builtin": ["staircase", "amphora", "car"], "validation": ["car"], "test": ["staircase"]},
+    "pose": {"distance": [15.0], "yaw_deg": {"low": -20.0, "high": 20.0}},
+    "water": {"attenuation_lengths": {"low": 0.5, "high": 2.0}},
+    "exposure": {"signal_photons": {"low": 20.0, "high": 200.0, "log": True}},
+    "gate": {"before": 1.5, "behind": 1.0, "bins": 128},
+    "frames": {"per_scene": 3, "backscatter_fraction": list(BS)},
+    "scene": {
+        "medium": {"extinction": 0.1, "albedo": 0.5},
+        "laser": {"preset": "paper", "half_angle_deg": 14.0, "repetition_rate": 5e6},
+        "camera": {"preset": "paper", "width": 36, "height": 24},
+        "detector": {"preset": "paper"},
+    },
+}
+
+
+def recipe(**changes):
+    return spadwarp.Recipe.from_dict(TABLES).with_overrides(changes) if changes else spadwarp.Recipe.from_dict(TABLES)
+
+
+def checksums(place):
+    return {path.relative_to(place).as_posix(): checksum(path) for path in sorted(place.rglob("*.*")) if path.is_file()}

@@ -1,0 +1,140 @@
+"""torch: the same numbers, in shared memory, wherever they lie."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+import spadwarp
+from helpers.scenes import scene as make_scene
+from spadwarp.frames.spad import first_photon_probabilities
+
+torch = pytest.importorskip("torch")
+
+SECTIONS = {
+    "laser": {"half_angle_deg": 20.0, "position": [-0.1, 0.0, 0.0], "pulse_energy": 1e-14, "repetition_rate": 1e7},
+    "detector": {"dark_count_rate": 1e4, "pulses": 2000},
+    "transport": {"photons": 20_000, "seed": 1, "max_collisions": 12, "axis_threshold": 1.0},
+}
+SHAPE = (3, 4, 4, 8)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(**SECTIONS)
+
+
+@pytest.fixture(scope="module")
+def result(scene):
+    return spadwarp.simulate(scene, device="cpu")
+
+
+@pytest.mark.parametrize("options", [{}, {"uncertainty": True}], ids=["whole", "batches"])
+@pytest.mark.parametrize("kind", ["torch", "warp"])
+def test_tallies_of_the_caller(scene, result, kind, options):
+    """They are overwritten, and hold the bits of any run of the seed."""
+    if kind == "torch":
+        mine = torch.full(SHAPE, 5, dtype=torch.int64)
+        seen = mine.numpy()
+    else:
+        mine = wp.full(int(np.prod(SHAPE)), 5, dtype=wp.int64, device="cpu")
+        seen = mine.numpy().reshape(SHAPE)
+    filled = spadwarp.simulate(scene, device="cpu", tallies=mine, **options)
+    assert np.array_equal(filled.tallies, seen)
+    assert np.shares_memory(filled.tallies, seen)
+    if not options:
+        assert np.array_equal(seen, result.tallies)
+
+
+def test_results_share_their_memory(result):
+    view = spadwarp.to_torch(result)
+    assert view.tallies.data_ptr() == result.tallies.ctypes.data
+    assert view.truth.depth.data_ptr() == result.truth.depth.ctypes.data
+    assert np.array_equal(view.histogram.numpy(), result.histogram)
+    assert np.array_equal(view.component("backscatter").numpy(), result.component("backscatter"))
+    assert np.allclose(view.detections.numpy(), result.detections, rtol=1e-15)
+    assert np.allclose(view.intensity.numpy(), result.intensity, rtol=1e-12)
+    with pytest.raises(ValueError, match="'fog' is not one of"):
+        view.component("fog")
+
+    flat = torch.from_numpy(result.tallies).flatten()
+    assert spadwarp.to_torch(result, tallies=flat).tallies.shape == SHAPE
+    with pytest.raises(ValueError, match=r"torch\.int32 \(384,\); torch\.int64 \(3, 4, 4, 8\) is needed"):
+        spadwarp.to_torch(result, tallies=flat.int())
+
+
+MODES = {
+    "first photon": {},
+    "summed": {"summed": True},
+    "free running": {"mode": "free_running", "dead_time_ns": 20.0},
+    "free running, summed": {"mode": "free_running", "dead_time_ns": 20.0, "summed": True},
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_frames_are_the_same_in_torch(result, mode):
+    options = {"frames": 3, "seed": 5, "device": "cpu", "summed": False} | MODES[mode]
+    summed = options.pop("summed")
+    fields = {name: options.pop(name) for name in ("mode", "dead_time_ns") if name in options}
+    detector = result.scene.with_overrides(detector=fields).detector
+    expected = spadwarp.detect(result, detector=detector, summed=summed, **options)
+    frames = spadwarp.detect(spadwarp.to_torch(result), detector=detector, summed=summed, **options)
+    for name in ("counts", "expected", "background", "intensity"):
+        one, other = getattr(frames, name), getattr(expected, name)
+        assert isinstance(one, torch.Tensor) and one.numpy().dtype == other.dtype, name
+        assert np.array_equal(one.numpy(), other), name
+    for method in ("centroid", "matched", "likelihood"):
+        times = frames.arrival_time(method, device="cpu")
+        assert isinstance(times, torch.Tensor) and times.dtype == torch.float64
+        assert np.array_equal(times.numpy(), expected.arrival_time(method, device="cpu"), equal_nan=True)
+    if mode == "first photon":
+        undone = frames.arrival_time(undo_pile_up=True)
+        again = expected.arrival_time(undo_pile_up=True, device="cpu")
+        assert np.array_equal(undone.numpy(), again, equal_nan=True)
+
+    mine = torch.full(expected.counts.shape, -1, dtype=torch.int32)
+    filled = spadwarp.detect(result, detector=detector, summed=summed, out=mine, **options)
+    assert filled.counts.data_ptr() == mine.data_ptr()
+    assert np.array_equal(mine.numpy(), expected.counts)
+
+
+def test_frames_share_their_memory(result):
+    frames = spadwarp.detect(result, seed=5, device="cpu")
+    view = spadwarp.to_torch(frames)
+    for name in ("counts", "expected", "background"):
+        assert np.shares_memory(getattr(view, name).numpy(), getattr(frames, name))
+    assert dataclasses.replace(view, counts=frames.counts).seed == frames.seed
+
+
+def test_laws_are_the_same_in_torch():
+    hazard = np.random.default_rng(2).uniform(0.0, 0.2, (2, 3, 8))
+    law = first_photon_probabilities(torch.from_numpy(hazard))
+    assert isinstance(law, torch.Tensor)
+    assert np.array_equal(law.numpy(), first_photon_probabilities(hazard, device="cpu"))
+    counts = np.random.default_rng(2).poisson(3.0, (2, 3, 8))
+    corrected = spadwarp.coates(torch.from_numpy(counts), pulses=1000)
+    assert isinstance(corrected, torch.Tensor)
+    assert np.array_equal(corrected.numpy(), spadwarp.coates(counts, pulses=1000, device="cpu"))
+
+
+@pytest.mark.parametrize(
+    ("tallies", "words"),
+    [
+        (torch.zeros(SHAPE, dtype=torch.int32), r"int32 \(3, 4, 4, 8\) on cpu; contiguous int64"),
+        (torch.zeros(2, dtype=torch.int64), r"int64 \(2,\)"),
+        (torch.zeros((*SHAPE, 2), dtype=torch.int64)[..., 0], "contiguous int64"),
+        (np.zeros(SHAPE, np.int64), "a torch tensor or a Warp array is needed"),
+    ],
+)
+def test_tallies_that_do_not_fit_are_refused(scene, tallies, words):
+    with pytest.raises(ValueError, match=words):
+        spadwarp.simulate(scene, photons=10, device="cpu", tallies=tallies)
+
+
+def test_counts_that_do_not_fit_are_refused(result):
+    options = {"seed": 5, "device": "cpu"}
+    with pytest.raises(ValueError, match=r"out is torch\.int64 \(1, 4, 4, 8\) on cpu; contiguous torch\.int32"):
+        spadwarp.detect(result, out=torch.zeros((1, 4, 4, 8), dtype=torch.int64), **options)
+    with pytest.raises(ValueError, match="out is a ndarray; a torch tensor is needed"):
+        spadwarp.detect(result, out=np.zeros((1, 4, 4, 8), np.int32), **options)

@@ -1,0 +1,150 @@
+"""The built-in targets: closed, of the size they state, the same every time, and worth a depth image."""
+
+import hashlib
+import re
+
+import numpy as np
+import pytest
+
+from spadwarp.mesh.shapes import SHAPES, make_shape
+from spadwarp.mesh.shapes import solids as so
+
+
+def front_depth(mesh, cells=64):
+    """Nearest z [cells, cells] of 60 000 surface points, seen along +z from far away; NaN where there are none."""
+    rng = np.random.default_rng(5)
+    areas = mesh.area_faces
+    faces = rng.choice(len(areas), 60_000, p=areas / areas.sum())
+    u, v = rng.random((2, 60_000, 1))
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[faces]], 1, 0)
+    points = a + u * (b - a) + v * (c - a)
+    column, row = np.clip(((points[:, :2] / 4 + 0.5) * cells).astype(int), 0, cells - 1).T
+    depth = np.full((cells, cells), np.inf)
+    np.minimum.at(depth, (row, column), points[:, 2])
+    return np.where(np.isfinite(depth), depth, np.nan)
+
+
+def test_there_are_nineteen_targets_under_plain_names():
+    assert len(SHAPES) == 19
+    assert all(re.fullmatch(r"[a-z]+(_[a-z]+)*", name) for name in SHAPES)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_mesh_is_one_closed_outward_oriented_piece(name):
+    mesh = make_shape(name)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.body_count == 1
+    assert mesh.volume > 0.1
+    assert 1_000 <= len(mesh.faces) <= 60_000
+    _, uses = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    assert (uses == 2).all()
+    # Divergence theorem: the area vectors of a closed surface sum to zero.
+    assert np.abs((mesh.face_normals * mesh.area_faces[:, None]).sum(axis=0)).max() < 1e-6 * mesh.area
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_every_face_has_an_area_in_single_precision(name):
+    mesh = make_shape(name)
+    a, b, c = np.moveaxis(mesh.vertices.astype(np.float32)[mesh.faces], 1, 0)
+    assert (np.cross(b - a, c - a) != 0).any(axis=1).all()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_size_is_the_one_stated_and_fits_the_view(name):
+    mesh = make_shape(name)
+    stated = re.search(r"Size ([\d.]+) × ([\d.]+) × ([\d.]+) m\.", SHAPES[name].__doc__)
+    np.testing.assert_allclose(mesh.extents, [float(side) for side in stated.groups()], atol=0.006)
+    np.testing.assert_allclose(mesh.bounds.sum(axis=0), 0, atol=1e-9)
+    # 20° by 15° at 15 m, up to the front of the box: the target is neither cut off nor lost in the picture.
+    distance = 15 - mesh.extents[2] / 2
+    width, height = 2 * distance * np.tan(np.radians(10)) * np.array([1, 0.75])
+    assert mesh.extents[0] < width and mesh.extents[1] < height
+    assert max(mesh.extents[:2]) >= 3.2
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_depth_image_has_relief(name):
+    depth = front_depth(make_shape(name))
+    seen = depth[np.isfinite(depth)]
+    assert seen.size > 0.1 * depth.size
+    near, far = np.percentile(seen, [5, 95])
+    assert 0.1 < far - near < 2.5
+
+
+def test_no_two_targets_look_alike():
+    silhouettes = [np.isfinite(front_depth(make_shape(name), 32)) for name in SHAPES]
+    for k, one in enumerate(silhouettes):
+        for other in silhouettes[:k]:
+            assert (one & other).sum() < 0.9 * (one | other).sum()
+
+
+@pytest.mark.parametrize("name", ["pipe_valve", "starfish", "submarine", "television"])
+def test_same_bits_in_every_call(name):
+    def digest(mesh):
+        return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+
+    assert digest(SHAPES[name]()) == digest(SHAPES[name]())
+
+
+def test_make_shape_hands_out_copies():
+    first = make_shape("anchor")
+    first.apply_scale(2.0)
+    assert make_shape("anchor").extents == pytest.approx(first.extents / 2)
+
+
+def test_unknown_name_is_answered_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"'ancor' is not one of submarine, anchor, "):
+        make_shape("ancor")
+
+
+def test_camera_frame_has_top_at_minus_y_and_front_at_minus_z():
+    heavy_end_right_up_and_near = so.union(so.box((0.2, 0.2, 0.2), (1, 1, 1)), so.box((0.01, 0.01, 0.01)))
+    mesh = so.to_trimesh(heavy_end_right_up_and_near)
+    assert np.sign(mesh.center_mass).tolist() == [1, -1, -1]
+    assert mesh.volume > 0
+
+
+class TestSolids:
+    def test_lathe_and_torus_follow_pappus(self):
+        ring = so.lathe([(1.0, 0), (1.2, 0), (1.2, 0.3), (1.0, 0.3)], segments=256)
+        assert ring.volume() == pytest.approx(2 * np.pi * 1.1 * 0.2 * 0.3, rel=1e-3)
+        assert ring.bounding_box() == pytest.approx((-1.2, 0, -1.2, 1.2, 0.3, 1.2), abs=1e-3)
+        assert so.torus(1.0, 0.1, segments=256).volume() == pytest.approx(2 * np.pi * np.pi * 0.01, rel=0.02)
+
+    @pytest.mark.parametrize(("axis", "lower", "upper"), [("x", 0, 3), ("y", 1, 4), ("z", 2, 5)])
+    def test_lathe_stands_along_its_axis(self, axis, lower, upper):
+        box = so.lathe([(0, 0.5), (0.1, 0.5), (0, 2)], axis=axis).bounding_box()
+        assert (box[lower], box[upper]) == pytest.approx((0.5, 2))
+
+    def test_tube_along_a_bent_path_has_the_volume_of_its_straightened_self(self):
+        turn = np.linspace(0, np.pi, 200)
+        path = np.stack([np.cos(turn), np.sin(turn), 0.3 * turn], axis=1)
+        length = np.pi * np.hypot(1, 0.3)
+        assert so.tube(path, 0.1, sides=128).volume() == pytest.approx(np.pi * 0.01 * length, rel=2e-3)
+
+    def test_implicit_ball_in_every_octant(self):
+        def field(x, y, z):
+            return 0.8 - np.sqrt((x - 0.1) ** 2 + y**2 + z**2)
+
+        ball = so.implicit(field, (-1, -1, -1), (1, 1, 1), 0.05)
+        assert ball.volume() == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.005)
+        assert ball.genus() == 0
+        radius = np.linalg.norm(so.to_trimesh(ball).vertices, axis=1)
+        assert np.abs(radius - 0.8).max() < 0.01
+
+    def test_implicit_solid_cut_by_the_grid_is_refused(self):
+        with pytest.raises(ValueError, match="not a closed manifold"):
+            so.implicit(lambda x, y, z: 0.5 - np.abs(x) + 0 * (y + z), (-1, -1, -1), (1, 1, 1), 0.2)
+
+    def test_smooth_union_covers_the_union_and_adds_at_most_a_quarter_radius(self):
+        a, b = np.random.default_rng(3).normal(size=(2, 1000))
+        joined = so.smooth_union([a, b], 0.4)
+        assert (joined >= np.maximum(a, b)).all()
+        assert (joined - np.maximum(a, b)).max() <= 0.1
+
+    def test_spline_passes_through_its_points(self):
+        points = np.array([(0.0, 0), (1, 2), (3, 1), (4, 4)])
+        np.testing.assert_allclose(so.spline(points, 5)[::5], points)
+        np.testing.assert_allclose(so.spline(points, 5, closed=True)[::5], points)

@@ -1,0 +1,180 @@
+"""Promises of the engines: every job is done once, wherever it runs, whatever happens to its worker; a run over Ray
+has the bits of a run without."""
+
+import os
+import random
+import re
+import signal
+import sys
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers import parallel_jobs
+from helpers.datasets import checksums, recipe
+from helpers.runs import PHOTONS, RUN, same
+from helpers.scenes import scene
+from spadwarp.parallel import Ray, interruptible, run_jobs
+
+ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
+
+
+@pytest.fixture(params=ENGINES)
+def options(request):
+    """Of `run_jobs`, for each engine."""
+    if request.param == "ray":
+        request.getfixturevalue("cluster")
+    return ENGINES[request.param]
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two cores of Ray for all tests of this file."""
+    ray = pytest.importorskip("ray")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
+        yield
+        ray.shutdown()
+
+
+def test_every_job_is_done_once_and_workers_keep_their_state(options):
+    done = dict(run_jobs(parallel_jobs.square, range(20), **options))
+    assert {job: value[0] for job, value in done.items()} == {job: job**2 for job in range(20)}
+    counts = {}
+    for _, pid, count in done.values():
+        counts[pid] = max(count, counts.get(pid, 0))
+    assert sum(counts.values()) == 20
+    assert len(counts) <= 2
+
+
+def test_an_error_of_a_job_is_raised_as_it_is(options):
+    with pytest.raises(ValueError, match="job 0 is wrong"):
+        list(run_jobs(parallel_jobs.fails, [0], **options))
+
+
+def test_a_job_whose_worker_was_killed_runs_again(cluster, tmp_path):
+    notes = []
+    jobs = [(number, str(tmp_path)) for number in range(7)]
+    done = dict(run_jobs(parallel_jobs.dies_once, jobs, engine=Ray(workers=2), note=notes.append))
+    assert done == {job: job[0] ** 2 for job in jobs}
+    assert sum(note.startswith("lost the worker") for note in notes) == 3
+
+
+def test_a_job_that_kills_every_worker_is_given_up(cluster):
+    with pytest.raises(spadwarp.DeviceError, match="took 4 workers with it"):
+        list(run_jobs(parallel_jobs.always_dies, [0], engine=Ray(workers=1)))
+    with pytest.raises(spadwarp.DeviceError, match="killed"):
+        list(run_jobs(parallel_jobs.always_dies, [0], device="cpu,cpu"))
+
+
+def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(options):
+    begun = []
+
+    def jobs():
+        for job in range(1000):
+            begun.append(job)
+            if job == 5:
+                signal.raise_signal(signal.SIGTERM)
+            yield job
+
+    with interruptible() as stopped:
+        done = [job for job, _ in run_jobs(parallel_jobs.square, jobs(), stopped=stopped, **options)]
+    assert stopped.is_set()
+    assert sorted(done) == begun and 5 <= len(begun) <= 7
+
+
+def test_simulations_do_not_depend_on_who_runs_them():
+    for seed, tallies in run_jobs(parallel_jobs.shots, [3, 4], **ENGINES["processes"]):
+        alone = spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu")
+        np.testing.assert_array_equal(tallies, alone.tallies)
+
+
+# Runs over Ray
+
+
+class Killer:
+    """Kills one of the workers that have joined, with each of so many reports of progress."""
+
+    def __init__(self, kills, seed):
+        self.left, self.random, self.pids, self.remarks = kills, random.Random(seed), [], []
+
+    def __call__(self, stage, done, total):
+        if stage != "trace":
+            self.remarks.append(stage)
+            if found := re.match(r"worker .*process (\d+)$", stage):
+                self.pids.append(int(found[1]))
+        elif self.left and 0 < done < total and self.pids:
+            self.left -= 1
+            pid = self.pids.pop(self.random.randrange(len(self.pids)))
+            os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("uncertainty", "kills"), [(False, 3), (True, 1)])
+def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, uncertainty, kills, whole, tmp_path):
+    killer = Killer(kills, seed=kills)
+    options = {"uncertainty": uncertainty, "checkpoint": tmp_path / "checkpoint.h5", "checkpoint_every": 0.0}
+    run = spadwarp.simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
+    same(run, whole[uncertainty])
+    assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == kills
+    assert kills + 1 <= len(run.provenance["workers"]) <= kills + 2 and run.provenance["device"] == "2 Ray workers"
+    # What was written down on the way is consistent, whatever was lost, and can be gone on from.
+    kept = spadwarp.load_result(tmp_path / "checkpoint.h5")
+    assert kept.partial and 0 < kept.photons < PHOTONS and kept.ledger_report()["exact"]
+    same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
+
+
+def test_a_run_can_be_gone_on_with_over_ray(cluster, whole):
+    parts = [spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, shard=(n, 5)) for n in (5, 1)]
+    gaps = spadwarp.merge(parts)
+    same(spadwarp.simulate(scene(), engine=Ray(workers=1), resume=gaps), whole[True])
+    assert gaps.photons < PHOTONS / 2  # untouched
+
+
+def test_the_stopping_rule_is_the_same_over_ray(cluster):
+    options = {"photons": 2**20, "seed": 1, "relative_error": 0.1}
+    same(
+        spadwarp.simulate(scene(), **options, engine=Ray(workers=1)),
+        spadwarp.simulate(scene(), **options, device="cpu"),
+    )
+
+
+def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
+    def interrupt(stage, done, total):
+        if stage == "trace" and done >= 10_000 and not fired:
+            fired.append(done)
+            signal.raise_signal(signal.SIGINT)
+
+    fired = []
+    part = spadwarp.simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
+    assert part.partial and 10_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
+    # The photons it has, whichever they are, are those of a local run.
+    parts = [
+        spadwarp.simulate(scene(), photons=stop - start, first_photon=start, seed=5, device="cpu")
+        for start, stop in part.photon_ranges
+    ]
+    assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()
+
+
+def test_what_ray_cannot_do_is_said(cluster):
+    with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
+        spadwarp.simulate(scene(), **RUN, device="cuda:1", engine=Ray())
+    with pytest.raises(spadwarp.DeviceError, match="no GPU"):
+        spadwarp.simulate(scene(), **RUN, device="cuda", engine=Ray())
+    with pytest.raises(spadwarp.ConfigError, match="workers = 0"):
+        spadwarp.simulate(scene(), **RUN, engine=Ray(workers=0))
+
+
+def test_a_dataset_whose_workers_are_killed_has_the_files_of_a_local_one(cluster, tmp_path):
+    small, killer = recipe(**{"frames.per_scene": 1, "scenes_per_target": 3}), Killer(2, seed=3)
+    spadwarp.make_dataset(small, tmp_path / "here", device="cpu")
+    spadwarp.make_dataset(
+        small,
+        tmp_path / "ray",
+        engine=Ray(workers=2),
+        progress=lambda stage, done, total: killer("trace" if stage == "frames" else stage, done, total),
+    )
+    assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == 2
+    assert checksums(tmp_path / "ray") == checksums(tmp_path / "here")
+    assert not spadwarp.verify_dataset(tmp_path / "ray")

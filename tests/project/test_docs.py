@@ -1,0 +1,240 @@
+"""The documentation: links lead somewhere, its code runs, its references are current, figures can be drawn."""
+
+import ast
+import importlib.util
+import re
+import runpy
+import shlex
+import tomllib
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import spadwarp
+from helpers.scenes import scene as make_scene
+from spadwarp.cli import app
+from spadwarp.scene import Target
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8") and page.name != "tutorial.md"]
+FIGURES = sorted((ROOT / "docs" / "figures").glob("*.py"))
+
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def anchors(text):
+    """Anchors that the headings of a Markdown page get, code blocks left out."""
+    headings = re.findall(r"^#+ (.*)$", _FENCE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def by_name(path):
+    return path.name
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder in which the configurations lie as in a checkout."""
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    (folder / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_relative_links_and_images_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for link in _LINK.findall(_FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        if anchor:
+            assert anchor in anchors(target.read_text(encoding="utf-8")), f"{page.name}: {link}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_python_in_the_text_uses_names_that_exist(page):
+    for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
+        if language == "python":
+            for node in ast.walk(ast.parse(code)):
+                if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spadwarp":
+                    assert hasattr(spadwarp, node.attr) or importlib.util.find_spec(f"spadwarp.{node.attr}")
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=by_name)
+def test_python_in_the_text_runs(page, checkout, tmp_path):
+    """The blocks of a page, one after the other, as one program in a checkout."""
+    blocks = [code for language, code in _FENCE.findall(page.read_text(encoding="utf-8")) if language == "python"]
+    program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
+    program.write_text("\n".join(blocks), encoding="utf-8")
+    runpy.run_path(str(program))
+
+
+# The same commands at a small size.
+SMALLER = {
+    r"--photons \S+": "--photons 5e3 --set camera.width=16 --set camera.height=12",
+    r"--pulses 20000": "--pulses 500",
+    r"(dataset make \S+small\.toml)": r"\1 --set scenes_per_target=1 --set scenes_per_shard=1 --set frames.per_scene=2",
+    r"(train \S+)": r"\1 --steps 2",
+    r"(evaluate \S+)": r"\1 --frames 1",
+}
+
+
+def test_tutorial_runs(checkout):
+    """From the first command to the last, block by block; pip aside."""
+    names = {}
+    for language, code in _FENCE.findall((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")):
+        if language == "toml":
+            Path(re.match(r"# (\S+)", code)[1]).write_text(code)
+        elif language == "python":
+            exec(compile(code, "tutorial.md", "exec"), names)
+        else:
+            for line in code.splitlines():
+                if not line.startswith("pip "):
+                    run(line)
+
+
+def commands(text):
+    """The words of every command line in a page's shell blocks, comments left out."""
+    for language, code in _FENCE.findall(text):
+        if language in ("sh", "bash"):
+            for line in code.replace("\\\n", " ").splitlines():
+                with suppress(ValueError):  # a quotation that goes on, in a job's script
+                    yield shlex.split(line, comments=True)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=by_name)
+def test_commands_in_the_text_name_what_there_is(page):
+    """Commands, options, configurations and scripts; the tutorial runs most of them."""
+    told = {}
+    for words in commands(page.read_text(encoding="utf-8")):
+        if words[:1] == ["python"] and words[1].startswith("kernels/examples/"):
+            known = (ROOT / words[1]).read_text()
+        elif "spadwarp" in words[:1] or words[-2:-1] == ["spadwarp"]:
+            words = words[words.index("spadwarp") + 1 :]
+            command = tuple(words[: 2 if words[0] == "dataset" else 1])
+            if command not in told:
+                told[command] = CliRunner().invoke(app, [*command, "--help"]).stdout
+            known = told[command] + "--help"
+        else:
+            continue
+        assert known, words
+        for word in words:
+            assert not word.startswith("--") or word.partition("=")[0] in known, words
+            assert not re.match(r"configs/\S+\.toml", word) or (ROOT / word).is_file(), words
+
+
+def test_every_picture_of_the_gallery_has_its_commands():
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert len(re.findall(r"^!\[[^\]]+\]\([^)]+\)\n\n```sh\n", text, re.MULTILINE)) == text.count("![") > 5
+
+
+def run(line):
+    """A command, in this process."""
+    for pattern, smaller in SMALLER.items():
+        line = re.sub(pattern, smaller, line)
+    program, *arguments = shlex.split(line)
+    assert program == "spadwarp"
+    outcome = CliRunner().invoke(app, arguments)
+    assert outcome.exit_code == 0, f"{line}\n{outcome.output}"
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "docs" / "reference" / "scene.md"], ids=by_name)
+def test_scenes_in_the_text_are_valid(page, checkout):
+    """A block of TOML is a scene, or sections that lie over one."""
+    for language, code in _FENCE.findall(page.read_text(encoding="utf-8")):
+        if language == "toml" and page.name != "tutorial.md":
+            tables = tomllib.loads(code)
+            spadwarp.load_scene("configs/scenes/plane_5m.toml", {} if {"camera", "gate"} <= set(tables) else tables)
+            if {"camera", "gate"} <= set(tables):
+                spadwarp.Scene.from_dict(tables)
+
+
+def test_reference_is_that_of_the_code():
+    made = load(ROOT / "docs" / "reference.py").pages()
+    old = [name for name, text in made.items() if (ROOT / "docs" / "reference" / name).read_text() != text]
+    assert not old, f"docs/reference: {', '.join(old)} differ from the code: run `python docs/reference.py`"
+    assert len(list((ROOT / "docs" / "reference").iterdir())) == len(made)
+
+
+def test_reference_tells_every_field():
+    """Also with its range: what lies outside of it is refused in these words."""
+    text = (ROOT / "docs" / "reference" / "scene.md").read_text()
+    for name, section in spadwarp.Scene.model_fields.items():
+        model = section.annotation if isinstance(section.annotation, type) else Target
+        part = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
+        for field, info in model.model_fields.items():
+            assert f"| `{field}` |" in part and info.description, f"{name}.{field}"
+    row = next(line for line in text.splitlines() if line.startswith("| `anisotropy` |"))
+    with pytest.raises(spadwarp.ConfigError, match=r"anisotropy = 1\.2 .*is outside \(-1, 1\)"):
+        spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml", {"medium.anisotropy": 1.2})
+    assert "(-1, 1)" in row and "`0.924`" in row
+
+
+def test_pages_of_the_site_exist():
+    """What the navigation names leads to a file."""
+    text = (ROOT / "mkdocs.yml").read_text()
+    named = set(re.findall(r": ([\w/]+\.md)$", text, re.MULTILINE))
+    elsewhere = set(re.findall(r'": "([\w/]+\.md)"', (ROOT / "docs" / "hooks.py").read_text()))
+    here = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert named and named <= here | elsewhere
+
+
+def test_every_image_is_shown_somewhere():
+    shown = "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"])
+    unused = [path.name for path in (ROOT / "docs" / "images").glob("*.png") if path.name not in shown]
+    assert not unused
+
+
+@pytest.mark.parametrize("path", FIGURES, ids=by_name)
+def test_figure_scripts_import_and_say_how_to_run_them(path):
+    module = load(path)
+    assert callable(module.main)
+    assert f"python docs/figures/{path.name}" in module.__doc__
+
+
+def test_ballistic_light_of_the_figure_is_the_analytic_signal():
+    figure = load(ROOT / "docs" / "figures" / "analytic_limits.py")
+    mean, error = figure.ratios(0.4, photons=160_000)
+    ballistic, target = figure.BALLISTIC, figure.TARGET
+    assert abs(mean[ballistic] - 1.0) < 4.5 * error[ballistic] < 0.1
+    # Light that scatters forward still comes back; it cannot be more than without any loss by scattering.
+    assert 1.2 < mean[target] < np.exp(2.0 * figure.ALBEDO * 0.4)
+
+
+def test_formats_page_names_everything_in_the_files(tmp_path):
+    """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
+    from spadwarp.frames.file import record_frames
+    from spadwarp.transport.records import save_records
+
+    scene = make_scene(transport={"photons": 2000, "seed": 1})
+    result = spadwarp.simulate(scene, device="cpu", uncertainty=True)
+    record_frames(result, tmp_path / "frames.h5", pulses=100, frames=1, seed=1, tags=True, device="cpu")
+    save_records(spadwarp.trace(scene, photons=10, device="cpu"), tmp_path / "records.h5", scene=scene)
+    paths = [result.save(tmp_path / "result.h5"), tmp_path / "frames.h5", tmp_path / "records.h5"]
+    paths.append(spadwarp.simulate_analytic(scene, frames=1, device="cpu").save(tmp_path / "analytic.h5"))
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    for path in paths:
+        with h5py.File(path) as file:
+            names = [*file.attrs]
+            file.visititems(
+                lambda name, one, names=names: names.append(name) if isinstance(one, h5py.Dataset) else None
+            )
+        missing = [name for name in names if f"`{name}`" not in text]
+        assert not missing, f"{path.name}: docs/formats.md does not name {missing}"

@@ -1,0 +1,119 @@
+"""The house: which way its arrows point, what it says about itself, and what it does not say."""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import spadwarp
+
+ROOT = Path(__file__).parents[2]
+
+# Heavy, so that nothing that `import spadwarp` or `spadwarp --help` loads may import them at its top.
+HEAVY = {"warp", "spadwarp_kernels", "torch", "matplotlib", "h5py", "rich", "trimesh", "OpenEXR", "scipy", "ray"}
+
+# Folder or file, and what it must not know of.
+ARROWS = {
+    "spadwarp/cli": {"warp", "spadwarp_kernels", "torch"},
+    "spadwarp/analytic_model.py": {"spadwarp.transport.simulate", "spadwarp_kernels.transport"},
+    "spadwarp/budgets.py": {"spadwarp.transport.simulate", "spadwarp_kernels.transport"},
+    "spadwarp/detector.py": {"spadwarp.transport.simulate", "spadwarp_kernels.transport"},
+    "spadwarp/depth.py": {"spadwarp.transport.simulate", "spadwarp_kernels.transport"},
+    "spadwarp/config": {"spadwarp.transport.simulate", "spadwarp.result", "spadwarp.model"},
+}
+
+
+def imports(path, top_only=False):
+    """Full names of the modules that a file imports, relative ones resolved."""
+    tree = ast.parse(path.read_text())
+    relative_to = path.relative_to(ROOT).parts[:-1]
+    for node in tree.body if top_only else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(relative_to[: len(relative_to) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def sources(place):
+    path = ROOT / place
+    found = [path] if path.suffix == ".py" else sorted(path.rglob("*.py"))
+    assert found, place
+    return found
+
+
+def test_kernels_import_warp_numpy_and_the_standard_library_only():
+    allowed = {"warp", "numpy", "kernels", "spadwarp_kernels"} | sys.stdlib_module_names  # "kernels": relative ones
+    for path in sources("kernels/spadwarp_kernels"):
+        foreign = {name.split(".")[0] for name in imports(path)} - allowed
+        assert not foreign, f"{path.name} imports {foreign}"
+
+
+@pytest.mark.parametrize("place", ARROWS)
+def test_arrows_point_one_way(place):
+    for path in sources(place):
+        for name in imports(path):
+            wrong = {one for one in ARROWS[place] if name == one or name.startswith(one + ".")}
+            assert not wrong, f"{path.name} imports {name}"
+
+
+# Themselves loaded when there are pictures to draw, or a network to run.
+LOADED_LATE = {
+    "preview.py",
+    "denoising/clues.py",
+    "denoising/networks.py",
+    "denoising/noise.py",
+    "denoising/training.py",
+}
+
+
+def test_heavy_packages_are_imported_where_they_are_used():
+    for path in sources("spadwarp"):
+        if path.relative_to(ROOT / "spadwarp").as_posix() not in LOADED_LATE:
+            top = {name.split(".")[0] for name in imports(path, top_only=True)}
+            assert top.isdisjoint(HEAVY), f"{path.name} imports {top & HEAVY}"
+
+
+def test_one_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == spadwarp.__version__
+    assert f'version: "{spadwarp.__version__}"' in (ROOT / "CITATION.cff").read_text()
+    assert f"## {spadwarp.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_public_name_is_there():
+    for name in spadwarp.__all__:
+        assert getattr(spadwarp, name) is not None
+        # Importing a submodule must not hide a function behind it.
+        assert type(getattr(spadwarp, name)).__name__ != "module"
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = spadwarp.nothing
+
+
+def tracked_texts():
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True)
+    if listed.returncode != 0:
+        pytest.skip("not a git checkout")
+    for name in listed.stdout.decode().split("\0")[:-1]:
+        path = ROOT / name
+        if path.is_file() and path.suffix not in {".png", ".h5", ".exr", ".npz", ".safetensors"}:
+            yield name, path.read_text()
+
+
+def test_no_file_names_a_place_on_somebodys_machine():
+    place = re.compile(r"(?<![\w./~-])/(?:home|Users|root|tmp|work|mnt|scratch)/\w+")
+    found = [f"{name}: {hit}" for name, text in tracked_texts() for hit in place.findall(text)]
+    assert not found
+
+
+def test_relative_links_in_the_documents_lead_somewhere():
+    for name, text in tracked_texts():
+        if name.endswith(".md"):
+            for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text) + re.findall(r'src="([^"]+)"', text):
+                assert "://" in link or (ROOT / name).parent.joinpath(link).exists(), f"{name}: {link}"

@@ -1,0 +1,150 @@
+"""Histograms, time axis, ranges and ledger of a result."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.synthetic_result import UNIT, make_result, make_scene
+from spadwarp.result.result import COMPONENTS, Result, pixel_directions, range_from_path
+
+SPEED = 299_792_458.0 / 1.3638
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return make_result(make_scene())
+
+
+def test_components_sum_to_the_histogram_and_carry_its_unit(result: Result) -> None:
+    total = sum(result.component(name) for name in COMPONENTS)
+    np.testing.assert_allclose(result.histogram, total, rtol=1e-12)
+    assert result.histogram[3, 4, 40] == result.tallies[:, 3, 4, 40].sum() * UNIT / result.photons
+    np.testing.assert_allclose(result.intensity, result.histogram.sum(-1), rtol=1e-12)
+
+
+def test_detections_are_fractions_times_photons_per_pulse_times_pde(result: Result) -> None:
+    # 37.5 nJ at 532 nm: E0·λ/(hc); PDE = 0.247 · 0.2
+    photons = 37.5e-9 * 532e-9 / (6.62607015e-34 * 299_792_458.0)
+    np.testing.assert_allclose(result.detections, result.histogram * photons * 0.247 * 0.2, rtol=1e-12)
+
+
+def test_bins_are_half_open_from_the_gates_start_and_paths_are_geometric(result: Result) -> None:
+    gate = result.scene.gate
+    assert result.bin_edges.shape == (gate.bins + 1,)
+    assert result.bin_edges[0] == gate.start
+    np.testing.assert_allclose(np.diff(result.bin_edges), gate.bin_width, rtol=1e-9)
+    np.testing.assert_allclose(result.bin_centres, (result.bin_edges[1:] + result.bin_edges[:-1]) / 2)
+    np.testing.assert_allclose(result.path_edges, result.bin_edges * SPEED)
+
+
+def test_unknown_names_are_refused(result: Result) -> None:
+    with pytest.raises(ValueError, match="'ballistic', 'forward_scattered', 'backscatter'"):
+        result.component("fluorescent")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="quantity = 'height'"):
+        result.depth(quantity="height")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("unit", 0.3, "not a power of two"),
+        ("photons", 0, "photons = 0"),
+        ("photon_ranges", ((0, 5),), "5 ids"),
+        ("tallies", np.zeros((3, 12, 16, 47), dtype=np.int64), r"int64 \(3, 12, 16, 48\)"),
+        ("tallies", np.zeros((3, 12, 16, 48)), "tallies are float64"),
+    ],
+)
+def test_arrays_and_numbers_that_do_not_fit_the_scene_are_refused(
+    result: Result, field: str, value: object, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(result, **{field: value})
+
+
+# Depth
+
+
+@pytest.mark.parametrize("laser", [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (-1.5, 0.7, 0.4)])
+def test_depth_frame_finds_the_target_within_a_bin(laser: tuple[float, float, float]) -> None:
+    result = make_result(make_scene(laser={"position": laser}))
+    depth, truth = result.depth(method="peak"), result.truth.depth
+    seen = np.isfinite(truth)
+    assert seen.sum() == 12 * 12  # the plate is 4 m wide and the view 5.25 m
+    bin_path = result.path_edges[1] - result.path_edges[0]
+    # A bin centre is at most half a bin of path from the arrival, and dr/dL = 1/(1 + cos) of the angle at the target.
+    assert np.abs(depth - truth)[seen].max() < 0.6 * bin_path
+    distance = result.depth(method="peak", quantity="range")
+    np.testing.assert_allclose(distance * pixel_directions(result.scene.camera)[..., 2], depth)
+
+
+def test_nothing_returned_is_nan_not_zero() -> None:
+    assert np.isnan(make_result(make_scene(), empty=True).depth()).all()
+
+
+def test_pixel_directions_pass_through_pixel_centres() -> None:
+    camera = make_scene(width=16, height=12).camera
+    rays = pixel_directions(camera)
+    assert rays.shape == (12, 16, 3)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1.0)
+    tangent = np.tan(np.radians(10.0)) / 8  # half the field over half the pixels
+    first = rays[0, 0] / rays[0, 0, 2]
+    np.testing.assert_allclose(first, [-7.5 * tangent, -5.5 * tangent, 1.0])  # up and left: −x, −y
+
+
+def test_range_of_a_coaxial_laser_is_half_the_path() -> None:
+    np.testing.assert_allclose(range_from_path([2.0, 30.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]), [1.0, 15.0])
+
+
+def test_range_on_the_axes_of_the_ellipse() -> None:
+    # Foci 0 and (2e, 0, 0), path L = 2a: vertices at a + e and a − e from the lens, (a² − e²)/a across.
+    a, e = 5.0, 1.5
+    along, against, across = (range_from_path(2 * a, u, [2 * e, 0.0, 0.0]) for u in ([1, 0, 0], [-1, 0, 0], [0, 1, 0]))
+    np.testing.assert_allclose([along, against, across], [a + e, a - e, (a * a - e * e) / a])
+
+
+def test_range_is_nan_for_paths_shorter_than_the_baseline_and_for_nan() -> None:
+    assert np.isnan(range_from_path([0.5, 1.0, -3.0, np.nan], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])).all()
+
+
+@given(
+    laser=st.tuples(*[st.floats(-3, 3)] * 3),
+    direction=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda u: np.linalg.norm(u) > 0.01),
+    distance=st.floats(0.01, 100),
+)
+def test_range_from_path_undoes_the_path(
+    laser: tuple[float, ...], direction: tuple[float, ...], distance: float
+) -> None:
+    u = np.array(direction) / np.linalg.norm(direction)
+    detour = np.linalg.norm(distance * u - laser) + distance - np.linalg.norm(laser)
+    path = detour + np.linalg.norm(laser)
+    if detour < 1e-6:  # the target lies between lens and laser: any point there has this path
+        return
+    np.testing.assert_allclose(range_from_path(path, u, laser), distance, rtol=1e-6)
+
+
+# Accounts
+
+
+def test_ledger_closes_exactly_and_names_what_is_missing(result: Result) -> None:
+    report = result.ledger_report()
+    assert report["exact"]
+    assert report["difference"] == 0
+    assert report["fractions"] == {"absorbed_water": 0.75, "weight_cutoff": 0.5, "roulette": -0.25}
+    leaky = dataclasses.replace(result, ledger={**result.ledger, "absorbed_water": result.ledger["absorbed_water"] - 1})
+    assert not leaky.ledger_report()["exact"]
+    assert leaky.ledger_report()["difference"] == 1
+
+
+def test_summary_is_plain_numbers(result: Result) -> None:
+    summary = json.loads(json.dumps(result.summary()))
+    assert summary["photons"] == 10**9
+    np.testing.assert_allclose(sum(summary["collected_fraction"].values()), result.histogram.sum(), rtol=1e-12)
+    np.testing.assert_allclose(summary["detections_per_pulse"], result.detections.sum(), rtol=1e-12)
+    assert summary["truth"]["depth_m"] == pytest.approx([14.29, 14.79], abs=1e-5)
+    assert make_result(make_scene(), empty=True).summary()["pixels_with_return"] == 0

@@ -1,0 +1,292 @@
+"""Exports: read back by the programs' own libraries, and as others' code reads them."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from scipy import io, sparse, stats
+from typer.testing import CliRunner
+
+import spadwarp
+from helpers.synthetic_result import make_result, make_scene
+from spadwarp.cli import app
+from spadwarp.errors import FileError
+from spadwarp.frames.file import record_frames
+from spadwarp.frames.measured import read_histograms
+from spadwarp.scene import SPEED_OF_LIGHT
+
+WIDTH, HEIGHT, BINS, PULSES, FRAMES = 8, 5, 48, 20_000, 2
+LASER = {"position": [0.1, 0.0, 0.0], "pulse_energy": 1e-7, "repetition_rate": 4e6}  # a period of 34.6 m of path
+
+
+@pytest.fixture(scope="module")
+def result():
+    return make_result(make_scene(width=WIDTH, height=HEIGHT, bins=BINS, laser=LASER))
+
+
+@pytest.fixture(scope="module")
+def detection(result):
+    return spadwarp.detect(result, pulses=PULSES, frames=FRAMES, seed=3, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def frames(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames") / "frames.h5"
+    record_frames(result, path, pulses=PULSES, frames=FRAMES, seed=3, methods=("peak", "centroid"), device="cpu")
+    return path
+
+
+def read_exr_channels(path):
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+
+
+def test_expected_detections_are_what_the_counts_are_drawn_from(detection):
+    """A pulse is detected with probability 1 − exp(−Σλ): χ² of the pixels' binomial counts."""
+    chance = -np.expm1(-detection.expected.sum(axis=-1, dtype=np.float64))
+    trials = PULSES * FRAMES
+    z = (detection.intensity.sum(axis=0) - trials * chance) / np.sqrt(trials * chance * (1 - chance))
+    assert stats.chi2.sf((z**2).sum(), z.size) > 1e-3
+    assert (detection.expected >= detection.background).all()
+
+
+@pytest.mark.parametrize("origin", ["file", "memory"])
+def test_npy(origin, frames, detection, tmp_path):
+    source = frames if origin == "file" else detection
+    assert spadwarp.export(source, tmp_path / "all.npy") == [tmp_path / "all.npy"]
+    assert np.array_equal(np.load(tmp_path / "all.npy"), detection.counts)
+    spadwarp.export(source, tmp_path / "one.npy", frames=1)
+    assert np.array_equal(np.load(tmp_path / "one.npy"), detection.counts[1])
+    assert np.array_equal(read_histograms(tmp_path / "one.npy").values, detection.counts[1])
+
+
+def test_tensors_are_exported_too(detection, tmp_path):
+    pytest.importorskip("torch")
+    spadwarp.export(spadwarp.to_torch(detection), tmp_path / "a.npy")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), detection.counts)
+
+
+def test_npy_of_a_result_is_its_histogram(result, tmp_path):
+    spadwarp.export(result, tmp_path / "a.npy")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), result.histogram)
+
+
+@pytest.mark.parametrize("origin", ["file", "memory"])
+def test_mat_as_denoisers_read_it(origin, frames, detection, result, tmp_path):
+    """Index arithmetic of the public training code for simulated data (Lindell, O'Toole and Wetzstein 2018)."""
+    source = frames if origin == "file" else detection
+    written = spadwarp.export(source, tmp_path / "a.mat", result=result)
+    assert written == [tmp_path / "a-00000.mat", tmp_path / "a-00001.mat"]
+    for number, path in enumerate(written):
+        file = io.loadmat(path, spmatrix=False)
+        assert sparse.issparse(file["spad"])
+        spad = np.asarray(file["spad"].todense()).reshape(1, WIDTH, HEIGHT, -1).transpose(0, 3, 2, 1)  # [1, T, H, W]
+        assert np.array_equal(spad[0], detection.counts[number].transpose(2, 0, 1))
+        rates = file["rates"].reshape(1, HEIGHT, WIDTH, -1).transpose(0, 3, 1, 2)
+        assert np.allclose(rates[0].transpose(1, 2, 0), PULSES * detection.expected, rtol=1e-6)
+    # MATLAB's reshape(full(spad), size(rates)) is column by column.
+    assert np.array_equal(
+        np.asarray(file["spad"].todense()).reshape(HEIGHT, WIDTH, BINS, order="F"), detection.counts[1]
+    )
+
+    # Light that was neither scattered nor spread by the response arrives in `bin`.
+    there = file["bin"] > 0
+    ballistic = result.component("ballistic")
+    lit = there & (ballistic.max(axis=-1) > 0)
+    assert lit.sum() > WIDTH * HEIGHT // 2
+    assert np.array_equal(file["bin"][lit] - 1, ballistic.argmax(axis=-1)[lit])
+    assert np.array_equal(file["range_bins"], file["bin"])
+    assert file["bin_size"].item() == pytest.approx(result.scene.gate.bin_width)
+    assert np.array_equal(file["depth"] > 0, np.isfinite(result.truth.depth))
+
+    signal, noise = file["mean_signal_photons"].item(), file["mean_background_photons"].item()
+    assert file["SBR"].item() == pytest.approx(signal / noise) and file["photons"].item() == signal
+    assert signal + noise == pytest.approx(file["rates"].sum() / (WIDTH * HEIGHT), rel=1e-4)
+    assert file["intensity"].min() >= 0 and file["intensity"].max() == 1
+
+
+def test_ptu_is_read_back_by_ptufile(frames, detection, tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    with ptufile.PtuFile(path) as file:
+        assert file.is_t3 and file.is_image
+        assert file.tcspc_resolution == pytest.approx(detection.bin_width)
+        assert file.global_resolution == pytest.approx(1 / LASER["repetition_rate"])
+        assert f"{detection.gate_start * 1e9:.6f} ns" in file.comment
+        image = file.decode_image(channel=0, keepdims=True)  # [frame, y, x, channel, bin]
+    assert np.array_equal(image[:, :, :, 0, :], detection.counts[..., : image.shape[-1]])
+    assert not detection.counts[..., image.shape[-1] :].any()
+    spadwarp.export(frames, tmp_path / "one.ptu", frames=0)
+    again = read_histograms(tmp_path / "one.ptu")
+    assert again.values.sum() == detection.counts[0].sum()
+
+
+def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu", frames=0)
+    assert detection.gate_start > 0
+    assert read_histograms(path).gate_start == pytest.approx(detection.gate_start, abs=1e-15)
+    # The same words by another writer are not ours to believe.
+    with ptufile.PtuFile(path) as file:
+        about = file.comment
+    ptufile.imwrite(
+        tmp_path / "b.ptu",
+        np.ones((1, 2, 2, 1, 4), np.uint32),
+        global_resolution=50e-9,
+        tcspc_resolution=4e-12,
+        comment=about,
+    )
+    assert read_histograms(tmp_path / "b.ptu").gate_start == 0
+
+    ranges = {}
+    for name, options in {"own": (), "given": ("--gate-start-ns", 0)}.items():
+        arguments = ("depth", path, "--group-index", 1.3638, *options, "--device", "cpu", "--out", tmp_path / name)
+        done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        assert done.exit_code == 0, done.output
+        ranges[name] = np.load(tmp_path / name / "range.npy")
+    later = 0.5 * SPEED_OF_LIGHT / 1.3638 * detection.gate_start
+    assert np.nanmedian(ranges["own"] - ranges["given"]) == pytest.approx(later, rel=1e-4)
+
+
+def test_exr_is_read_back_by_openexr(frames, detection, result, tmp_path):
+    import h5py
+
+    written = spadwarp.export(frames, tmp_path / "a.exr")
+    assert [path.name for path in written] == ["a-00000.exr", "a-00001.exr"]
+    channels = read_exr_channels(written[1])
+    with h5py.File(frames) as file:
+        for name in ("peak", "centroid"):
+            assert np.array_equal(channels[f"{name}.Z"], file[f"depth/{name}"][1], equal_nan=True)
+    assert np.array_equal(channels["Z"], channels["centroid.Z"], equal_nan=True)
+    assert np.array_equal(channels["intensity"], detection.counts[1].sum(axis=-1).astype(np.float32))
+    assert np.array_equal(channels["truth.Z"], result.truth.depth, equal_nan=True)
+
+    channels = read_exr_channels(*spadwarp.export(result, tmp_path / "b.exr"))
+    parts = sum(channels[name].astype(np.float64) for name in ("ballistic", "forward_scattered", "backscatter"))
+    assert np.allclose(parts, result.histogram.sum(axis=-1), rtol=1e-6)
+    assert np.array_equal(channels["Z"], result.depth().astype(np.float32), equal_nan=True)
+    assert np.array_equal(channels["truth.N.Z"], result.truth.normal[..., 2], equal_nan=True)
+
+
+def test_analytic_frames(tmp_path):
+    analytic = spadwarp.simulate_analytic(
+        make_scene(width=WIDTH, height=HEIGHT, bins=BINS), frames=3, seed=5, device="cpu"
+    )
+    path = analytic.save(tmp_path / "analytic.h5")
+    spadwarp.export(path, tmp_path / "depth.npy")
+    assert np.array_equal(np.load(tmp_path / "depth.npy"), analytic.depth, equal_nan=True)
+    [exr] = spadwarp.export(path, tmp_path / "depth.exr", frames=2)
+    assert np.array_equal(read_exr_channels(exr)["Z"], analytic.depth[2], equal_nan=True)
+    with pytest.raises(ValueError, match=r"frame 0 is depth without counts, which \.mat is for"):
+        spadwarp.export(path, tmp_path / "a.mat")
+
+
+def test_what_cannot_be_written_is_said(frames, detection, result, tmp_path):
+    for ending in ("mat", "ptu"):
+        with pytest.raises(ValueError, match="draw frames first"):
+            spadwarp.export(result, tmp_path / f"a.{ending}")
+    with pytest.raises(ValueError, match=r"frames = 2 is outside \[0, 1\]"):
+        spadwarp.export(frames, tmp_path / "a.npy", frames=2)
+    with pytest.raises(ValueError, match="result is missing"):
+        spadwarp.export(detection, tmp_path / "a.mat")
+    with pytest.raises(FileError, match=r"'\.tif' is not one of \.npy"):
+        spadwarp.export(result, tmp_path / "a.tif")
+    with pytest.raises(FileError, match="no such file"):
+        spadwarp.export(tmp_path / "none.h5", tmp_path / "a.npy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_command(frames, tmp_path):
+    def run(*arguments, code=0):
+        outcome = CliRunner().invoke(app, ["export", *map(str, arguments)])
+        assert outcome.exit_code == code, outcome.output
+        return outcome
+
+    told = run(frames.parent, "--format", "mat", "--format", "npy", "--out", tmp_path / "a").stdout
+    assert "frames-00000.mat to frames-00001.mat (2 files)" in told
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [
+        "frames-00000.mat",
+        "frames-00001.mat",
+        "frames.npy",
+    ]
+    run(frames, "--format", "npy", "--frames", "1:2", "--out", tmp_path / "b", "--quiet")
+    assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
+    assert (
+        "holds no frames.h5 and no result.h5"
+        in run(tmp_path, "--format", "npy", "--out", tmp_path / "c", code=1).output
+    )
+    assert "outside" in run(frames, "--format", "npy", "--frames", 9, "--out", tmp_path / "d", code=2).output
+    assert (
+        "none of them in 5:" in run(frames, "--format", "npy", "--frames", "5:", "--out", tmp_path / "d", code=2).output
+    )
+    make_result(make_scene()).save(tmp_path / "result.h5")
+    refused = run(tmp_path / "result.h5", "--format", "npy", "--format", "mat", "--out", tmp_path / "e", code=2).output
+    assert "draw frames first" in refused and not list((tmp_path / "e").iterdir())  # the array neither
+
+
+RECIPE = {
+    "name": "both kinds",
+    "seed": 3,
+    "scenes_per_target": 2,
+    "scenes_per_shard": 2,
+    "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
+    "pose": {"distance": 5.0},
+    "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
+    "exposure": {"pulses": 3000},
+    "frames": {"per_scene": 2},
+    "monte_carlo": {"share": 1.0, "photons": 20_000},
+    "scene": {
+        "medium": {"extinction": 0.3, "albedo": 0.8},
+        "laser": {"half_angle_deg": 12.0, "position": [-0.05, 0.0, 0.0], "repetition_rate": 5e6},
+        "camera": {"width": 7, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    place = tmp_path_factory.mktemp("dataset") / "traced"
+    spadwarp.make_dataset(spadwarp.Recipe.from_dict(RECIPE), place, device="cpu")
+    return place
+
+
+def test_datasets_with_histograms(dataset, tmp_path):
+    items = list(spadwarp.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
+    written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
+    assert len(written) == len(items) == 4
+    for path, item in zip(written, items, strict=True):
+        file = io.loadmat(path, spmatrix=False)
+        counts = np.asarray(file["spad"].todense()).reshape(7, 4, -1).transpose(2, 1, 0)
+        assert np.array_equal(counts, item["counts"]) and counts.any()
+        assert np.array_equal(file["rates"].transpose(2, 0, 1), item["expected"])
+        assert np.array_equal(file["depth"], np.nan_to_num(item["clean"][0]))
+        assert file["SBR"] > 0
+    # Where light comes straight back, the bin of the truth holds most of what was expected of the target.
+    seen = file["bin"] > 0
+    rates, at = file["rates"], file["bin"].astype(int) - 1
+    near = sum(np.take_along_axis(rates, np.clip(at + k, 0, 39)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1, 2))
+    assert seen.sum() > 10 and np.median(near[seen] / rates.sum(axis=-1)[seen]) > 0.5
+
+    spadwarp.export(dataset, tmp_path / "a.npy", split="train", frames=slice(1, 3))
+    stacked = np.stack([item["counts"].transpose(1, 2, 0) for item in items[1:3]])
+    assert np.array_equal(np.load(tmp_path / "a.npy"), stacked)
+    spadwarp.export(dataset, tmp_path / "a.ptu", split="train", frames=0)
+    assert read_histograms(tmp_path / "a.ptu").values.sum() == items[0]["counts"].sum()
+
+
+def test_datasets_of_depth(dataset, tmp_path):
+    """Images of a frame with those of its scene; a split of its own."""
+    items = list(spadwarp.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
+    written = spadwarp.export(dataset, tmp_path / "a.exr", split="test")
+    assert len(written) == len(items)
+    for path, item in zip(written, items, strict=True):
+        channels = read_exr_channels(path)
+        for name, field in {"Z": "noisy", "truth.Z": "clean", "background": "label"}.items():
+            assert np.array_equal(channels[name], item[field][0], equal_nan=True), name
+    with pytest.raises(FileError, match="name the dataset's folder"):
+        spadwarp.export(next(dataset.glob("frames-*.h5")), tmp_path / "b.npy")
+    outcome = CliRunner().invoke(
+        app,
+        ["export", str(dataset), "--split", "test", "--frames", "0:1", "--format", "exr", "--out", str(tmp_path / "c")],
+    )
+    assert outcome.exit_code == 0, outcome.output
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["traced.exr"]

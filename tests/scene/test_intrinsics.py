@@ -1,0 +1,210 @@
+"""Intrinsics, distortion and pose mean what OpenCV means by them: against its published formulas, in float64."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helpers.opencv import project_points
+from spadwarp import load_scene, look_at, opencv_pose
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.result.result import pixel_directions
+from spadwarp.scene import Camera
+from spadwarp.scene.intrinsics import image_points, image_tangents, pixel_views, view_box
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_camera, to_world
+
+# Calibrations of a barrel, a pincushion and a decentred lens.
+LENSES = {
+    "barrel": (-0.28, 0.07, 0.0, 0.0, -0.01),
+    "pincushion": (0.12, -0.02, 0.0, 0.0, 0.0),
+    "decentred": (-0.1, 0.01, 0.004, -0.006, 0.002),
+}
+INTRINSICS = {"width": 64, "height": 48, "fx": 61.0, "fy": 63.5, "cx": 29.2, "cy": 25.1, "aperture_diameter": 0.01}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("rvec", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.9), (-2.0, 0.4, 1.1)])
+def test_points_of_the_world_fall_where_opencv_puts_them(lens, rvec):
+    tvec = (0.2, -0.4, 3.0)
+    camera = Camera(**INTRINSICS, distortion=LENSES[lens], **opencv_pose(rvec, tvec))
+    rng = np.random.default_rng(1)
+    seen = rng.uniform([-0.35, -0.3, 1.0], [0.35, 0.3, 5.0], size=(40, 3))
+    seen[:, :2] *= seen[:, 2:]
+    world = to_world(camera, seen)
+    np.testing.assert_allclose(to_camera(camera, world), seen, atol=1e-12)
+    expected = project_points(world, rvec, tvec, 61.0, 63.5, 29.2, 25.1, LENSES[lens])
+    points = to_camera(camera, world)
+    ours = image_points(camera, points[:, :2] / points[:, 2:])
+    np.testing.assert_allclose(ours - 0.5, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_pixel_directions_are_imaged_in_the_middle_of_their_pixels(lens):
+    camera = Camera(**INTRINSICS, distortion=LENSES[lens])
+    view = pixel_directions(camera)
+    expected = project_points(view.reshape(-1, 3), (0, 0, 0), (0, 0, 0), 61.0, 63.5, 29.2, 25.1, LENSES[lens])
+    row, column = np.mgrid[:48, :64]
+    np.testing.assert_allclose(expected.reshape(48, 64, 2), np.stack([column, row], axis=-1), atol=1e-8)
+    np.testing.assert_allclose(np.linalg.norm(view, axis=-1), 1.0)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_view_holds_every_pixel_and_little_more(lens):
+    camera = Camera(**INTRINSICS, distortion=LENSES[lens])
+    left, top, right, bottom = view_box(camera)
+    inner = image_tangents(camera, np.random.default_rng(2).uniform((0, 0), (64, 48), size=(4000, 2)))
+    assert (inner > (left, top)).all() and (inner < (right, bottom)).all()
+    # Each side is touched by the image's border.
+    border = np.array([(c, r) for c in np.linspace(0, 64, 200) for r in (0, 48)])
+    border = image_tangents(
+        camera, np.concatenate([border, [(c, r) for r in np.linspace(0, 48, 200) for c in (0, 64)]])
+    )
+    np.testing.assert_allclose((*border.min(axis=0), *border.max(axis=0)), (left, top, right, bottom), atol=0.001)
+    views = pixel_views(camera)
+    row, column = np.random.default_rng(3).integers((0, 0), (48, 64), size=(500, 2)).T
+    inside = image_tangents(camera, np.stack([column, row], -1) + np.random.default_rng(4).uniform(size=(500, 2)))
+    assert (inside > views[row, column, :2]).all() and (inside < views[row, column, 2:]).all()
+
+
+def test_without_intrinsics_the_axis_is_in_the_middle():
+    camera = Camera(width=40, height=30, horizontal_fov_deg=2 * math.degrees(math.atan(0.2)), aperture_diameter=0.01)
+    same = Camera(width=40, height=30, fx=100.0, cx=19.5, cy=14.5, aperture_diameter=0.01)
+    assert camera.is_plain and Camera(width=40, height=30, fx=100.0, aperture_diameter=0.01).is_plain
+    assert same.focal_pixels == pytest.approx(camera.focal_pixels)
+    assert same.principal_point == camera.principal_point == (20.0, 15.0)
+    np.testing.assert_allclose(pixel_directions(same), pixel_directions(camera), rtol=1e-14)
+    shifted = Camera(width=40, height=30, fx=100.0, cx=0.0, cy=0.0, aperture_diameter=0.01)
+    np.testing.assert_array_equal(pixel_directions(shifted)[0, 0], [0.0, 0.0, 1.0])
+    assert shifted.horizontal_fov == pytest.approx(math.atan(0.395) + math.atan(0.005))
+
+
+def test_focusing_nearer_moves_the_image_plane_away_and_narrows_the_view():
+    """1/f = 1/image + 1/object: 20 mm focused at 0.1 m has its image at 25 mm."""
+    camera = Camera(width=10, height=10, focal_length=0.02, pixel_pitch_um=250.0, f_number=2.0, focus_distance=0.1)
+    assert camera.pixel_tangent == pytest.approx(250e-6 / 0.025)
+    far = Camera(width=10, height=10, focal_length=0.02, pixel_pitch_um=250.0, f_number=2.0, focus_distance=math.inf)
+    assert far.pixel_tangent == pytest.approx(250e-6 / 0.02)
+
+
+# Poses
+
+
+def test_a_cameras_axes_are_the_columns_of_its_rotation():
+    camera = Camera(**INTRINSICS, position=(1.0, 2.0, 3.0), rotation_deg=(0.0, 90.0, 0.0))
+    # Turned to the right about y, which points down: it looks along the world's +x.
+    np.testing.assert_allclose(to_world(camera, [[0, 0, 5.0], [2.0, 0, 0]]), [[6, 2, 3], [1, 2, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("angles", [(10.0, 20.0, 30.0), (-170.0, 80.0, 5.0), (30.0, 90.0, 0.0), (-40.0, -90.0, 0.0)])
+def test_angles_are_read_back_from_the_matrix(angles):
+    matrix = rotation_matrix(angles)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(rotation_matrix(rotation_angles(matrix)), matrix, atol=1e-12)
+
+
+def test_look_at_puts_the_point_on_the_axis_and_keeps_the_horizon():
+    camera = Camera(**INTRINSICS, **look_at((1.0, -2.0, 0.5), (-3.0, 1.0, 4.0)))
+    np.testing.assert_allclose(to_camera(camera, (-3.0, 1.0, 4.0)), (0, 0, math.sqrt(16 + 9 + 12.25)), atol=1e-9)
+    right, down = rotation_matrix(camera.rotation_deg).T[:2]
+    assert right[1] == pytest.approx(0.0, abs=1e-12) and down[1] > 0
+    assert look_at((0, 0, 0), (0, 0, 1)) == {"position": (0.0, 0.0, 0.0), "rotation_deg": pytest.approx((0, 0, 0))}
+    with pytest.raises(ValueError, match="no horizon"):
+        look_at((0, 0, 0), (0, 3, 0))
+
+
+def test_opencv_poses_are_checked():
+    assert opencv_pose((0, 0, 0), (1, 2, 3))["position"] == (-1.0, -2.0, -3.0)
+    turned = opencv_pose((0, 0, math.pi / 2), (0, 0, 0))
+    np.testing.assert_allclose(turned["rotation_deg"], (0, 0, -90), atol=1e-9)
+    np.testing.assert_allclose(opencv_pose(rotation_matrix((0, 0, 90)), (0, 0, 0))["rotation_deg"], (0, 0, -90))
+    with pytest.raises(ValueError, match="not a rotation matrix"):
+        opencv_pose(np.diag([1, 1, -1]), (0, 0, 0))
+    with pytest.raises(ValueError, match="3 numbers"):
+        opencv_pose((0, 0), (0, 0, 0))
+
+
+# Calibration files
+
+_OPENCV_YAML = """%YAML:1.0
+---
+calibration_time: "Mon 01 Jan 2024"
+image_width: 64
+image_height: 48
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 6.1e+01, 0., 29.2, 0., 63.5, 25.1,
+       0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -2.8e-01, 0.07, 0., 0., -0.01 ]
+avg_reprojection_error: 2.1e-01
+"""
+_ROS_YAML = """image_width: 64
+image_height: 48
+camera_name: narrow
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [61.0, 0, 29.2, 0, 63.5, 25.1, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.28, 0.07, 0, 0, -0.01]
+"""
+_OPENCV_JSON = """{"image_width": 64, "image_height": 48,
+ "camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
+                   "data": [61.0, 0.0, 29.2, 0.0, 63.5, 25.1, 0.0, 0.0, 1.0]},
+ "distortion_coefficients": {"type_id": "opencv-matrix", "rows": 5, "cols": 1, "dt": "d",
+                             "data": [-0.28, 0.07, 0.0, 0.0, -0.01]}}"""
+_PLAIN_JSON = '{"K": [[61.0, 0, 29.2], [0, 63.5, 25.1], [0, 0, 1]], "dist": [[-0.28, 0.07, 0, 0, -0.01, 0, 0, 0]]}'
+
+
+@pytest.mark.parametrize("text", [_OPENCV_YAML, _ROS_YAML, _OPENCV_JSON, _PLAIN_JSON])
+def test_a_calibration_file_becomes_fields(tmp_path, text):
+    path = tmp_path / "camera.yml"
+    path.write_text(text)
+    size = {} if "image_width" in text else {"width": 64, "height": 48}
+    camera = Camera(calibration=str(path), aperture_diameter=0.01, **size)
+    assert camera == Camera(**INTRINSICS, distortion=LENSES["barrel"])
+    assert camera.calibration is None  # the numbers stand for it
+
+
+@pytest.mark.parametrize(
+    "text, problem",
+    [
+        ("image_width: 64\n", "holds no camera_matrix"),
+        (_ROS_YAML.replace("plumb_bob", "equidistant"), "'equidistant' is not Brown's"),
+        (_ROS_YAML.replace("61.0, 0, 29.2", "61.0, 0.3, 29.2"), "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]"),
+        (_PLAIN_JSON.replace("-0.01, 0, 0, 0", "-0.01, 0, 0.1, 0"), "no rational, prism or tilt terms"),
+        ('{"K": ', "not valid JSON"),
+    ],
+)
+def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
+    path = tmp_path / "camera.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        Camera(calibration=str(path), aperture_diameter=0.01, width=64, height=48)
+    assert problem in str(caught.value) and str(path) in str(caught.value)
+    with pytest.raises(FileError, match="No such file"):
+        Camera(calibration=str(tmp_path / "none.yml"), aperture_diameter=0.01, width=64, height=48)
+
+
+def test_files_beside_a_scene_are_found_from_anywhere(tmp_path):
+    (tmp_path / "lens.yml").write_text(_OPENCV_YAML)
+    (tmp_path / "scene.toml").write_text(
+        "[medium]\nextinction = 0.3\nalbedo = 0.8\n[gate]\nbin_width_ps = 100\nbins = 10\n"
+        '[camera]\ncalibration = "lens.yml"\naperture_diameter = 0.01\n'
+        '[laser]\nprofile = "measured"\nprofile_image = "beam.npy"\n'
+    )
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.camera == Camera(**INTRINSICS, distortion=LENSES["barrel"])
+    assert scene.laser.profile_image == str(tmp_path / "beam.npy")
+    # The numbers stand in the text of the scene, which needs the calibration's file no more.
+    (tmp_path / "lens.yml").unlink()
+    (tmp_path / "again.toml").write_text(scene.to_toml())
+    assert load_scene(tmp_path / "again.toml") == scene

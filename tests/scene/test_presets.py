@@ -1,0 +1,103 @@
+"""Presets: sourced, complete, and as published."""
+
+import pytest
+
+from spadwarp.scene import Camera, Medium, Scene
+from spadwarp.scene.presets import PRESETS, presets
+from spadwarp.water.seawater import pure_water_absorption
+
+MEDIA = presets("medium")
+
+
+def test_every_preset_names_its_source():
+    for name, preset in presets().items():
+        assert name == f"{preset.section}.{preset.name}"
+        assert len(preset.source) > 30
+        assert preset.values
+
+
+def test_sections_and_names():
+    assert set(PRESETS) == {"medium", "laser", "camera", "detector", "gate"}
+    assert len(presets()) == sum(map(len, PRESETS.values()))
+    assert presets("laser").keys() == {"picoquant-visuv-532", "paper"}
+    assert presets("detector").keys() == {"photon-force-pf32", "photon-force-pf32-microlens", "paper"}
+    with pytest.raises(KeyError):
+        presets("targets")
+
+
+def test_what_presets_returns_is_the_callers_own():
+    presets("medium").clear()
+    assert presets("medium") == MEDIA
+
+
+@pytest.mark.parametrize("name", sorted(MEDIA))
+def test_every_medium_is_complete_and_adds_up(name):
+    medium = Medium(preset=name)
+    assert medium.absorption + medium.scattering == pytest.approx(medium.extinction, rel=1e-12)
+    if medium.albedo != "paper":
+        assert medium.albedo == pytest.approx(medium.scattering / medium.extinction, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(set(MEDIA) - {"paper"}))
+def test_every_medium_but_the_papers_absorbs_at_least_as_pure_water_does(name):
+    assert Medium(preset=name).absorption >= pure_water_absorption(530.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "extinction"),
+    [
+        ("petzold-autec-8", 0.151),
+        ("petzold-haoce-11", 0.398),
+        ("petzold-nuc-2040", 2.190),
+        ("petzold-nuc-2240", 1.330),
+        ("uwoc-pure-sea", 0.056),
+        ("uwoc-clear", 0.149),
+        ("uwoc-coastal", 0.304),
+        ("uwoc-harbour", 2.17),
+        ("jerlov-IB-williamson", 0.177),
+        ("jerlov-5C-williamson", 1.376),
+        ("jerlov-I-solonenko", 0.0525),
+        ("jerlov-III-solonenko", 1.0926),
+        ("jerlov-9C-solonenko", 3.714),
+        ("paper", 0.035),
+    ],
+)
+def test_published_extinctions(name, extinction):
+    assert Medium(preset=name).extinction == pytest.approx(extinction, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "lengths"), [("1.7m-1.2", 1.2), ("1.7m-4.4", 4.4), ("1.7m-5.7", 5.7), ("3m-7.5", 7.5)]
+)
+def test_the_tanks_attenuation_lengths(name, lengths):
+    distance = float(name.split("m-")[0])
+    assert Medium(preset=f"maccarone-{name}").extinction * distance == pytest.approx(lengths, abs=0.01)
+
+
+def test_water_gets_murkier_along_a_series():
+    for source, types in (
+        ("williamson", "IB II III 1C 3C 5C"),
+        ("solonenko", "I IA IB II III"),
+        ("solonenko", "1C 3C 5C 7C 9C"),
+    ):
+        series = [Medium(preset=f"jerlov-{name}-{source}").extinction for name in types.split()]
+        assert series == sorted(series)
+
+
+def test_the_papers_camera_has_pixels_of_9_2_um_and_20_degrees():
+    camera = Camera(preset="paper")
+    assert camera.focal_length is not None
+    assert camera.focal_length * camera.pixel_tangent == pytest.approx(9.2e-6, rel=1e-3)
+    assert camera.horizontal_fov_deg == 20.0
+    assert camera.focal_length / (2 * camera.aperture_radius) == pytest.approx(2.0)
+
+
+def test_the_pf32s_window_is_56_ns():
+    one = Scene.from_dict(
+        {
+            "medium": {"preset": "uwoc-clear"},
+            "camera": {"preset": "photon-force-pf32", "focal_length": 0.0125, "f_number": 1.4},
+            "gate": {"preset": "photon-force-pf32"},
+        }
+    )
+    assert one.gate.stop == pytest.approx(56.32e-9)

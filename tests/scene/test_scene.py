@@ -1,0 +1,541 @@
+"""Scenes: what goes in comes out, layers win in the promised order, and errors name field, value and range."""
+
+import math
+import pickle
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from spadwarp.errors import ConfigError, FileError, SpadwarpError
+from spadwarp.scene import SPEED_OF_LIGHT, Camera, Domain, Laser, Medium, Scene, load_scene, parse_override
+from spadwarp.scene.presets import presets
+
+SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
+
+MINIMAL = {
+    "medium": {"extinction": 0.3, "albedo": 0.8},
+    "camera": {"width": 8, "height": 6, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01},
+    "gate": {"bin_width_ps": 100.0, "bins": 50},
+}
+
+
+def scene(**sections: dict) -> Scene:
+    return Scene.from_dict({**MINIMAL, **sections})
+
+
+def problems(tables: dict | None = None, overrides: object = None) -> tuple[str, ...]:
+    with pytest.raises(ConfigError) as caught:
+        Scene.from_dict({**MINIMAL, **(tables or {})}).with_overrides(overrides)
+    return caught.value.problems
+
+
+# Media
+
+coefficients = st.floats(1e-6, 1e3)
+
+
+@given(a=coefficients, b=coefficients)
+def test_every_pair_of_coefficients_gives_the_same_medium(a, b):
+    c = a + b
+    truth = {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c}
+    names = list(truth)
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            medium = Medium(**{first: truth[first], second: truth[second]})
+            # A difference of two coefficients keeps the absolute accuracy of the larger.
+            for name, value in truth.items():
+                scale = max(1.0, c / min(a, b)) if name in ("absorption", "scattering", "extinction") else c / a
+                assert getattr(medium, name) == pytest.approx(value, rel=1e-14 * scale)
+            assert medium.given == (first, second)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4])
+def test_a_medium_takes_exactly_two_coefficients(count):
+    values = {"absorption": 0.1, "scattering": 0.2, "extinction": 0.3, "albedo": 2 / 3}
+    (problem,) = problems({"medium": dict(list(values.items())[:count])})
+    assert problem.startswith(
+        "medium needs exactly two of absorption, scattering, extinction, albedo, or chlorophyll; given: "
+    )
+
+
+def test_contradicting_or_empty_coefficients_are_refused():
+    assert problems({"medium": {"absorption": 0.4, "extinction": 0.3}}) == (
+        "medium.absorption = 0.4 is outside [0, 0.3], 0.3 being the extinction",
+    )
+    assert problems({"medium": {"absorption": 0.0, "scattering": 0.0}}) == (
+        "medium.extinction = 0.0 is outside (0, inf)",
+    )
+    (text,) = problems({"medium": {"absorption": 0.1, "albedo": 1.0}})
+    assert text.startswith("medium.albedo = 1.0 leaves the extinction undetermined")
+
+
+def test_the_papers_albedo_goes_with_extinction_and_reads_as_its_mean():
+    medium = Medium(extinction=0.2, albedo="paper")
+    assert medium.albedo == "paper"
+    assert medium.scattering == pytest.approx(0.2 * 0.97 / 2)
+    assert medium.absorption + medium.scattering == pytest.approx(0.2)
+    assert problems({"medium": {"absorption": 0.1, "albedo": "paper"}}) == (
+        "medium.albedo = 'paper' goes with extinction only",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "kept"),
+    [("extinction", "albedo"), ("albedo", "extinction"), ("absorption", "scattering"), ("scattering", "absorption")],
+)
+@pytest.mark.parametrize("base", [{"preset": "uwoc-harbour"}, {"absorption": 0.295, "scattering": 1.875}])
+def test_overriding_one_coefficient_keeps_its_partner(changed, kept, base):
+    before = Medium(**base)
+    after = scene(medium=base).with_overrides({f"medium.{changed}": 0.5}).medium
+    assert getattr(after, changed) == 0.5
+    assert getattr(after, kept) == getattr(before, kept)
+    assert set(after.given) == {changed, kept}
+
+
+def test_each_layer_keeps_the_partner_of_the_layer_below():
+    base = scene(medium={"preset": "uwoc-harbour", "extinction": 1.0})  # keeps the preset's albedo
+    albedo = Medium(preset="uwoc-harbour").albedo
+    assert base.medium.albedo == albedo
+    medium = base.with_overrides(["medium.absorption=0.25"]).medium
+    assert medium.scattering == pytest.approx(albedo)
+    assert medium.extinction == pytest.approx(0.25 + albedo)
+
+
+def test_overriding_two_coefficients_replaces_both():
+    medium = (
+        scene(medium={"preset": "uwoc-harbour"}).with_overrides(["medium.extinction=0.9", "medium.albedo=0.5"]).medium
+    )
+    assert (medium.extinction, medium.albedo, medium.anisotropy) == (0.9, 0.5, 0.924)
+    medium = scene().with_overrides(["medium.absorption=0.1", "medium.extinction=0.5"]).medium
+    assert (medium.absorption, medium.extinction) == (0.1, 0.5)
+
+
+def test_a_single_coefficient_that_leaves_the_papers_albedo_without_a_meaning_is_refused():
+    (text,) = problems({"medium": {"preset": "paper"}}, {"medium.absorption": 0.1})
+    assert text.endswith("; given: absorption, extinction, albedo")
+    assert scene(medium={"preset": "paper"}).with_overrides(["medium.extinction=0.9"]).medium.albedo == "paper"
+
+
+def test_index_names_stand_for_water_at_532_nm():
+    medium = Medium(extinction=1.0, albedo=0.5, group_index="fresh", phase_index="fresh")
+    assert (medium.group_index, medium.phase_index) == (1.3566, 1.3350)
+    assert problems({"medium": {**MINIMAL["medium"], "group_index": "salt"}}) == (
+        "medium.group_index = 'salt' is neither a number nor one of 'seawater', 'fresh'",
+    )
+
+
+# Presets and other layers
+
+
+@pytest.mark.parametrize("name", sorted(presets()))
+def test_a_preset_gives_its_fields_and_each_can_be_overridden(name):
+    section, _, preset = name.partition(".")
+    lens = {"focal_length": 0.01, "f_number": 2.0} if name == "camera.photon-force-pf32" else {}
+    base = scene(**{section: {"preset": preset, **lens}})
+    for field, value in presets(section)[preset].values.items():
+        assert getattr(getattr(base, section), field) == value
+        if isinstance(value, (int, float)):
+            other = int(value * 2) if isinstance(value, int) else value * 0.75 + 0.1
+            changed = base.with_overrides({f"{section}.{field}": other})
+            assert getattr(getattr(changed, section), field) == other
+
+
+def test_the_order_is_preset_file_override():
+    base = scene(laser={"preset": "paper", "pulse_energy": 1e-6})
+    assert (base.laser.pulse_energy, base.laser.pulse_fwhm_ps) == (1e-6, 72.0)
+    assert base.with_overrides(["laser.pulse_fwhm_ps=50"]).laser.pulse_fwhm_ps == 50.0
+    other = base.with_overrides(["laser.preset=picoquant-visuv-532"]).laser
+    assert (other.pulse_energy, other.pulse_fwhm_ps, other.half_angle_deg) == (37.5e-9, 85.0, 1.9702)
+
+
+def test_excluding_fields_displace_each_other_only_across_layers():
+    camera = scene(camera={"preset": "paper"}).with_overrides({"camera.pixel_pitch_um": 9.2}).camera
+    assert camera.horizontal_fov_deg is None
+    assert math.degrees(camera.horizontal_fov) == pytest.approx(20.0, abs=0.01)
+    assert scene(camera={"preset": "paper", "aperture_diameter": 0.02}).camera.f_number is None
+    (text,) = problems({"camera": {**MINIMAL["camera"], "f_number": 2.0}})
+    assert text == "camera needs either aperture_diameter or f_number with focal_length"
+    base = scene(targets=[{"builtin": "plane", "size": [1, 2]}])
+    target = base.with_overrides({"targets[0].mesh": "/a/bust.stl"}).targets[0]
+    assert (target.builtin, target.mesh, target.size) == (None, "/a/bust.stl", None)
+
+
+def test_none_takes_a_field_back_to_its_default():
+    base = scene(transport={"max_path": 10.0, "photons": 5})
+    back = base.with_overrides({"transport": {"max_path": None, "photons": None}})
+    assert back == scene()
+    paper = scene(detector={"preset": "paper"}).with_overrides({"detector.pdp": None})
+    assert (paper.detector.pdp, paper.detector.preset) == (0.247, None)
+    assert reloaded(paper) == paper
+
+
+# Overrides
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value"),
+    [
+        ("medium.extinction=0.9", ("medium", "extinction"), 0.9),
+        (" medium.extinction = .9 ", ("medium", "extinction"), 0.9),
+        ("transport.photons=2e9", ("transport", "photons"), 2e9),
+        ("transport.seed=0x10", ("transport", "seed"), 16),
+        ("detector.fold=false", ("detector", "fold"), False),
+        ("medium.preset=jerlov-1C-williamson", ("medium", "preset"), "jerlov-1C-williamson"),
+        ('medium.albedo="paper"', ("medium", "albedo"), "paper"),
+        ("laser.position=[0.1, 0, 0]", ("laser", "position"), [0.1, 0, 0]),
+        ("targets[0].reflectance=0.3", ("targets", 0, "reflectance"), 0.3),
+        ("targets.12.mesh=a=b.stl", ("targets", 12, "mesh"), "a=b.stl"),
+        ("transport.lateral_limit=inf", ("transport", "lateral_limit"), math.inf),
+    ],
+)
+def test_overrides_are_toml_or_bare_strings(text, key, value):
+    assert parse_override(text) == (key, value)
+
+
+@pytest.mark.parametrize(
+    "text", ["medium.extinction", "medium.extinction=", "=3", "0.x=1", "medium..x=1", "laser.position=[1,"]
+)
+def test_malformed_overrides_are_refused(text):
+    with pytest.raises(ConfigError, match="override"):
+        parse_override(text)
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_an_override_or_a_config_error(text):
+    try:
+        parse_override(text)
+    except ConfigError as error:
+        assert "override" in str(error)
+
+
+def test_overrides_reach_targets_by_index_and_may_add_the_next():
+    base = scene(targets=[{"builtin": "plane"}])
+    changed = base.with_overrides(["targets[0].reflectance=0.3", "targets.1.builtin=sphere", "targets[1].scale=2"])
+    assert [target.builtin for target in changed.targets] == ["plane", "sphere"]
+    assert (changed.targets[0].reflectance, changed.targets[1].scale) == (0.3, (2.0, 2.0, 2.0))
+    assert base.with_overrides({"targets": []}).targets == ()
+    assert problems({"targets": [{"builtin": "plane"}]}, ["targets[2].scale=2"]) == (
+        "targets[2] does not exist; the scene has 1",
+    )
+
+
+def test_dotted_nested_and_keyword_overrides_say_the_same():
+    base = scene()
+    one = base.with_overrides(["medium.extinction=0.9", "gate.bins=7"])
+    assert one == base.with_overrides({"medium.extinction": 0.9, "gate.bins": 7})
+    assert one == base.with_overrides({"medium": {"extinction": 0.9}, "gate": {"bins": 7}})
+    assert one == base.with_overrides(medium={"extinction": 0.9}, gate={"bins": 7})
+    assert base == scene()
+
+
+@pytest.mark.parametrize("overrides", [["medium.a.b=1"], ["targets.reflectance=1"], ["medium[0]=1"], ["targets[0]=1"]])
+def test_overrides_that_name_no_field_are_refused(overrides):
+    (text,) = problems(None, overrides)
+    assert "does not name a field" in text
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("medium.anisotropy=1.2", "medium.anisotropy = 1.2 (an override) is outside (-1, 1)"),
+        ("medium.albedo=1.5", "medium.albedo = 1.5 (an override) is outside [0, 1] and not 'paper'"),
+        ("medium.albedo=none", "medium.albedo = 'none' (an override) is neither a number nor 'paper'"),
+        ("transport.max_collisions=0", "transport.max_collisions = 0 (an override) is outside [1, 2147483647]"),
+        ("transport.axis_threshold=0", "transport.axis_threshold = 0 (an override) is outside (0, 1]"),
+        ("transport.max_path=inf", "transport.max_path = inf (an override) is outside (0, inf)"),
+        ("transport.lateral_limit=nan", "transport.lateral_limit = nan (an override) is outside (0, inf)"),
+        ("transport.seed=-1", "transport.seed = -1 (an override) is outside [0, 18446744073709551615]"),
+        ("camera.width=3.5", "camera.width = 3.5 (an override) is not an integer"),
+        ("camera.width=true", "camera.width = True (an override) is not an integer"),
+        ("detector.fold=1", "detector.fold = 1 (an override) is not true or false"),
+        ("laser.position=[1, 2]", "laser.position = [1, 2] has the wrong number of values"),
+        ("laser.direction=[0, 0, 'up']", "laser.direction[2] = 'up' (an override) is not a number"),
+        ("laser.direction=[0, 0, 0]", "laser.direction = [0.0, 0.0, 0.0] has no length"),
+        ("targets[0].size=[-1]", "targets[0].size[0] = -1 (an override) is outside (0, inf)"),
+        ("targets[0].reflectance=2", "targets[0].reflectance = 2 (an override) is outside [0, 1]"),
+        ("medium=3", "medium = 3 (an override) is not a table"),
+        ("targets=3", "targets = 3 (an override) is not a list"),
+        ("medium.absorbtion=1", "medium.absorbtion is not a known field; did you mean 'absorption'?"),
+        ("medium.g=0.9", "medium.g is not a known field; did you mean 'anisotropy'?"),
+        ("targets[0].color=1", "targets[0].color is not a known field; known are "),
+        ("lasser.position=1", "lasser is not a known section; did you mean 'laser'?"),
+        (
+            "transport.estimator=nextevent",
+            "transport.estimator = 'nextevent' (an override) is not one of 'analog', 'next_event', 'guided'; "
+            "did you mean 'next_event'?",
+        ),
+        (
+            "medium.preset=jerlov-1C",
+            "medium.preset = 'jerlov-1C' (an override) is not one of the known presets; "
+            "did you mean 'jerlov-1C-williamson' or 'jerlov-1C-solonenko'?",
+        ),
+        ("detector.irf=gausian", "detector.irf = 'gausian' (an override) is not one of 'gaussian', "),
+    ],
+)
+def test_errors_name_field_value_and_range(override, message):
+    (text,) = problems({"targets": [{"builtin": "plane"}]}, [override])
+    assert text.startswith(message)
+
+
+def test_every_problem_has_its_line_with_the_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        "[medium]\nextinction = 0.3\nalbedo = 0.8\nanisotropy = 1.2\n[camera]\nwidth = 4\n[gate]\nbins = 0\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_scene(path, ["laser.profile=gauss"])
+    assert str(caught.value).splitlines() == [
+        f"{path}: medium.anisotropy = 1.2 is outside (-1, 1)",
+        f"{path}: laser.profile = 'gauss' (an override) is not one of 'uniform_cone', 'gaussian', 'collimated', "
+        "'measured'; did you mean 'gaussian'?",
+        f"{path}: camera.height is missing (rows)",
+        f"{path}: gate.bin_width_ps is missing (width of a bin [ps])",
+        f"{path}: gate.bins = 0 is outside [1, 1000000]",
+    ]
+    assert isinstance(caught.value, SpadwarpError)
+
+
+def test_a_missing_or_broken_file_is_named(tmp_path):
+    with pytest.raises(FileError, match=r"nowhere\.toml: cannot be read: No such file"):
+        load_scene(tmp_path / "nowhere.toml")
+    broken = tmp_path / "broken.toml"
+    for content in (b"[medium\n", b"\xff\xfe"):
+        broken.write_bytes(content)
+        with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
+            load_scene(broken)
+
+
+json_like = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["preset", "width", "0", "x"]), inner),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=150)
+@given(
+    st.dictionaries(st.sampled_from([*Scene.model_fields, "x"]), json_like, max_size=4),
+    st.dictionaries(st.sampled_from([*Scene.model_fields, "gate.bins", "targets[0].scale"]), json_like, max_size=3),
+)
+def test_any_tables_are_a_scene_or_a_config_error(tables, overrides):
+    try:
+        Scene.from_dict({**MINIMAL, **tables}).with_overrides(overrides)
+    except ConfigError as error:
+        assert error.problems
+
+
+# Round trips
+
+vector = st.tuples(*[st.floats(-100, 100)] * 3)
+section_values = {
+    "medium": st.one_of(
+        st.fixed_dictionaries({"extinction": st.floats(1e-3, 9), "albedo": st.floats(0, 1) | st.just("paper")}),
+        st.fixed_dictionaries({"absorption": st.floats(1e-3, 9), "scattering": st.floats(0, 9)}),
+        st.fixed_dictionaries({"preset": st.sampled_from(sorted(presets("medium")))}),
+        st.fixed_dictionaries({"preset": st.just("uwoc-clear"), "scattering": st.floats(0, 9)}),
+        st.fixed_dictionaries(
+            {
+                "preset": st.just("uwoc-clear"),
+                "phase_function": st.just("two_term_henyey_greenstein"),
+                "g1": st.floats(0, 0.99),
+                "g2": st.floats(-0.9, 0),
+                "alpha": st.floats(0, 1),
+            }
+        ),
+    ),
+    "laser": st.fixed_dictionaries(
+        {"position": vector},
+        optional={
+            "preset": st.sampled_from(sorted(presets("laser"))),
+            "pulse_energy": st.floats(1e-12, 1),
+            "frame": st.sampled_from(["camera", "world"]),
+        },
+    ),
+    "camera": st.one_of(
+        st.just(MINIMAL["camera"]),
+        st.fixed_dictionaries({"preset": st.just("paper")}, optional={"pixel_pitch_um": st.floats(1, 100)}),
+        st.fixed_dictionaries(
+            {"width": st.just(8), "height": st.just(6), "fx": st.floats(10, 50), "aperture_diameter": st.just(0.01)},
+            optional={
+                "fy": st.floats(10, 50),
+                "cx": st.floats(-3, 9),
+                "distortion": st.lists(st.floats(-0.01, 0.01), min_size=4, max_size=5),
+                "focus_distance": st.sampled_from([0.5, math.inf]),
+                "position": vector,
+                "rotation_deg": vector,
+            },
+        ),
+    ),
+    "scan": st.fixed_dictionaries(
+        {}, optional={"mode": st.sampled_from(["none", "confocal"]), "distance": st.sampled_from([3.0, math.inf])}
+    ),
+    "detector": st.fixed_dictionaries({}, optional={"fold": st.booleans(), "irf": st.just('/a "b"\\c\x07\n.csv')}),
+    "gate": st.fixed_dictionaries(
+        {"start_ns": st.floats(0, 500), "bin_width_ps": st.floats(1, 1e4), "bins": st.just(10.0)}
+    ),
+    "targets": st.lists(
+        st.fixed_dictionaries(
+            {"builtin": st.text(min_size=1, max_size=9), "translation": vector},
+            optional={
+                "scale": st.floats(0.1, 9) | st.just([1, 2, 3]),
+                "size": st.lists(st.just(2.5), min_size=1, max_size=3),
+            },
+        ),
+        max_size=3,
+    ),
+    "domain": st.sampled_from(
+        [{}, {"shape": "slab", "lower": 0, "upper": 3.5}, {"shape": "box", "lower": -1, "upper": [1, 2, 3]}]
+    ),
+    "transport": st.fixed_dictionaries(
+        {},
+        optional={
+            "seed": st.integers(0, 2**64 - 1),
+            "max_path": st.floats(1, 100) | st.none(),
+            "lateral_limit": st.sampled_from([3.0, math.inf]),
+        },
+    ),
+    "analytic": st.fixed_dictionaries({}, optional={"backscatter_fraction": st.floats(0, 1)}),
+}
+
+
+def reloaded(one: Scene) -> Scene:
+    return Scene.from_dict(tomllib.loads(one.to_toml()))
+
+
+@settings(max_examples=100)
+@given(st.fixed_dictionaries(section_values))
+def test_the_text_of_a_scene_reloads_to_an_equal_scene(tables):
+    one = Scene.from_dict(tables)
+    assert reloaded(one) == one
+    assert hash(reloaded(one)) == hash(one)
+    assert reloaded(one).to_toml() == one.to_toml()
+    assert one.with_overrides(one.to_dict()) == one
+
+
+def test_a_loaded_scene_survives_files_pickling_and_copying(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    path = tmp_path / "meshes" / "scene.toml"
+    path.write_text(scene(targets=[{"mesh": "bust.stl"}]).to_toml())
+    one = load_scene(path)
+    assert one.source == path
+    assert one.targets[0].mesh == str(tmp_path / "meshes" / "bust.stl")
+    other = tmp_path / "other.toml"
+    other.write_text(one.to_toml())
+    assert load_scene(other) == one
+    again = pickle.loads(pickle.dumps(one))
+    assert (again, again.source, again.medium.given) == (one, path, one.medium.given)
+    assert one != one.with_overrides(["gate.bins=3"])
+
+
+def test_relative_paths_start_at_the_file_and_those_of_overrides_at_the_working_directory(tmp_path, monkeypatch):
+    path = tmp_path / "scene.toml"
+    path.write_text(scene(targets=[{"mesh": "a.stl"}, {"mesh": "/b.stl"}], detector={"irf": "irf.csv"}).to_toml())
+    monkeypatch.chdir("/")
+    one = load_scene(path, ["targets[1].mesh=c.stl"])
+    assert [target.mesh for target in one.targets] == [str(tmp_path / "a.stl"), "/c.stl"]
+    assert one.detector.irf == str(tmp_path / "irf.csv")
+    assert load_scene(path, {"targets": [{"mesh": "d.stl"}]}).targets[0].mesh == "/d.stl"
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_every_shipped_scene_loads_and_reloads(path):
+    one = load_scene(path)
+    assert reloaded(one) == one
+
+
+def test_the_shipped_scenes_are_there():
+    assert {path.stem for path in SCENES} >= {"staircase_15m", "staircase_5m", "harbour_5m", "plane_5m"}
+
+
+# What can be read
+
+
+def test_models_are_frozen():
+    with pytest.raises(ValidationError, match="frozen"):
+        scene().medium.albedo = 0.1
+
+
+def test_derived_quantities():
+    one = scene(
+        gate={"start_ns": 10.0, "bin_width_ps": 100.0, "bins": 50},
+        laser={"wavelength_nm": 532.0, "pulse_energy": 37.5e-9, "half_angle_deg": 15.0, "direction": [0, 3, 4]},
+        detector={"pdp": 0.25, "fill_factor": 0.2},
+    )
+    assert one.gate.stop == pytest.approx(15e-9)
+    assert one.path_limit == pytest.approx(SPEED_OF_LIGHT / 1.3638 * 15e-9)
+    assert one.with_overrides(["transport.max_path=2"]).path_limit == 2.0
+    assert one.with_overrides(["transport.max_path=200"]).path_limit == one.path_limit
+    # A 532 nm photon carries 2.3305 eV.
+    assert one.laser.photons_per_pulse == pytest.approx(37.5e-9 / (2.330530 * 1.602176634e-19), rel=1e-5)
+    assert one.laser.axis == pytest.approx((0.0, 0.6, 0.8))
+    assert one.laser.half_angle == pytest.approx(math.pi / 12)
+    assert one.detector.pde == pytest.approx(0.05)
+    assert one.medium.attenuation_length == pytest.approx(1 / 0.3)
+    assert one.camera.aperture_area == pytest.approx(math.pi * 0.005**2)
+
+
+def test_both_ways_to_give_a_camera_agree():
+    by_angle = Camera(width=40, height=30, horizontal_fov_deg=2 * math.degrees(math.atan(0.2)), aperture_diameter=0.005)
+    by_lens = Camera(width=40, height=30, focal_length=0.01, pixel_pitch_um=100.0, f_number=2.0)
+    for camera in (by_angle, by_lens):
+        assert camera.pixel_tangent == pytest.approx(0.01)
+        assert camera.aperture_radius == pytest.approx(0.0025)
+        assert math.tan(camera.horizontal_fov / 2) == pytest.approx(0.2)
+        assert math.tan(camera.vertical_fov / 2) == pytest.approx(0.15)
+
+
+def test_a_domain_has_only_the_bounds_of_its_shape():
+    inf = math.inf
+    assert Domain(lower=1, upper=[2, 3, 4]).bounds == ((-inf,) * 3, (inf,) * 3)
+    assert Domain(shape="slab", lower=0, upper=2).bounds == ((-inf, -inf, 0.0), (inf, inf, 2.0))
+    assert Domain(shape="box", lower=-1, upper=[2, 3, 4]).bounds == ((-1.0,) * 3, (2.0, 3.0, 4.0))
+    assert problems({"domain": {"shape": "slab", "lower": 3, "upper": 1}}) == (
+        "domain.lower = 3.0 is outside (-inf, 1.0), 1.0 being upper in z",
+    )
+
+
+def test_a_gaussian_beam_is_narrower_than_a_half_space():
+    assert Laser(half_angle_deg=180.0).half_angle == pytest.approx(math.pi)
+    assert problems({"laser": {"profile": "gaussian", "half_angle_deg": 90.0}}) == (
+        "laser.half_angle_deg = 90.0 is outside (0, 90), the range of a gaussian profile",
+    )
+
+
+def test_every_field_is_documented():
+    for section in (scene().medium, scene().laser, scene().camera, scene().detector, scene().gate, scene().domain):
+        for name, info in type(section).model_fields.items():
+            assert info.description, f"{section.section}.{name}"
+
+
+def test_ways_to_give_a_camera_exclude_each_other(tmp_path):
+    assert problems({"camera": {**MINIMAL["camera"], "fx": 20.0}}) == (
+        "camera needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length; "
+        "given: horizontal_fov_deg, fx",
+    )
+    assert problems({"camera": {**MINIMAL["camera"], "cx": 2.0}}) == ("camera.cx = 2.0 goes with fx only",)
+    assert problems({"camera": {**MINIMAL["camera"], "distortion": [0.1, 0.2]}}) == (
+        "camera.distortion = [0.1, 0.2] has the wrong number of values",
+    )
+    (text,) = problems({"camera": {**MINIMAL["camera"], "horizontal_fov_deg": 120.0, "distortion": [-0.4, 0, 0, 0]}})
+    assert text.startswith("camera.distortion = [-0.4, 0.0, 0.0, 0.0, 0.0] folds the image")
+    lens = {"width": 8, "height": 6, "focal_length": 0.05, "pixel_pitch_um": 100.0, "f_number": 2.0}
+    assert problems({"camera": {**lens, "focus_distance": 0.04}}) == (
+        "camera.focus_distance = 0.04 is outside (0.05, inf], beyond the focal length",
+    )
+    # A later layer takes the place of an earlier one, whatever way it is given in.
+    path = tmp_path / "camera.json"
+    path.write_text('{"K": [[30, 0, 4], [0, 31, 3], [0, 0, 1]], "dist": [0.1, 0, 0, 0], "image_width": 8}')
+    one = scene().with_overrides({"camera.calibration": str(path)}).camera
+    assert (one.fx, one.fy, one.distortion[0], one.horizontal_fov_deg) == (30, 31, 0.1, None)
+    angle = scene(camera={"width": 8, "height": 6, "fx": 30.0, "aperture_diameter": 0.01})
+    assert angle.with_overrides({"camera.horizontal_fov_deg": 20.0}).camera.fx is None
+    assert problems(overrides={"camera.calibration": str(path), "camera.width": 9}) == (
+        "camera.width = 9 is not 8, the image's of the calibration",
+    )

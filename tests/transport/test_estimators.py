@@ -1,0 +1,171 @@
+"""The estimators share one expectation, and it is the physics': closed forms, components, rules on and off."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+import spadwarp_kernels as sk
+from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES, equal_means_p
+from spadwarp.mesh.targets import build_mesh
+from spadwarp.transport.model import build_model, pick_device, transport_spec
+
+SEEDS = 32
+
+
+def _cells(estimator, device, photons, **sections):
+    """Tallies summed over pixels: [seeds, component x bin], as fractions of emitted photons."""
+    sections.setdefault("transport", {})["estimator"] = estimator
+    one = scene(**sections)
+    rows = []
+    for seed in range(SEEDS):
+        result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
+        assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
+        rows.append(result.tallies.sum(axis=(1, 2)).ravel() * result.unit / photons)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
+def test_estimators_agree_in_every_component(axis_threshold, device):
+    """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
+    cells = {
+        estimator: _cells(estimator, device, photons, transport={"axis_threshold": axis_threshold})
+        for estimator, photons in {"analog": 60_000, "next_event": 30_000, "guided": 30_000}.items()
+    }
+    assert equal_means_p(cells["analog"], cells["next_event"]) > 1e-3
+    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
+    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
+    # The comparison has teeth: every component is seen, the guided estimate of the total to 1 %.
+    total = cells["guided"].sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+    assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_estimators_agree_with_a_tabulated_phase_function(device):
+    """Two terms, one of them backward, under a raised near-axis threshold."""
+    water = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
+    cells = {
+        estimator: _cells(estimator, device, photons, medium=water, transport={"axis_threshold": 0.97})
+        for estimator, photons in {"analog": 40_000, "next_event": 20_000, "guided": 20_000}.items()
+    }
+    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
+    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
+    total = cells["guided"].sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
+    """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
+    water = {"phase_function": "fournier_forand"}
+    analog, guided = (
+        _cells(estimator, device, photons, medium=water)
+        for estimator, photons in (("analog", 60_000), ("guided", 15_000))
+    )
+    assert equal_means_p(analog, guided) > 1e-3
+    total = guided.sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
+    """Through the file, the table, and the directions and angles of its own that guided takes from it."""
+    angle = np.concatenate([[0.0], np.geomspace(0.01, 20.0, 400), np.linspace(20.0, 180.0, 641)[1:]])
+    value = sk.henyey_greenstein_density(2.0 * np.sin(np.radians(angle) / 2) ** 2, 0.8)
+    np.savetxt(tmp_path / "hg.csv", np.column_stack([angle, value]), delimiter=",", header="angle_deg,value")
+    table = {"phase_function": "tabulated", "phase_table": str(tmp_path / "hg.csv")}
+    one, other = (_cells("guided", device, 20_000, medium=water) for water in ({}, table))
+    assert equal_means_p(one, other) > 1e-3
+    assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator, device):
+    """Pencil beam onto a plate: R/pi exp(-2 c d) A/d^2 to 1 %, for a lens small against the distance."""
+    one = scene(
+        laser={"profile": "collimated", "position": [0.0, 0.0, 0.0]},
+        camera={"aperture_diameter": 0.02},
+        gate={"bin_width_ps": 100.0, "bins": 200},
+        transport={"estimator": estimator},
+    )
+    result = spadwarp.simulate(one, photons=400_000, seed=3, device=device)
+    area = math.pi * 0.01**2
+    expected = 0.7 / math.pi * math.exp(-2 * 0.5 * 2.2) * area / 2.2**2
+    assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.01)
+    # And it arrives when it should: 4.4 m of path at index 1.
+    arrival = (result.component("ballistic").sum(axis=(0, 1)) * result.path_edges[:-1]).sum() / expected
+    assert arrival == pytest.approx(4.4, abs=0.06)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided", "analog"])
+def test_clear_water_gives_straight_lines_only(estimator, device):
+    one = scene(medium={"albedo": 0.0}, transport={"estimator": estimator})
+    result = spadwarp.simulate(one, photons=200_000, seed=5, device=device)
+    assert result.component("ballistic").sum() > 0
+    assert not result.component("backscatter").any()
+    assert not result.component("forward_scattered").any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_reflectance_scales_the_ballistic_return(device):
+    """Half the reflectance, half the light: one surface each, the same photons, so equal to the rounding of the
+    tally."""
+    bright, dark = (
+        spadwarp.simulate(
+            scene(targets=[{"builtin": "plane", "size": [3.0, 3.0], "translation": [0, 0, 2.2], "reflectance": rho}]),
+            photons=50_000,
+            seed=2,
+            device=device,
+        )
+        .component("ballistic")
+        .sum()
+        for rho in (0.8, 0.4)
+    )
+    assert bright == pytest.approx(2 * dark, rel=1e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_blocker_casts_a_shadow(device):
+    """A black screen between plate and lens removes the plate's light from the pixels that it covers, and only
+    there."""
+    plate = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
+    screen = {"builtin": "plane", "size": [2.0, 2.0], "translation": [1.0, 0.0, 1.0], "reflectance": 0.0}
+    sections = {"medium": {"albedo": 0.0}, "camera": {"aperture_diameter": 0.02}}
+    open_view = spadwarp.simulate(scene(**sections), photons=200_000, seed=6, device=device).intensity
+    shaded = spadwarp.simulate(
+        scene(**sections, targets=[plate, screen]), photons=200_000, seed=6, device=device
+    ).intensity
+    # The lens is 2 cm wide: half a pixel's percent of penumbra at the screen's edge.
+    assert (shaded[:, 2:] <= 0.02 * open_view[:, 2:]).all()
+    np.testing.assert_allclose(shaded[:, 0], open_view[:, 0], rtol=0.05)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
+    """A staircase, tilted, close to a wide lens: with and without the map the same tallies, with fewer shadow rays."""
+    one = scene(
+        camera={"width": 16, "height": 16, "aperture_diameter": 0.1},
+        targets=[{"builtin": "staircase", "scale": 0.4, "rotation_deg": [4, -6, 10], "translation": [0, 0, 2.0]}],
+        transport={"estimator": estimator},
+    )
+    mesh = build_mesh(one)
+    model = build_model(one, pick_device(device), mesh)
+    spec = transport_spec(one, mesh)
+    tallies, rays = [], []
+    for surfaces in (model.surfaces, sk.make_surfaces(model.mesh, model.surfaces.reflectance)):
+        data = sk.make_data(model)
+        sk.launch_transport(
+            spec, dataclasses.replace(model, surfaces=surfaces), data, seed=3, first_id=0, photon_count=100_000
+        )
+        tallies.append(data.tally.numpy())
+        rays.append(sk.read_ledger(data)[1]["shadow_queries"])
+    np.testing.assert_array_equal(*tallies)
+    assert tallies[0].any() and rays[0] < rays[1]

@@ -1,0 +1,223 @@
+"""Cameras in the simulation: each lens images as optics has it, the estimators agree behind every one of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.opencv import project_points
+from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES, equal_means_p
+from spadwarp.errors import ConfigError
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_world
+
+SEEDS = 32
+BENT = {
+    "horizontal_fov_deg": None,
+    "fx": 4.3,
+    "fy": 4.6,
+    "cx": 1.2,
+    "cy": 1.9,
+    "distortion": [-0.15, 0.02, 0.01, -0.02, 0],
+}
+CAMERAS = {
+    "thin lens": {"camera": {"focus_distance": 1.2}},
+    "calibrated, posed, laser in the world": {
+        "camera": {**BENT, "position": [0.4, -0.3, -0.2], "rotation_deg": [6.0, -9.0, 20.0], "focus_distance": 3.0},
+        "laser": {"position": [0.7, 0.2, -0.1], "direction": [-0.2, -0.1, 1.0], "frame": "world"},
+    },
+}
+
+
+def _cells(estimator, device, photons, **sections):
+    """Fractions of emitted photons [seeds, cells]: each component's bins over all pixels, and each pixel over all
+    bins."""
+    one = scene(**sections).with_overrides({"transport.estimator": estimator})
+    rows = []
+    for seed in range(SEEDS):
+        result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
+        assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
+        both = [result.tallies.sum(axis=(1, 2)).ravel(), result.tallies.sum(axis=(0, 3)).ravel()]
+        rows.append(np.concatenate(both) * (result.unit / photons))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_estimators_agree_behind_every_lens(camera, device):
+    cells = {
+        estimator: _cells(estimator, device, photons, **CAMERAS[camera])
+        for estimator, photons in {"analog": 60_000, "next_event": 30_000, "guided": 30_000}.items()
+    }
+    # What next_event has not yet seen often has no normal mean: it is left out.
+    assert equal_means_p(cells["analog"], cells["next_event"], converged=0.1) > 1e-3
+    assert equal_means_p(cells["guided"], cells["next_event"], converged=0.1) > 1e-3
+    assert equal_means_p(cells["analog"], cells["guided"], converged=0.1) > 1e-3
+    # The comparison has teeth: every component and pixel is seen, the guided estimate of the total to 1 %.
+    pixels = cells["guided"][:, -16:]
+    assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(SEEDS) < 0.1).all()
+    total = pixels.sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+    assert (cells["guided"][:, :24].reshape(SEEDS, 3, 8).sum(axis=(0, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
+    """The same photons through a hole of 20 µm, focused at 1.2 m or everywhere: the same image to what rounding
+    moves from a pixel to its neighbour."""
+    sections = {"transport": {"estimator": estimator}, "camera": {"width": 16, "height": 16, "aperture_diameter": 2e-5}}
+    pinhole = spadwarp.simulate(scene(**sections), photons=100_000, seed=1, device=device)
+    sections["camera"] = {**sections["camera"], "focus_distance": 1.2}
+    thin = spadwarp.simulate(scene(**sections), photons=100_000, seed=1, device=device)
+    assert thin.scene.camera.is_plain is False and pinhole.scene.camera.is_plain
+    wrong = np.abs(thin.intensity - pinhole.intensity).sum() / pinhole.intensity.sum()
+    assert wrong < 0.01  # guided draws from a view that is a hundredth of a pixel wider
+    np.testing.assert_allclose(thin.histogram.sum(axis=(0, 1)), pinhole.histogram.sum(axis=(0, 1)), rtol=0.01)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("focus", [0.6, 2.5, math.inf])
+def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
+    """Radius a·|1/z − 1/focus| as a tangent: for a small spot at z its image is even, and ends there."""
+    z, radius, pixel = 1.0, 0.05, 2e-3
+    one = scene(
+        medium={"albedo": 0.0},
+        laser={"half_angle_deg": 0.2, "position": [0.0, 0.0, 0.0]},
+        camera={
+            "width": 64,
+            "height": 64,
+            "horizontal_fov_deg": None,
+            "fx": 1 / pixel,
+            "aperture_diameter": 2 * radius,
+            "focus_distance": focus,
+        },
+        targets=[{"builtin": "plane", "size": 4e-3, "translation": [0.0, 0.0, z], "reflectance": 1.0}],
+    )
+    image = spadwarp.simulate(one, photons=200_000, seed=4, device=device).intensity
+    disc = radius * abs(1 / z - (0 if math.isinf(focus) else 1 / focus)) / pixel  # [pixels]
+    place = np.arange(64) + 0.5 - 32
+    r2 = place[:, None] ** 2 + place**2
+    spread = (image * r2).sum() / image.sum()
+    spot = (4e-3 / z / pixel) ** 2 / 6 + 1 / 6  # of a square of 2 pixels, and of a pixel
+    assert spread == pytest.approx(disc**2 / 2 + spot, rel=0.01)
+    assert image[r2 > (disc + 2.5) ** 2].sum() == 0
+    inner = r2 < (disc / 2) ** 2
+    # Even, but for cos^4 of the angle at the lens: a quarter of the light in a quarter of the area.
+    assert image[inner].sum() / image.sum() == pytest.approx(np.count_nonzero(inner) / (math.pi * disc**2), rel=0.03)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
+    rvec, tvec, coefficients = (0.2, -0.3, 0.4), (0.1, -0.05, 1.0), (-0.25, 0.05, 0.01, -0.008, 0.0)
+    spots = np.array([[0.55, 0.35, 2.0], [-0.5, 0.4, 1.5]])  # as the camera sees them
+    world = to_world(scene(camera=spadwarp.opencv_pose(rvec, tvec)).camera, spots)
+    for seen, place in zip(spots, world, strict=True):
+        one = scene(
+            medium={"albedo": 0.0},
+            camera={
+                **BENT,
+                "width": 64,
+                "height": 48,
+                "fx": 70.0,
+                "fy": 66.0,
+                "cx": 30.3,
+                "cy": 22.2,
+                "distortion": coefficients,
+                **spadwarp.opencv_pose(rvec, tvec),
+                "aperture_diameter": 1e-3,
+            },
+            laser={"half_angle_deg": 3.0, "position": [0.0, 0.0, 0.0], "direction": seen.tolist()},
+            targets=[{"builtin": "sphere", "size": 0.12, "translation": place.tolist()}],
+        )
+        result = spadwarp.simulate(one, photons=200_000, seed=2, device=device)
+        row, column = np.indices(result.intensity.shape)
+        mean = [np.average(axis, weights=result.intensity) for axis in (column, row)]
+        (expected,) = project_points([place], rvec, tvec, 70.0, 66.0, 30.3, 22.2, coefficients)
+        np.testing.assert_allclose(mean, expected, atol=0.1)
+        # And the truth maps know it there, with the range to the ball's near side.
+        there = result.truth.range[round(expected[1]), round(expected[0])]
+        assert there == pytest.approx(np.linalg.norm(place - one.camera.position) - 0.06, abs=0.005)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_moving_everything_together_changes_nothing(device):
+    """Camera, laser and target under one rigid motion: the same histories to float32, so the same histogram."""
+    turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
+    here = spadwarp.simulate(scene(), photons=100_000, seed=3, device=device)
+    target = {
+        "builtin": "plane",
+        "size": [3.0, 3.0],
+        "translation": (turn @ [0, 0, 2.2] + shift).tolist(),
+        "rotation_deg": [25.0, -40.0, 70.0],
+        "reflectance": 0.7,
+    }
+    camera = {"position": shift.tolist(), "rotation_deg": rotation_angles(turn)}
+    riding = scene(camera=camera, targets=[target])
+    standing = scene(
+        camera=camera,
+        targets=[target],
+        laser={"position": (turn @ [-0.1, 0, 0] + shift).tolist(), "direction": turn[:, 2].tolist(), "frame": "world"},
+    )
+    for moved in (riding, standing):
+        there = spadwarp.simulate(moved, photons=100_000, seed=3, device=device)
+        np.testing.assert_allclose(there.truth.range, here.truth.range, rtol=1e-5)
+        np.testing.assert_allclose(there.truth.normal, here.truth.normal, atol=1e-5)
+        np.testing.assert_allclose(there.true_path(), here.true_path(), rtol=1e-5)
+        assert np.abs(there.histogram - here.histogram).sum() < 0.01 * here.histogram.sum()
+        np.testing.assert_allclose(there.depth(), here.depth(), rtol=0.01)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_domain_stands_in_the_world(device):
+    """A camera that is turned against a box of water: photons end on the faces that the ledger names."""
+    box = {"shape": "box", "lower": [-0.5, -0.8, -0.4], "upper": [0.6, 0.9, 1.0]}
+    one = scene(
+        medium={"albedo": 1.0, "extinction": 2.0},
+        camera={"position": [0.1, 0.2, 0.1], "rotation_deg": [20.0, 130.0, -50.0]},
+        domain=box,
+        targets=[],
+        transport={"weight_cutoff": 0.0, "max_collisions": 1000},
+    )
+    records = spadwarp.trace(one, photons=20_000, seed=1, device=device)
+    for index, axis in enumerate("xyz"):
+        for side, corner in (("low", box["lower"]), ("high", box["upper"])):
+            ended = records.ended(f"exit_{axis}_{side}")
+            assert ended.sum() > 100
+            np.testing.assert_allclose(records.position[ended, index], corner[index], atol=1e-5)
+    inside = (records.position > np.array(box["lower"]) - 1e-5) & (records.position < np.array(box["upper"]) + 1e-5)
+    assert inside.all()
+
+
+def test_a_camera_outside_the_water_is_refused():
+    outside = scene(domain={"shape": "slab", "lower": 0.5, "upper": 9.0}, laser={"position": [0, 0, 1.0]})
+    with pytest.raises(ConfigError, match=r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"):
+        spadwarp.simulate(outside, photons=10, device="cpu")
+    with pytest.raises(ConfigError, match=r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"):
+        spadwarp.simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_layers_of_water_stand_in_the_world(device):
+    """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
+    turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
+    layers = [{"start": 0.7, "extinction": 3.0, "albedo": 0.5}, {"start": 1.5, "extinction": 0.2, "albedo": 0.9}]
+    here = scene(medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]}, targets=[])
+    start = float(turn @ [0.6, 0.0, 0.8] @ shift)
+    there = scene(
+        medium={
+            "layers": [{**layer, "start": layer["start"] + start} for layer in layers],
+            "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist(),
+        },
+        camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn)},
+        targets=[],
+    )
+    assert there.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) == pytest.approx(
+        here.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0))
+    )
+    first, second = (spadwarp.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
+    apart = np.linalg.norm(second.position - (first.position @ turn.T + shift), axis=1)
+    # A rounding may tip one history over an edge of something; most end where they must to float32.
+    assert np.quantile(apart, 0.98) < 1e-3
+    assert (first.collisions == second.collisions).mean() > 0.98

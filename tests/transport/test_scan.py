@@ -1,0 +1,159 @@
+"""Confocal scanning: laser and pixel move together, and each position is a run of its own."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+import spadwarp_kernels as sk
+from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES, equal_means_p
+from spadwarp.mesh.targets import build_mesh
+from spadwarp.result.result import scan_axes
+from spadwarp.scene import Camera
+from spadwarp.transport.model import build_model, pick_device, transport_spec
+
+CONFOCAL = {"scan": {"mode": "confocal"}, "laser": {"half_angle_deg": 3.0}}
+
+
+def _one_pixel(one, row, column):
+    """The scene of one position: a camera of one pixel, and the laser aimed where the scan aims it."""
+    (fx, fy), (cx, cy) = one.camera.focal_pixels, one.camera.principal_point
+    camera = {
+        "width": 1,
+        "height": 1,
+        "horizontal_fov_deg": None,
+        "fx": fx,
+        "fy": fy,
+        "cx": cx - 0.5 - column,
+        "cy": cy - 0.5 - row,
+        "distortion": one.camera.distortion,
+    }
+    direction = scan_axes(one)[row, column].tolist()
+    return one.with_overrides(camera=camera, laser={"direction": direction}, scan={"mode": "none"})
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+@pytest.mark.parametrize("camera", [{}, {"distortion": [-0.1, 0.0, 0.01, 0.0, 0.0], "focus_distance": 1.5}])
+def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, estimator, device):
+    """The photons of each position, walked one by one through a scene of that pixel alone, leave the same integers."""
+    one = scene(**CONFOCAL, camera=camera, transport={"estimator": estimator})
+    rounds, pixels = 40, 16
+    result = spadwarp.simulate(one, photons=rounds * pixels, seed=9, device=device)
+    target, mesh = pick_device(device), build_mesh(one)
+    scale = build_model(one, target, mesh).scale
+    for row, column in np.ndindex(4, 4):
+        single = _one_pixel(one, row, column)
+        model = dataclasses.replace(build_model(single, target, mesh), scale=scale)
+        spec, data = transport_spec(single, mesh), sk.make_data(model)
+        assert not spec.confocal
+        for photon in range(4 * row + column, rounds * pixels, pixels):
+            sk.launch_transport(spec, model, data, seed=9, first_id=photon, photon_count=1)
+        tallies = data.tally.numpy().reshape(3, 8)
+        np.testing.assert_array_equal(result.tallies[:, row, column], tallies)
+        # And per photon of the position the values are those of the single run.
+        expected = tallies.sum(axis=0) * (1.0 / scale / rounds)
+        np.testing.assert_allclose(result.histogram[row, column], expected, rtol=1e-12)
+    assert result.tallies.any(axis=(0, 3)).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_estimators_agree_in_a_scan(device):
+    """From 1 m on: nearer, next_event's rare and bright events next to the lens have no normal mean yet."""
+    cells, gate = {}, {"start_ns": 6.671, "bins": 4}
+    for estimator, photons in {"analog": 160_000, "next_event": 64_000, "guided": 64_000}.items():
+        rows = []
+        for seed in range(24):
+            one = scene(**CONFOCAL, gate=gate, transport={"estimator": estimator})
+            result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
+            rows.append(result.tallies.sum(axis=(1, 2)).ravel() * result.unit / photons)
+        cells[estimator] = np.array(rows)
+    assert equal_means_p(cells["analog"], cells["next_event"], converged=0.1) > 1e-3
+    assert equal_means_p(cells["guided"], cells["next_event"], converged=0.1) > 1e-3
+    assert equal_means_p(cells["analog"], cells["guided"], converged=0.1) > 1e-3
+    total = cells["guided"].sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(24) < 0.01
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_pixels_of_a_scan_see_their_own_light_alone(device):
+    """Clear water, a beam narrower than a pixel: each pixel gets the full return of a pencil beam, R/pi e^(-2cr) A
+    cos^2/r^2 times the cosine at the lens, whatever the number of pixels; without a scan the beam is in one alone."""
+    one = scene(
+        medium={"albedo": 0.0},
+        laser={"profile": "collimated", "position": [0.0, 0.0, 0.0]},
+        camera={"aperture_diameter": 0.02, "width": 6, "height": 4},
+        scan={"mode": "confocal"},
+    )
+    result = spadwarp.simulate(one, photons=6 * 4 * 20_000, seed=2, device=device)
+    distance = result.truth.range.astype(float)
+    cosine = 2.2 / distance
+    expected = 0.7 / math.pi * np.exp(-2 * 0.5 * distance) * math.pi * 0.01**2 * cosine**2 / distance**2
+    lit = np.isfinite(expected)
+    assert lit.all()
+    np.testing.assert_allclose(result.component("ballistic").sum(axis=2), expected, rtol=0.06)
+    assert result.component("ballistic").sum() == pytest.approx(expected.sum(), rel=0.01)
+
+
+def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
+    """Runs that stop within a round of the raster: each pixel is divided by its own photons."""
+    one = scene(**CONFOCAL)
+    whole = spadwarp.simulate(one, photons=1000, seed=5, device="cpu")
+    parts = [
+        spadwarp.simulate(one, photons=count, first_photon=first, seed=5, device="cpu")
+        for first, count in ((0, 333), (333, 667))
+    ]
+    for result in (whole, *parts):
+        start, stop = result.photon_ranges[0]
+        ids = np.arange(start, stop) % 16
+        expected = np.bincount(ids, minlength=16).reshape(4, 4)
+        np.testing.assert_array_equal(result.unit / result.tally_value, expected)
+    joined = spadwarp.merge(parts)
+    np.testing.assert_array_equal(joined.histogram, whole.histogram)
+    resumed = spadwarp.simulate(one, photons=1000, resume=parts[0], device="cpu")
+    np.testing.assert_array_equal(resumed.tallies, whole.tallies)
+
+
+def test_the_standard_error_of_a_scan_is_the_spread_between_seeds():
+    runs = [
+        spadwarp.simulate(scene(**CONFOCAL), photons=16 * 640, seed=seed, uncertainty=True, device="cpu")
+        for seed in range(48)
+    ]
+    assert runs[0].batch_size % 16 == 0 and runs[0].photons % runs[0].batch_size == 0
+    totals = np.array([run.histogram.sum(axis=2) for run in runs])
+    errors = np.sqrt(np.array([(run.standard_error**2).sum(axis=2) for run in runs]).mean(axis=0))
+    # Bins of a pixel are nearly independent; 16 pixels of 48 runs tell a standard deviation to 3 %.
+    assert np.mean(totals.std(axis=0, ddof=1) / errors) == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_scan_survives_its_file_and_gives_depth(tmp_path):
+    one = scene(**CONFOCAL, gate={"bin_width_ps": 100.0, "bins": 200})
+    result = spadwarp.simulate(one, photons=16 * 4000, seed=1, device="cpu")
+    loaded = spadwarp.load_result(result.save(tmp_path / "scan.h5"))
+    assert loaded.scene == one
+    np.testing.assert_array_equal(loaded.histogram, result.histogram)
+    np.testing.assert_allclose(result.depth(method="peak"), 2.2, atol=0.05)
+    with pytest.raises(ValueError, match="CALIBRATED"):
+        sk.make_transport_kernel(sk.TransportSpec(confocal=True))
+
+
+def test_beam_and_line_of_sight_cross_at_the_distance_of_the_scan():
+    one = scene(scan={"mode": "confocal", "distance": 2.5}, laser={"position": [-0.3, 0.1, 0.0]})
+    axes = scan_axes(one)
+    view = spadwarp.result.result.pixel_directions(one.camera)
+    np.testing.assert_allclose(np.cross(axes, 2.5 * view - np.array([-0.3, 0.1, 0.0])), 0.0, atol=1e-12)
+    np.testing.assert_array_equal(scan_axes(scene(scan={"mode": "confocal"})), view)
+    assert isinstance(one.camera, Camera)
+
+
+def test_the_check_knows_that_a_pixel_gets_the_photons_of_its_position_alone():
+    few = {"laser": CONFOCAL["laser"], "transport": {"estimator": "analog", "photons": 100}}
+    told = [
+        next(message for message in spadwarp.check(one) if message.field == "transport.estimator")
+        for one in (scene(**few), scene(**few, scan={"mode": "confocal"}))
+    ]
+    flash, scan = (message.values["photons_per_pixel"] for message in told)
+    assert scan == pytest.approx(flash / 16, rel=0.05)

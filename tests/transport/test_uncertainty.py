@@ -1,0 +1,143 @@
+"""Errors of every bin, the stopping rule, resuming and merging."""
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy import stats
+
+import spadwarp
+from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES
+from spadwarp_kernels import Batches
+
+
+def _same(a, b):
+    assert a.tallies.tobytes() == b.tallies.tobytes()
+    assert a.ledger == b.ledger and a.counters == b.counters
+    assert a.photons == b.photons and a.photon_ranges == b.photon_ranges
+    assert (a.squares is None) == (b.squares is None)
+    if a.squares is not None:
+        np.testing.assert_array_equal(a.squares, b.squares)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_squares_are_exact_to_128_bits(device):
+    rng = np.random.default_rng(0)
+    rows = [rng.integers(0, 2**61, size=(3, 50), dtype=np.int64) // [[1], [2**20], [2**40]] for _ in range(300)]
+    rows[0][:] = 0
+    tally = wp.zeros(150, dtype=wp.int64, device=device)
+    batches = Batches(tally, 3)
+    for row in rows:
+        tally.assign(row.ravel() // 3)
+        batches.close(tally)
+        assert not tally.numpy().any()
+    sums = [[int(v) // 3 for v in row.ravel()] for row in rows]
+    expected = [sum((row[i] + row[50 + i] + row[100 + i]) ** 2 for row in sums) for i in range(50)]
+    low, high = (half.numpy() for half in batches.squares)
+    assert [int(h) << 64 | int(l) for l, h in zip(low, high, strict=True)] == expected
+    assert batches.count == 300
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_standard_error_is_the_spread_between_seeds(device):
+    """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
+    one = scene(transport={"estimator": "guided"})
+    runs = [spadwarp.simulate(one, photons=2**15, seed=seed, device=device, uncertainty=True) for seed in range(64)]
+    values = np.array([run.histogram for run in runs])
+    bright = values.mean(axis=0) > 0.05 * values.mean(axis=0).max()
+    spread = values.var(axis=0, ddof=1)[bright]
+    claimed = np.mean([run.standard_error**2 for run in runs], axis=0)[bright]
+    assert bright.sum() > 20
+    assert np.sqrt(claimed / spread).mean() == pytest.approx(1.0, abs=0.1)
+    z = (values - values.mean(axis=0))[:, bright] / np.array([run.standard_error for run in runs])[:, bright]
+    # Coverage, both sides together: a bin's sum is skewed, and its error rises and falls with it.
+    beyond = 2 * stats.norm.sf(2)
+    assert beyond / 2 < (np.abs(z) > 2).mean() < 2 * beyond
+
+
+def test_batches_do_not_depend_on_how_the_run_is_cut_up():
+    one = scene()
+    whole = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=1, uncertainty=True)
+    cut = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=2, pass_size=100, uncertainty=True)
+    _same(whole, cut)
+    assert whole.photons >= 20_000 and whole.photons % whole.batch_size == 0
+    plain = spadwarp.simulate(one, photons=whole.photons, seed=5, device="cpu")
+    assert plain.tallies.tobytes() == whole.tallies.tobytes() and plain.ledger == whole.ledger
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_a_resumed_run_equals_one_long_run(uncertainty, tmp_path):
+    one = scene()
+    whole = spadwarp.simulate(one, photons=65_536, seed=5, device="cpu", uncertainty=uncertainty)
+    batch = whole.batch_size
+    short = spadwarp.simulate(one, photons=24_576, seed=5, device="cpu", uncertainty=uncertainty)
+    if uncertainty:
+        # A shorter run of its own would choose smaller batches: a run that was interrupted kept the long run's.
+        assert short.batch_size < batch
+        short = _first_batches(one, whole, 12)
+    short.save(tmp_path / "short.h5")
+    resumed = spadwarp.simulate(one, photons=65_536, device="cpu", resume=spadwarp.load_result(tmp_path / "short.h5"))
+    _same(resumed, whole)
+    assert not resumed.partial
+
+
+def _first_batches(one, whole, count):
+    """The run interrupted after so many batches or a few more."""
+    import signal
+
+    def interrupt(stage, done, total):
+        if stage == "trace" and done >= count * whole.batch_size and not fired:
+            fired.append(True)
+            signal.raise_signal(signal.SIGINT)
+
+    fired = []
+    part = spadwarp.simulate(one, photons=65_536, seed=5, device="cpu", threads=1, uncertainty=True, progress=interrupt)
+    assert part.partial and count * whole.batch_size <= part.photons < whole.photons
+    return part
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_merged_parts_equal_one_long_run(uncertainty):
+    one = scene()
+    whole = spadwarp.simulate(one, photons=65_536, seed=5, device="cpu", uncertainty=uncertainty)
+    parts = [
+        spadwarp.simulate(
+            one, photons=65_536, seed=5, device="cpu", uncertainty=uncertainty, first_photon=first * 65_536
+        )
+        for first in (2, 0, 1)
+    ]
+    gap = spadwarp.merge([parts[0], parts[1]])
+    assert gap.photon_ranges == ((0, 65_536), (131_072, 196_608))
+    _same(spadwarp.merge([gap, parts[2]]), spadwarp.merge(parts))
+    _same(parts[1], whole)
+    if not uncertainty:
+        _same(spadwarp.merge(parts), spadwarp.simulate(one, photons=196_608, seed=5, device="cpu"))
+
+
+def test_what_cannot_be_merged_is_refused():
+    one = scene()
+    a = spadwarp.simulate(one, photons=1000, seed=5, device="cpu")
+    with pytest.raises(spadwarp.ConfigError, match="ids 0 to 999 are in more than one"):
+        spadwarp.merge([a, a])
+    with pytest.raises(spadwarp.ConfigError, match="seed of the results differs"):
+        spadwarp.merge([a, spadwarp.simulate(one, photons=1000, seed=6, device="cpu", first_photon=1000)])
+    other = one.with_overrides({"medium.extinction": 0.6})
+    with pytest.raises(spadwarp.ConfigError, match="scene of the results differs in medium: only photons"):
+        spadwarp.merge([a, spadwarp.simulate(other, photons=1000, seed=5, device="cpu", first_photon=1000)])
+    with pytest.raises(spadwarp.ConfigError, match="photons = 1000 is outside"):
+        spadwarp.simulate(one, photons=1000, device="cpu", resume=a)
+    with pytest.raises(spadwarp.ConfigError, match="no batches"):
+        _ = a.standard_error
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
+    one = scene(transport={"estimator": "guided"})
+    run = spadwarp.simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)
+    assert run.relative_error <= 0.05 and not run.partial
+    assert run.photons < 2**22
+    # Stopping is checked at 8, 16, 32, ... batches, whatever the pass size.
+    batches = run.photons // run.batch_size
+    assert batches >= 8 and batches & (batches - 1) == 0
+    never = spadwarp.simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)
+    assert never.photons == 2**14 and not never.partial and never.relative_error > 1e-6

@@ -1,0 +1,215 @@
+"""The validation: its statistics, its reference numbers, and a short run of every kind of case."""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+
+from reference import fournier_forand
+from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab, stack
+from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
+from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
+from spadwarp.errors import ConfigError
+from spadwarp.validate import CASES, plot_results, references, validate, write_json
+from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
+
+# The statistics
+
+
+def test_holm_raises_each_p_by_the_hypotheses_left():
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.5, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_z_of_few_batches_allows_for_their_uncertain_error():
+    """Student's t of 3 with 7 degrees of freedom is as likely as a normal deviate of 2.327."""
+    assert Quantity("", Estimate(3.0, 1.0, 7.0), 0.0).z == pytest.approx(2.327, abs=0.01)
+    assert Quantity("", Estimate(3.0, 1.0), 0.0).z == 3.0
+    assert Quantity("", Estimate(4.0, 3.0), -1.0, 4.0).z == 1.0  # both errors count
+    assert two_sided_p(1.959964) == pytest.approx(0.05, abs=1e-7)
+
+
+def test_quantities_without_error_are_held_to_equality():
+    assert Quantity("", Estimate(0.0, 0.0), 0.0).z == 0.0
+    assert Quantity("", Estimate(1e-12, 0.0), 0.0).z == math.inf
+
+
+def test_a_rounded_reference_is_an_interval():
+    near, far = (Quantity("", Estimate(value, 0.1), 1.0, rounding=0.05) for value in (1.04, 0.75))
+    assert near.z == 0.0
+    assert far.z == pytest.approx(-2.0)
+
+
+def test_means_in_blocks_are_those_of_the_whole():
+    scores = np.random.default_rng(0).random((1000, 2))
+    means = ScoreMeans()
+    for block in np.split(scores, [300, 700]):
+        means.add(block)
+    for i, estimate in enumerate(means.estimates()):
+        assert estimate.value == pytest.approx(scores[:, i].mean(), rel=1e-12)
+        assert estimate.standard_error == pytest.approx(scores[:, i].std(ddof=1) / math.sqrt(1000), rel=1e-9)
+    assert batch_means(scores)[1].standard_error == pytest.approx(means.estimates()[1].standard_error, rel=1e-9)
+
+
+# The numbers that the cases are held to
+
+
+@pytest.mark.parametrize("row", references.SLABS, ids=lambda row: row.text)
+def test_slab_references(row):
+    solved = slab(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
+    assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
+
+
+@pytest.mark.parametrize("row", references.STACKS, ids=lambda row: row.text)
+def test_stack_references(row):
+    solved = stack([(g, albedo, extinction * thickness) for g, albedo, extinction, thickness in row.layers])
+    assert (row.reflected, row.transmitted) == pytest.approx(solved, abs=6e-9)
+
+
+def test_exit_cosine_references():
+    for row, face, fractions in references.EXIT_COSINES:
+        both = exit_cosine_fractions(
+            anisotropy=row.anisotropy,
+            albedo=row.albedo,
+            optical_depth=row.optical_depth,
+            edges=references.EXIT_COSINE_EDGES,
+        )
+        np.testing.assert_allclose(fractions, both[face == "exit_z_high"], atol=6e-9)
+
+
+def test_time_resolved_references():
+    pulse = references.TIME_RESOLVED
+    medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
+    until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in pulse.edges[1:])]
+    np.testing.assert_allclose(pulse.fractions, np.diff(until), atol=2e-8)
+
+
+def test_moment_references():
+    fixed = after_path(5.0, scattering=1.0, anisotropy=0.0)
+    collided = after_collisions(5, extinction=1.0, anisotropy=0.924)
+    assert pytest.approx((fixed.z, fixed.r2), abs=6e-7) == references.AFTER_PATH
+    assert pytest.approx((collided.z, collided.r2, collided.cos_theta), abs=6e-7) == references.AFTER_COLLISIONS
+
+
+def test_references_of_the_rules_that_bias():
+    for threshold, cosine in references.NEAR_AXIS.items():
+        expected = snapped_mean_cosines(5, anisotropy=0.924, axis_threshold=threshold)[5]
+        assert cosine == pytest.approx(expected, abs=6e-9)
+    orders = reflected_by_order(50, anisotropy=0.0, albedo=0.8, nodes=24)
+    everything = slab(anisotropy=0.0, albedo=0.8, optical_depth=math.inf).reflected
+    for cutoff, reflected in references.CUTOFF.items():
+        lost = orders[0.8 ** np.arange(50) < cutoff].sum()
+        assert everything - lost == pytest.approx(reflected, abs=2e-7)
+
+
+def test_fluence_references():
+    shells = references.FLUENCE
+    inside = isotropic_radial_cdf(shells.edges[1:-1], path=shells.path, scattering=1.0)
+    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-shells.absorption * shells.path)
+    np.testing.assert_allclose(shells.fractions, fractions, atol=2e-7)
+
+
+def test_single_scatter_references():
+    lidar = Lidar()
+    for name, (rows, columns, fractions) in references.SINGLE_SCATTER.items():
+        if name == "whole field":
+            expected = single_scatter_total(lidar)
+        else:
+            where = {"rows": np.r_[rows], "columns": np.r_[columns]}
+            expected = single_scatter(lidar, **where, order=32).sum(axis=(0, 1))
+        np.testing.assert_allclose(fractions, expected, rtol=5e-5, atol=1e-20)
+
+
+def test_lambertian_references():
+    lidar = Lidar(laser_position=(0.1, -0.05, 0.0), half_angle=math.radians(10.0))
+    image = lambertian_plane(lidar, depth=5.0, reflectance=0.5)
+    for rows, columns, fraction in references.LAMBERTIAN.values():
+        assert fraction == pytest.approx(image[rows, columns].sum(), rel=1e-7)
+
+
+def test_fournier_forand_references():
+    """The mean of 1 − cosθ is the integral of what lies above it."""
+    law = {"particle_index": 1.10, "junge_slope": 3.5835}
+    edges = np.concatenate([[1e-15], np.geomspace(1e-9, 2.0, 400)])
+    node, weight = np.polynomial.legendre.leggauss(8)
+    t = 0.5 * (edges[1:] + edges[:-1])[:, None] + 0.5 * np.diff(edges)[:, None] * node
+    mean_cosine = 1 - 0.5 * (np.diff(edges) * ((1 - fournier_forand.cumulative(t, **law)) @ weight)).sum()
+    narrow = 2 * math.sin(math.radians(references.FOURNIER_FORAND_ANGLE) / 2) ** 2
+    fractions = [1 - fournier_forand.cumulative(1.0, **law), fournier_forand.cumulative(narrow, **law)]
+    after = after_collisions(5, extinction=1.0, anisotropy=mean_cosine)
+    expected = [*fractions, mean_cosine, after.cos_theta, after.z, after.r2]
+    np.testing.assert_allclose(references.FOURNIER_FORAND, expected, atol=6e-9)
+    lidar = Lidar(phase_function=lambda cosine: fournier_forand.density(1 - cosine, **law))
+    np.testing.assert_allclose(references.FOURNIER_FORAND_SINGLE_SCATTER, single_scatter_total(lidar), rtol=5e-5)
+
+
+# The cases
+
+
+@pytest.fixture(scope="module")
+def results():
+    """A short run of all cases but the two that trace most."""
+    return validate(
+        [name for name in CASES if name not in ("ledger", "mean-path")], photons=10_000, seed=3, device="cpu"
+    )
+
+
+def test_engine_agrees_with_every_reference(results):
+    failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
+    assert not failed
+    assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path"}
+
+
+def test_deviations_are_standard_normal(results):
+    """Too small an error would make them wide, too large a one narrow."""
+    z = np.array([r.z for r in results if r.standard_error > 0])
+    assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
+
+
+def test_a_table_of_henyey_greenstein_passes_as_well():
+    cases = ["slab", "near-axis", "single-scatter", "layers"]
+    assert all(r.passed for r in validate(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
+
+
+def test_ledger_and_closed_walls():
+    assert all(r.passed for r in validate(["ledger", "mean-path"], photons=1000, seed=4, device="cpu"))
+
+
+def test_wrong_physics_fails(monkeypatch):
+    """One reference off by five per cent among right ones."""
+    row = references.SLABS[0]
+    wrong = (row._replace(transmitted=row.transmitted * 1.05), *references.SLABS[1:3])
+    monkeypatch.setattr(references, "SLABS", wrong)
+    verdicts = {r.quantity: r.passed for r in validate(["slab"], photons=20_000, seed=5, device="cpu")}
+    assert [name for name, passed in verdicts.items() if not passed] == [f"T, {row.text}"]
+
+
+def test_one_seed_gives_one_result():
+    one, again, other = (validate(["moments"], photons=1000, seed=seed, device="cpu") for seed in (6, 6, 7))
+    assert one == again
+    assert all(a.value != b.value for a, b in zip(one, other, strict=True))
+
+
+def test_reports(results, tmp_path):
+    write_json(results, tmp_path / "report.json", photons=10_000, seed=3)
+    report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert report["passed"] is True and len(report["results"]) == len(results)
+    some = list(itertools.islice((r for r in results if r.name in ("slab", "moments")), 20))
+    for path in plot_results(some, tmp_path / "plots"):
+        assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"cases": ["slabs"]}, "'slabs' is not one of slab, "),
+        ({"photons": 10}, "photons = 10 is outside"),
+        ({"seed": -1}, "seed = -1 is outside"),
+    ],
+)
+def test_errors_name_the_argument(arguments, text):
+    with pytest.raises(ConfigError, match=text.replace("[", r"\[")):
+        validate(**arguments)

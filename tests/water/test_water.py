@@ -1,0 +1,240 @@
+"""Water over wavelength, temperature, salinity and chlorophyll: published values, and the scenes that use them."""
+
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.scenes import scene as make_scene
+from spadwarp import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
+from spadwarp.scene import Medium, Scene
+from spadwarp.scene.presets import WATER_INDICES
+
+TABLES = {
+    "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01},
+    "gate": {"bin_width_ps": 100.0, "bins": 500},
+}
+
+
+def scene(medium, wavelength_nm=532.0):
+    return Scene.from_dict({**TABLES, "medium": medium, "laser": {"wavelength_nm": wavelength_nm}})
+
+
+@pytest.mark.parametrize(("name", "salinity"), [("seawater", 35.0), ("fresh", 0.0)])
+def test_quan_and_fry_give_the_indices_in_use_at_532_nm(name, salinity):
+    phase, group = WATER_INDICES[name]
+    assert refractive_index(532.0, temperature=20.0, salinity=salinity) == pytest.approx(phase, abs=5e-5)
+    assert group_index(532.0, temperature=20.0, salinity=salinity) == pytest.approx(group, abs=5e-5)
+
+
+def test_the_group_index_is_the_index_less_wavelength_times_slope():
+    wavelength = np.array([405.0, 450.0, 532.0, 660.0])
+    water = {"temperature": 7.0, "salinity": 30.0}
+    step = 1e-3
+    slope = (refractive_index(wavelength + step, **water) - refractive_index(wavelength - step, **water)) / (2 * step)
+    np.testing.assert_allclose(
+        group_index(wavelength, **water), refractive_index(wavelength, **water) - wavelength * slope, atol=1e-9
+    )
+
+
+# Pope & Fry 1997.
+@pytest.mark.parametrize(
+    ("wavelength", "absorption"),
+    [(400, 0.00663), (417.5, 0.00442), (450, 0.00922), (500, 0.0204), (532.5, 0.0447), (600, 0.2224), (700, 0.624)],
+)
+def test_absorption_of_pure_water_as_published(wavelength, absorption):
+    assert pure_water_absorption(wavelength) == absorption
+
+
+def test_the_absorption_minimum_is_where_pope_and_fry_found_it():
+    """0.0044 ± 0.0006 1/m at 418 nm (their abstract)."""
+    wavelength = np.linspace(400.0, 700.0, 3001)
+    absorption = pure_water_absorption(wavelength)
+    assert wavelength[absorption.argmin()] == pytest.approx(418.0, abs=1.0)
+    assert absorption.min() == pytest.approx(0.0044, abs=5e-5)
+
+
+def test_scattering_of_pure_seawater_is_that_of_zhang_hu_and_he():
+    """Their own program at 18 °C and a salinity of 37, as other ports of it reproduce it."""
+    published = [0.00668, 0.00403, 0.00258, 0.00173, 0.00120, 0.00086, 0.00063]
+    computed = pure_water_scattering(np.arange(400.0, 701.0, 50.0), temperature=18.0, salinity=37.0)
+    np.testing.assert_allclose(computed, published, atol=5.1e-6)
+
+
+def test_sea_salt_adds_about_30_percent_of_scattering():
+    """Morel 1974: 1.3 times at a salinity of 35 to 39."""
+    wavelength = np.array([400.0, 532.0, 700.0])
+    ratio = pure_water_scattering(wavelength, salinity=37.0) / pure_water_scattering(wavelength, salinity=0.0)
+    np.testing.assert_allclose(ratio, 1.30, atol=0.04)
+
+
+# Bricaud et al. 1998: a_p(440) = 0.0520 C^0.635; Morel & Maritorena 2001: b_p(550) = 0.416 C^0.766.
+@pytest.mark.parametrize("chlorophyll", [0.03, 0.3, 1.0, 5.0])
+def test_chlorophyll_adds_what_was_published(chlorophyll):
+    blue, green = water_optics(440.0, chlorophyll=chlorophyll), water_optics(550.0, chlorophyll=chlorophyll)
+    particles = 0.0520 * chlorophyll**0.635
+    assert blue.absorption - blue.water_absorption == pytest.approx(1.2 * particles, rel=1e-3)
+    assert green.scattering - green.water_scattering == pytest.approx(0.416 * chlorophyll**0.766)
+    red = water_optics(676.0, chlorophyll=chlorophyll)
+    dissolved = 0.2 * particles * math.exp(-0.014 * (676.0 - 440.0))
+    assert red.absorption - red.water_absorption == pytest.approx(0.0203 * chlorophyll**0.8223 + dissolved, rel=1e-3)
+
+
+def test_particles_scatter_blue_light_more_in_clear_water_only():
+    def slope(chlorophyll):
+        blue, red = (water_optics(at, chlorophyll=chlorophyll) for at in (450.0, 650.0))
+        of_particles = (blue.scattering - blue.water_scattering) / (red.scattering - red.water_scattering)
+        return math.log(of_particles) / math.log(450.0 / 650.0)
+
+    assert slope(0.02) == pytest.approx(-1.0, abs=1e-3)
+    assert slope(0.2) == pytest.approx(0.5 * (math.log10(0.2) - 0.3))
+    assert slope(4.0) == 0.0
+
+
+def test_without_chlorophyll_the_water_is_pure():
+    optics = water_optics(532.0)
+    assert (optics.absorption, optics.scattering) == (optics.water_absorption, optics.water_scattering)
+    assert 0.0 < optics.albedo < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"wavelength_nm": 399.0}, "wavelength_nm = 399.0 is outside [400, 700]"),
+        ({"wavelength_nm": math.nan}, "wavelength_nm = nan"),
+        ({"wavelength_nm": 532.0, "chlorophyll": -1.0}, "chlorophyll = -1.0 is outside [0, 30]"),
+        ({"wavelength_nm": 532.0, "temperature": 31.0}, "temperature = 31.0 is outside [0, 30]"),
+        ({"wavelength_nm": 532.0, "salinity": 41.0}, "salinity = 41.0 is outside [0, 40]"),
+    ],
+)
+def test_values_outside_the_fits_are_refused(arguments, text):
+    with pytest.raises(ValueError) as caught:
+        water_optics(**arguments)
+    assert text in str(caught.value)
+
+
+def test_a_scene_s_water_follows_its_laser():
+    blue = scene({"chlorophyll": 0.5, "temperature": 10.0}, 450.0)
+    optics = water_optics(450.0, chlorophyll=0.5, temperature=10.0)
+    for name in ("absorption", "scattering", "extinction", "albedo", "phase_index", "group_index"):
+        assert getattr(blue.medium, name) == getattr(optics, name), name
+    green = blue.with_overrides({"laser.wavelength_nm": 532.0})
+    assert green.medium.absorption == water_optics(532.0, chlorophyll=0.5).absorption
+    assert green.medium == Medium(chlorophyll=0.5, temperature=10.0)
+    assert blue.medium.given == ()
+
+
+@pytest.mark.parametrize(
+    "medium",
+    [
+        {"chlorophyll": 0.5},
+        {"chlorophyll": 0.5, "group_index": 1.36, "salinity": 20.0},
+        {"preset": "uwoc-clear", "temperature": 5.0},
+        {"extinction": 0.3, "albedo": 0.8, "salinity": 0.0},
+    ],
+)
+def test_water_survives_the_way_through_toml(medium, tmp_path):
+    one = scene(medium, 480.0)
+    path = tmp_path / "scene.toml"
+    path.write_text(one.to_toml())
+    again = spadwarp.load_scene(path)
+    assert again == one and hash(again) == hash(one)
+    # Still follows the laser.
+    assert again.with_overrides({"laser.wavelength_nm": 532.0}) == scene(medium)
+
+
+def test_temperature_and_salinity_replace_a_preset_s_indices():
+    plain, cold = scene({"preset": "uwoc-clear"}), scene({"preset": "uwoc-clear", "temperature": 0.0})
+    assert plain.medium.group_index == 1.3638
+    assert cold.medium.group_index == group_index(532.0, temperature=0.0)
+    assert (cold.medium.absorption, cold.medium.preset) == (plain.medium.absorption, "uwoc-clear")
+    assert plain.with_overrides({"medium.salinity": 0.0}).medium.group_index == group_index(532.0, salinity=0.0)
+    assert cold.with_overrides({"medium.group_index": 1.36}).medium.group_index == 1.36
+
+
+def test_chlorophyll_and_coefficients_displace_each_other():
+    green = scene({"preset": "uwoc-clear"}).with_overrides({"medium.chlorophyll": 1.0}).medium
+    assert (green.preset, green.absorption) == (None, water_optics(532.0, chlorophyll=1.0).absorption)
+    clear = scene({"chlorophyll": 1.0}).with_overrides({"medium.preset": "uwoc-clear"}).medium
+    assert (clear.chlorophyll, clear.absorption) == (None, 0.069)
+    given = scene({"chlorophyll": 1.0}).with_overrides({"medium": {"absorption": 0.1, "scattering": 0.2}}).medium
+    assert (given.chlorophyll, given.extinction) == (None, pytest.approx(0.3))
+
+
+@pytest.mark.parametrize(
+    ("medium", "wavelength", "text"),
+    [
+        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 goes without preset"),
+        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 goes without absorption"),
+        ({"chlorophyll": 31.0}, 532.0, "medium.chlorophyll = 31.0 is outside [0, 30]"),
+        ({"chlorophyll": 0.5}, 850.0, "laser.wavelength_nm = 850.0 is outside [400, 700]"),
+    ],
+)
+def test_what_cannot_be_is_said(medium, wavelength, text):
+    with pytest.raises(spadwarp.ConfigError) as caught:
+        scene(medium, wavelength)
+    assert str(caught.value).startswith(text)
+
+
+def findings(one, field):
+    return {message.level: message for message in spadwarp.check(one) if message.field == field}
+
+
+def test_a_preset_at_another_wavelength_is_warned_about():
+    blue = scene({"preset": "uwoc-clear"}, 450.0)
+    assert findings(blue, "medium.preset")["warning"].values["pure_water"] == pytest.approx(0.00922)
+    index = findings(blue, "medium.group_index")["warning"].values
+    assert index["group_index"] == group_index(450.0)
+    # A gate of 50 ns ends at 5.5 m.
+    assert index["error"] == pytest.approx(5.4956 * (group_index(450.0) / 1.3638 - 1.0), rel=1e-4)
+    assert not findings(scene({"preset": "uwoc-clear"}), "medium.preset")
+    assert not findings(scene({"preset": "uwoc-clear", "temperature": 20.0}, 450.0), "medium.group_index")
+    # Beyond the tables it is said without their numbers.
+    assert "850 nm" in findings(scene({"preset": "uwoc-clear"}, 850.0), "medium.preset")["warning"].text
+
+
+@pytest.mark.parametrize("law", [{"anisotropy": 0.924}, {"phase_function": "fournier_forand"}])
+@pytest.mark.parametrize("chlorophyll", [0.05, 0.5])
+def test_the_water_s_own_scattering_is_in_the_phase_function(chlorophyll, law):
+    medium = Medium(chlorophyll=chlorophyll, **law)
+    optics = water_optics(532.0, chlorophyll=chlorophyll)
+    share = optics.water_scattering / optics.scattering
+    particles = spadwarp.phase_function(Medium(extinction=1.0, albedo=0.5, **law))
+    both = spadwarp.phase_function(medium)
+    angles = np.radians([1.0, 45.0, 90.0, 135.0, 180.0])
+    # 3/(4 pi) (1 + delta + (1 - delta) cos^2)/(4 + 2 delta): at 90 degrees 0.0608, at 180 degrees 0.1171 per steradian.
+    molecules = 3.0 / (4.0 * np.pi) * (1.039 + 0.961 * np.cos(angles) ** 2) / 4.078
+    assert molecules[[2, 4]] == pytest.approx([0.0608, 0.1171], abs=5e-5)
+    expected = share * molecules + (1.0 - share) * particles.density(angles)
+    np.testing.assert_allclose(both.density(angles), expected, rtol=1e-9)
+    assert both.mean_cosine == pytest.approx((1.0 - share) * particles.mean_cosine, rel=1e-4)
+    backward = share * 0.5 + (1.0 - share) * particles.backscatter_fraction
+    assert both.backscatter_fraction == pytest.approx(backward, rel=1e-4)
+
+
+def test_estimators_agree_in_water_that_scatters_by_itself():
+    totals = {}
+    for estimator in ("next_event", "guided"):
+        one = make_scene(
+            medium={"extinction": None, "albedo": None, "chlorophyll": 0.05},
+            transport={"estimator": estimator},
+        )
+        runs = [
+            spadwarp.simulate(one, photons=40_000, seed=seed, device="cpu").component("backscatter").sum()
+            for seed in range(8)
+        ]
+        totals[estimator] = np.mean(runs), np.std(runs, ddof=1) / math.sqrt(8)
+    (mean, error), (other, other_error) = totals.values()
+    assert mean == pytest.approx(other, abs=4.0 * math.hypot(error, other_error))
+    assert other_error < 0.02 * other
+
+
+def test_what_layers_leave_out_is_told():
+    layers = {"chlorophyll": 0.05, "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "chlorophyll": 0.5}]}
+    told = [message for message in spadwarp.check(scene(layers)) if message.field.endswith("chlorophyll")]
+    assert [message.field for message in told] == ["medium.chlorophyll", "medium.layers[1].chlorophyll"]
+    assert told[0].values["missing"] == pytest.approx(0.7655, abs=0.002)
+    assert told[1].values["missing"] == pytest.approx(0.363, abs=0.002)
+    assert scene(layers).medium.molecular_share == 0.0
+    assert not [m for m in spadwarp.check(scene({"chlorophyll": 0.05})) if m.field.endswith("chlorophyll")]
