@@ -54,7 +54,7 @@ def export(
     ptu  PicoQuant T3 image, one record a detection
     exr  images: depth, intensity, truth; one file a frame
 
-    mat and ptu are for counts (`spadwarp detect`) and need spadwarp[formats].
+    mat and ptu are for counts (`spadwarp detect`); ptu needs spadwarp[formats].
 
     \b
     Examples:

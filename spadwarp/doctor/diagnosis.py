@@ -21,10 +21,13 @@ from spadwarp.scene import Scene
 
 __all__ = ["Diagnosis", "SelfTest", "doctor"]
 
-NEEDED = ("warp-lang", "numpy", "trimesh", "OpenEXR", "pydantic", "typer", "rich", "h5py", "matplotlib", "manifold3d")
+NEEDED = (
+    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py",
+    "matplotlib",
+)  # fmt: skip
 
 # Package → extra that brings it.
-OPTIONAL = {"torch": "torch", "ray": "ray", "scipy": "formats", "ptufile": "formats", "plotly": "view"}
+OPTIONAL = {"torch": "torch", "ray": "ray", "ptufile": "formats", "plotly": "view"}
 
 _OLDEST_CUDA = 13000  # of the driver: what Warp's build asks for, R580
 _LARGEST_Z = 4.5  # a right simulator fails once in 150 000 times

@@ -198,7 +198,7 @@ def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np
         zero = float(weights @ (np.arange(weights.size) + 0.5))
         lower, upper = -zero, weights.size - zero
         knots = np.arange(weights.size + 1) - zero
-        curve = _MonotoneCubic(knots, np.concatenate([[0.0], np.cumsum(weights)]))
+        curve = _monotone_cubic(knots, np.concatenate([[0.0], np.cumsum(weights)]))
 
         def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
             return curve(np.clip(x, lower, upper))
@@ -219,18 +219,11 @@ def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
     return weights / weights.sum()
 
 
-class _MonotoneCubic:
+def _monotone_cubic(x: NDArray[np.floating], y: NDArray[np.floating]) -> Any:
     """Cubic Hermite curve through increasing data that stays increasing (Fritsch and Butland 1984)."""
+    from scipy.interpolate import CubicHermiteSpline
 
-    def __init__(self, x: NDArray[np.floating], y: NDArray[np.floating]):
-        rise = np.diff(y) / np.diff(x)
-        both = rise[:-1] * rise[1:]
-        inner = np.divide(2.0 * both, rise[:-1] + rise[1:], out=np.zeros_like(both), where=both > 0)
-        self.x, self.y, self.slope = x, y, np.concatenate([[0.0], inner, [0.0]])
-
-    def __call__(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        i = np.clip(np.searchsorted(self.x, at, side="right") - 1, 0, self.x.size - 2)
-        width = self.x[i + 1] - self.x[i]
-        t = (at - self.x[i]) / width
-        y0, y1, m0, m1 = self.y[i], self.y[i + 1], self.slope[i] * width, self.slope[i + 1] * width
-        return y0 + t * (m0 + t * (3 * (y1 - y0) - 2 * m0 - m1 + t * (2 * (y0 - y1) + m0 + m1)))
+    rise = np.diff(y) / np.diff(x)
+    both = rise[:-1] * rise[1:]
+    inner = np.divide(2.0 * both, rise[:-1] + rise[1:], out=np.zeros_like(both), where=both > 0)
+    return CubicHermiteSpline(x, y, np.concatenate([[0.0], inner, [0.0]]))

@@ -6,7 +6,6 @@ are the columns of R sees the world's point X at Rᵀ(X − position); R = Rx·R
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,22 +21,16 @@ Vector = tuple[float, float, float]
 
 def rotation_matrix(rotation_deg: ArrayLike) -> NDArray[np.float64]:
     """Rx·Ry·Rz `[3, 3]`: turns about x, then about the turned y, then about the twice turned z [°]."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_x @ about_y @ about_z
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("XYZ", np.asarray(rotation_deg, np.float64), degrees=True).as_matrix()
 
 
 def rotation_angles(matrix: ArrayLike) -> Vector:
     """`rotation_deg` [°] of a rotation matrix: `rotation_matrix` undone, with 0 for the last turn where ry is ±90°."""
-    m = np.asarray(matrix, np.float64)
-    y = math.asin(min(max(m[0, 2], -1.0), 1.0))
-    if abs(m[0, 2]) < 1.0 - 1e-12:
-        x, z = math.atan2(-m[1, 2], m[2, 2]), math.atan2(-m[0, 1], m[0, 0])
-    else:
-        x, z = math.atan2(m[2, 1], m[1, 1]), 0.0
-    return math.degrees(x), math.degrees(y), math.degrees(z)
+    from scipy.spatial.transform import Rotation
+
+    return _vector(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True, suppress_warnings=True))
 
 
 def to_camera(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
@@ -66,16 +59,15 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     Raises:
         ValueError: Another number of values, or a matrix that is no rotation.
     """
+    from scipy.spatial.transform import Rotation
+
     turn, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
     if turn.shape != (3, 3):
         turn = turn.ravel()
     if turn.shape not in ((3,), (3, 3)) or shift.shape != (3,):
         raise ValueError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
     if turn.shape == (3,):
-        angle = float(np.linalg.norm(turn))
-        x, y, z = turn / angle if angle > 0 else turn
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        matrix = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+        matrix = Rotation.from_rotvec(turn).as_matrix()
     else:
         matrix = turn
         if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):

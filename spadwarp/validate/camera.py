@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.scene.pose import rotation_angles
 from spadwarp.validate import references as known
 from spadwarp.validate.runs import Case, Run, point_source, scene
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means
@@ -115,7 +116,7 @@ def _reciprocity(run: Run) -> list[Quantity]:
         block = {
             "builtin": "box",
             "size": [0.7, 0.5, 0.6],
-            "rotation_deg": _intrinsic_angles(turned),
+            "rotation_deg": rotation_angles(turned),
             "translation": placement.tolist(),
         }
         tables = scene(
@@ -190,17 +191,6 @@ def _turn_onto_z(direction: NDArray) -> NDArray:
     right = np.cross([0.0, 1.0, 0.0], direction)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(direction, right), direction])
-
-
-def _intrinsic_angles(rotation: NDArray) -> list[float]:
-    """Angles [°] about x, y, z of a rotation Rx·Ry·Rz."""
-    return np.degrees(
-        [
-            math.atan2(-rotation[1, 2], rotation[2, 2]),
-            math.asin(np.clip(rotation[0, 2], -1.0, 1.0)),
-            math.atan2(-rotation[0, 1], rotation[0, 0]),
-        ]
-    ).tolist()
 
 
 def _disc_weights(half_angle: float, pixels: int, inner: int = 16) -> NDArray[np.float64]:
