@@ -7,9 +7,9 @@ mkdocstrings shows.
 
 from __future__ import annotations
 
-import ast
 import inspect
 import math
+import pkgutil
 import types
 from collections.abc import Iterator, Mapping
 from importlib import import_module
@@ -313,26 +313,21 @@ def python() -> str:
 
 
 def kernels() -> str:
-    """The names of `spadwarp_kernels.__all__`, by module."""
+    """The public names of `spadwarp_kernels`, by room."""
     import spadwarp_kernels
 
-    home = {}
-    for path in sorted(Path(spadwarp_kernels.__file__ or "").parent.glob("[a-z]*.py")):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-            for name in (getattr(node, "name", None), *(getattr(one, "id", None) for one in targets)):
-                home[name] = path.stem
-    homes: dict[str, list[str]] = {}
-    for name in sorted(spadwarp_kernels.__all__):
-        homes.setdefault(home[name], []).append(name)
+    rooms = [one.name for one in pkgutil.iter_modules(spadwarp_kernels.__path__) if one.ispkg]
     parts = [
         MADE
         + "# Kernel library\n\n`import spadwarp_kernels as sk`; what it is for: [README](../../kernels/README.md). "
-        "Warp functions (`wp.func`) go into kernels of your own; structs and the other functions are for Python."
+        "Warp functions (`wp.func`) go into kernels of your own; structs and the other functions are for Python. "
+        "Names of `sk.__all__` stand at the top too."
     ]
-    for module, names in sorted(homes.items()):
-        parts.append(f"## {module.replace('_', ' ').capitalize()}")
-        parts += [f"::: spadwarp_kernels.{module}.{name}" for name in names]
+    for room in sorted(rooms):
+        package = import_module(f"spadwarp_kernels.{room}")
+        parts.append(f"## {room.capitalize()}\n\n{package.__doc__}")
+        parts += [f"::: spadwarp_kernels.{room}.{name}" for name in package.__all__]
+    parts.append("## Ray cast\n\n::: spadwarp_kernels.ray_cast.truth_kernel")
     return "\n\n".join(parts) + "\n"
 
 

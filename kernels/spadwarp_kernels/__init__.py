@@ -1,24 +1,88 @@
 """Warp functions and kernels for photon transport, SPAD detection and depth; needs warp and numpy only.
 
 Functions marked `wp.func` go into the caller's own kernels; `launch_transport` walks photons against the caller's own
-`wp.Mesh`.
+`wp.Mesh`. A folder for each topic; what is not listed here is in its folder's `__all__`.
 """
 
-from .analytic import sample_frames
-from .analytic_budget import BACKSCATTER_SOURCES, Lidar, signal_map, single_scatter_table
-from .batches import Batches
-from .camera import Camera, lens_point, pixel_direction, project, project_calibrated
-from .cramer_rao import COUNT_LAWS, statistics_maps
-from .depth import arrival_bins
-from .detector import dark_count_rates, event_counts, expected_detections, first_photon_counts
-from .direction import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
-from .domain import Limits, exit_distance
-from .gate import C0, Gate, gate_bin
-from .guided import Guiding, PhaseGuide
-from .laser import LASER_PROFILES, Laser, Scan, emit_photon, profile_tables
-from .launch import (
+from .analytic import (
+    BACKSCATTER_SOURCES,
+    COUNT_LAWS,
+    Lidar,
+    sample_frames,
+    signal_map,
+    single_scatter_table,
+    statistics_maps,
+)
+from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
+from .estimators import COMPONENTS, next_event_value
+from .math import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
+from .medium import (
+    Layers,
+    Limits,
+    Medium,
+    exit_distance,
+    free_path,
+    layer_index,
+    layered_extinction,
+    layered_free_path,
+    layered_water,
+)
+from .phase import (
+    HENYEY_GREENSTEIN,
+    TABULATED,
+    Guiding,
+    PhaseFunction,
+    PhaseGuide,
+    fournier_forand_density,
+    henyey_greenstein_density,
+    henyey_greenstein_pdf,
+    interpolated_density,
+    make_phase_tables,
+    sample_henyey_greenstein,
+    sphere_integral,
+    two_term_henyey_greenstein_density,
+)
+from .random import philox4x32, random_block, u01, u01_fine
+from .ray_cast import truth_kernel
+from .sensor import (
+    C0,
+    CALIBRATED,
+    PINHOLE,
+    Camera,
+    Gate,
+    Lens,
+    gate_bin,
+    lens_point,
+    near_depth_map,
+    pixel_direction,
+    project,
+    project_calibrated,
+)
+from .source import LASER_PROFILES, Laser, Scan, emit_photon, profile_tables
+from .surface import (
+    SurfaceHit,
+    Surfaces,
+    Textures,
+    ggx_brdf,
+    ggx_normals,
+    ggx_pdf,
+    intersect_mesh,
+    intersect_surfaces,
+    lambert_brdf,
+    offset_from_surface,
+    reflectance_at,
+    sample_ggx,
+    segment_meets_box,
+    unshadowed,
+)
+from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, to_fixed_point
+from .transport import (
+    ESTIMATORS,
+    FEW_FACES,
     Data,
     Model,
+    Records,
+    TransportSpec,
     launch_transport,
     load_transport_kernel,
     make_data,
@@ -26,50 +90,12 @@ from .launch import (
     make_records,
     make_surfaces,
     make_textures,
+    make_transport_kernel,
     read_ledger,
     surface_choices,
 )
-from .layers import Layers, layer_index, layered_extinction, layered_free_path, layered_water
-from .lens import CALIBRATED, PINHOLE, Lens
-from .medium import Medium, free_path
-from .microfacet import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
-from .phase import (
-    HENYEY_GREENSTEIN,
-    PhaseFunction,
-    henyey_greenstein_pdf,
-    sample_henyey_greenstein,
-)
-from .phase_densities import (
-    fournier_forand_density,
-    henyey_greenstein_density,
-    interpolated_density,
-    sphere_integral,
-    two_term_henyey_greenstein_density,
-)
-from .philox import philox4x32, random_block, u01, u01_fine
-from .score import COMPONENTS, next_event_value
-from .shadow import near_depth_map
-from .surface import (
-    SurfaceHit,
-    Surfaces,
-    Textures,
-    intersect_mesh,
-    intersect_surfaces,
-    lambert_brdf,
-    offset_from_surface,
-    reflectance_at,
-    segment_meets_box,
-)
-from .tabulated import TABULATED, make_phase_tables
-from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, to_fixed_point
-from .transport import (
-    ESTIMATORS,
-    FEW_FACES,
-    Records,
-    TransportSpec,
-    make_transport_kernel,
-)
-from .truth import truth_kernel
+
+__version__ = "0.1.0"
 
 __all__ = [
     "BACKSCATTER_SOURCES",

@@ -272,7 +272,7 @@ def _pulses_needed(
 
     from spadwarp.analytic.model import response_sigma
     from spadwarp.transport.model import pick_device
-    from spadwarp_kernels.cramer_rao import outlier_probabilities
+    from spadwarp_kernels.analytic import outlier_probabilities
 
     target = pick_device(device)
     chosen = scene.analytic

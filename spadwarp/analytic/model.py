@@ -244,8 +244,7 @@ def pixel_maps(
     import warp as wp
 
     from spadwarp.transport.model import pick_device
-    from spadwarp_kernels import analytic_budget as budget
-    from spadwarp_kernels import cramer_rao
+    from spadwarp_kernels import analytic as kernels
 
     device = pick_device(device)
     start, stop = gate or (scene.gate.start, scene.gate.stop)
@@ -262,12 +261,12 @@ def pixel_maps(
     normal_d = on_device(np.asarray(normal, np.float64), wp.vec3d)
     reflectance_d = on_device(np.asarray(reflectance, np.float64), wp.float64)
     phase_d = on_device(_phase_table(scene), wp.float64)
-    signal_d, arrival_d = budget.signal_map(lidar, view_d, distance_d, normal_d, reflectance_d)
+    signal_d, arrival_d = kernels.signal_map(lidar, view_d, distance_d, normal_d, reflectance_d)
 
     profile = np.zeros((1, 1), np.float32)
     speed = SPEED_OF_LIGHT / scene.medium.group_index
     if chosen.backscatter == "single_scatter":
-        paths_d, cumulative_d, total_d = budget.single_scatter_table(lidar, phase_d, view_d, distance_d)
+        paths_d, cumulative_d, total_d = kernels.single_scatter_table(lidar, phase_d, view_d, distance_d)
         paths, cumulative = paths_d.numpy(), cumulative_d.numpy()
     elif chosen.backscatter == "monte_carlo":
         if backscatter_profile is None:
@@ -284,7 +283,7 @@ def pixel_maps(
         cumulative = np.array([[0.0, 1.0]], np.float32)
 
     per_frame = chosen.exposure * scene.laser.repetition_rate
-    statistics = cramer_rao.statistics_maps(
+    statistics = kernels.statistics_maps(
         lidar,
         phase_d,
         on_device(profile, wp.float32),
@@ -353,8 +352,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     """The kernels' picture of a scene; raises `ConfigError` for what the model does not cover."""
     import warp as wp
 
-    from spadwarp_kernels.analytic_budget import BACKSCATTER_SOURCES, Lidar
-    from spadwarp_kernels.laser import LASER_PROFILES
+    from spadwarp_kernels import BACKSCATTER_SOURCES, LASER_PROFILES, Lidar
 
     laser, camera, chosen = scene.beam, scene.camera, scene.analytic
     problems = []

@@ -185,7 +185,7 @@ def _draw_frames(
     import warp as wp
 
     from spadwarp.device import pick_device
-    from spadwarp_kernels.frames import FrameCoding, draw_frames
+    from spadwarp_kernels.analytic import FrameCoding, draw_frames
 
     on = pick_device(device)
     shape, view = truth.depth.shape, pixel_directions(scene.camera).reshape(-1, 3)

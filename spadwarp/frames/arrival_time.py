@@ -53,7 +53,7 @@ def arrival_time(
     """
     import warp as wp
 
-    from spadwarp_kernels import depth as kernels
+    from spadwarp_kernels import detection as kernels
 
     if method not in METHODS:
         raise ValueError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
@@ -146,7 +146,7 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
 
 def _background_rows(background: Any, rows: Any, frame: tuple[int, ...], wp: Any) -> Any:
     """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
-    from spadwarp_kernels.depth import first_invalid_row
+    from spadwarp_kernels.detection import first_invalid_row
 
     if background is None:
         return None

@@ -53,7 +53,7 @@ def crlb_from_histogram(
     import warp as wp
 
     from spadwarp.transport.model import pick_device
-    from spadwarp_kernels import cramer_rao
+    from spadwarp_kernels import analytic as kernels
 
     signal = np.ascontiguousarray(signal_cube, np.float32)
     background = np.asarray(background_cube, np.float32)
@@ -71,7 +71,7 @@ def crlb_from_histogram(
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
     rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
-    information = cramer_rao.histogram_information(
+    information = kernels.histogram_information(
         wp.array(signal.reshape(-1, bins), dtype=wp.float32, device=device),
         wp.array(np.ascontiguousarray(rows), dtype=wp.float32, device=device),
         wp.array(taps, dtype=wp.float64, device=device),

@@ -189,7 +189,7 @@ def detect(
     """
     import warp as wp
 
-    from spadwarp_kernels import detector as kernels
+    from spadwarp_kernels import detection as kernels
 
     scene = getattr(source, "scene", None)
     if scene is not None:
@@ -339,7 +339,7 @@ def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np
     """
     import warp as wp
 
-    from spadwarp_kernels import detector as kernels
+    from spadwarp_kernels import detection as kernels
 
     with in_torch_order(hazard):
         rows, shape = _rows(hazard, "hazard", device, dimensions=None)
@@ -361,7 +361,7 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
     """
     import warp as wp
 
-    from spadwarp_kernels import detector as kernels
+    from spadwarp_kernels import detection as kernels
 
     with in_torch_order(counts):
         rows, shape = _rows(counts, "counts", device, dimensions=None)
@@ -394,7 +394,7 @@ def _check_numbers(**numbers: int) -> None:
 def _rows(array: Any, name: str, device: Any, *, dimensions: int | None = 3) -> tuple[Any, tuple[int, ...]]:
     """Warp rows `[pixel, bin]` of a cube and the cube's shape; finite and not negative."""
     from spadwarp.frames.arrival_time import as_warp
-    from spadwarp_kernels.depth import first_invalid_row
+    from spadwarp_kernels.detection import first_invalid_row
 
     cube = as_warp(array, name=name, device=device)
     shape = tuple(int(n) for n in cube.shape)

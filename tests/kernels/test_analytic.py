@@ -11,9 +11,7 @@ from helpers.statistics_of_samples import DEVICES
 from reference import crlb
 from reference.single_scatter import Lidar as ReferenceLidar
 from reference.single_scatter import single_scatter
-from spadwarp_kernels import analytic as sampling
-from spadwarp_kernels import analytic_budget as budget
-from spadwarp_kernels import cramer_rao
+from spadwarp_kernels import analytic
 
 C0 = 299_792_458.0
 AXIS = [0.0, 0.0, 1.0]
@@ -46,7 +44,7 @@ def lidar(**changes):
         "nearest": 0.05,
         "bin_width": 1e-10,
     }
-    struct = budget.Lidar()
+    struct = analytic.Lidar()
     for name, value in {**fields, **changes}.items():
         setattr(struct, name, wp.vec3d(*value) if name in ("laser", "axis") else value)
     return struct
@@ -59,7 +57,7 @@ def signals(one, points, normals, reflectance=0.5, device="cpu"):
     arrays = [points / distance[:, None], distance, np.asarray(normals, float), np.full(len(points), reflectance)]
     kinds = [wp.vec3d, wp.float64, wp.vec3d, wp.float64]
     inputs = [wp.array(array, dtype=kind, device=device) for array, kind in zip(arrays, kinds, strict=True)]
-    return [out.numpy() for out in budget.signal_map(one, *inputs)]
+    return [out.numpy() for out in analytic.signal_map(one, *inputs)]
 
 
 def statistics(one, signal, arrival, *, count_law="per_pulse", acquisitions=1000.0, pulses_per_frame=1.0, device="cpu"):
@@ -69,7 +67,7 @@ def statistics(one, signal, arrival, *, count_law="per_pulse", acquisitions=1000
     kinds = {"dtype": wp.float64, "device": device}
     alpha, fisher, sigma_star, _, outlier = [
         out.numpy()
-        for out in cramer_rao.statistics_maps(
+        for out in analytic.statistics_maps(
             one,
             wp.zeros(2, **kinds),
             wp.zeros((1, 1), dtype=wp.float32, device=device),
@@ -185,7 +183,7 @@ def test_gaussian_and_collimated_beams_put_all_their_light_on_a_wide_plane(profi
 def scatter_table(one, view, distance, g, device="cpu"):
     angles = np.linspace(0, np.pi, 4097)
     phase = (1 - g * g) / (4 * math.pi * (1 + g * g - 2 * g * np.cos(angles)) ** 1.5)
-    out = budget.single_scatter_table(
+    out = analytic.single_scatter_table(
         one,
         wp.array(phase, dtype=wp.float64, device=device),
         wp.array(view, dtype=wp.vec3d, device=device),
@@ -289,7 +287,7 @@ def test_published_bounds_in_bins_of_a_tenth_of_sigma(rho, expected):
     edges = np.linspace(-10, 10, 201)
     signal = 300 * crlb.binned_signal(edges, 0.0, 1.0)
     device = "cpu"
-    information = cramer_rao.histogram_information(
+    information = analytic.histogram_information(
         wp.array(signal[None], dtype=wp.float32, device=device),
         wp.full((1, 1), 30.0 / rho, dtype=wp.float32, device=device),
         wp.ones(1, dtype=wp.float64, device=device),
@@ -311,7 +309,7 @@ def test_information_of_first_photons_is_that_of_their_law():
     h = 1e-5
     slope = (law(0.03 + h) - law(0.03 - h)) / (2 * h) * 0.1  # per bin of 0.1 σ
     expected = (slope**2 / law(0.03)).sum()
-    information = cramer_rao.histogram_information(
+    information = analytic.histogram_information(
         wp.array(0.4 * crlb.binned_signal(edges, 0.03, 1.0)[None], dtype=wp.float32, device="cpu"),
         wp.full((1, 1), 0.01, dtype=wp.float32, device="cpu"),
         wp.ones(1, dtype=wp.float64, device="cpu"),
@@ -367,7 +365,7 @@ def test_outlier_probability_within_a_fifth_of_monte_carlo(signal, level, window
     errors = crlb.likelihood_errors(signal, level, window, trials, seed=7)
     measured = np.mean(np.abs(errors) > 4)
     one = [wp.array([float(value)], dtype=wp.float64, device="cpu") for value in (signal, level, window)]
-    predicted = cramer_rao.outlier_probabilities(*one).numpy()[0]
+    predicted = analytic.outlier_probabilities(*one).numpy()[0]
     assert abs(predicted - measured) < 0.2 * measured + 2 * math.sqrt(measured * (1 - measured) / trials)
 
 
@@ -394,7 +392,7 @@ def test_outliers_of_a_decaying_background_are_bounded_by_the_model():
             outliers += abs(t[np.argmax(score)] - delay) > 4
         under = (level * np.exp(-0.5 * (t - delay) ** 2)).sum() / math.sqrt(2 * math.pi) * step
         one = [wp.array([float(value)], dtype=wp.float64, device="cpu") for value in (signal, under, window)]
-        predicted = cramer_rao.outlier_probabilities(*one).numpy()[0]
+        predicted = analytic.outlier_probabilities(*one).numpy()[0]
         measured = outliers / trials
         error = math.sqrt(measured * (1 - measured) / trials)
         assert measured - 2 * error < predicted < 2 * (measured + 2 * error)
@@ -418,7 +416,7 @@ def test_outlier_probability_falls_with_signal_and_rises_with_background_and_win
             wp.array(np.broadcast_to(v, (12,)).astype(float), dtype=wp.float64, device="cpu")
             for v in (signal, level, window)
         ]
-        return cramer_rao.outlier_probabilities(*arrays).numpy()
+        return analytic.outlier_probabilities(*arrays).numpy()
 
     ladder = np.geomspace(0.5, 500, 12)
     for level in (1e-6, 1e-2, 1.0, 1e4):
@@ -447,7 +445,7 @@ def draw(device, *, frames, first=0, seed=5, probability=0.0, flat=0.0, pixels=5
     def flat_array(value):
         return wp.array(np.broadcast_to(value, pixels).astype(np.float32), dtype=wp.float32, device=device)
 
-    depth, labels = sampling.sample_frames(
+    depth, labels = analytic.sample_frames(
         wp.array(view.astype(np.float32), dtype=wp.vec3, device=device),
         flat_array(np.where(np.isnan(sigma), np.nan, 7.0)),
         flat_array(sigma),

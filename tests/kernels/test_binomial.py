@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from spadwarp_kernels.binomial import binomial, expm1, log1p
+from spadwarp_kernels.random import binomial, expm1, log1p
 
 
 @wp.kernel(enable_backward=False)

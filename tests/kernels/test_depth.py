@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from spadwarp_kernels.depth import PHASES, arrival_bins, first_invalid_row, launch_pixels
+from spadwarp_kernels.detection import PHASES, arrival_bins, first_invalid_row
+from spadwarp_kernels.pixels import launch_pixels
 
 BINS = 96
 SIGMA = 1.7

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from spadwarp_kernels.detector import (
+from spadwarp_kernels.detection import (
     add_crosstalk,
     coates,
     dark_count_rates,

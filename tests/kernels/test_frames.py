@@ -6,7 +6,7 @@ import warp as wp
 from scipy import stats
 
 from helpers.statistics_of_samples import DEVICES
-from spadwarp_kernels.frames import FrameCoding, draw_frames
+from spadwarp_kernels.analytic import FrameCoding, draw_frames
 
 WIDTH, HEIGHT = 52, 40  # rows that do not end at a byte
 OFFSET, STEP = 9.0, 1e-3

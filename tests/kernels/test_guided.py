@@ -21,8 +21,9 @@ from spadwarp_kernels import (
     u01,
     u01_fine,
 )
-from spadwarp_kernels.camera import clip_to_planes, field
-from spadwarp_kernels.guided import HENYEY_GREENSTEIN_GUIDE, clip_to_gate, make_sample_flight
+from spadwarp_kernels.estimators import make_sample_flight
+from spadwarp_kernels.phase import HENYEY_GREENSTEIN_GUIDE
+from spadwarp_kernels.sensor import clip_to_gate, clip_to_planes, field
 
 COUNT = 10_000_000
 G = 0.924

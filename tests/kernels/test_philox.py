@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from helpers.statistics_of_samples import DEVICES
-from spadwarp_kernels.philox import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
+from spadwarp_kernels.random import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
 
 
 @wp.kernel(enable_backward=False)

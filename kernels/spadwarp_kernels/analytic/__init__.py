@@ -1,0 +1,23 @@
+"""The analytic simulator: photon budget, Cramér–Rao bound, depth frames."""
+
+from .cramer_rao import COUNT_LAWS, histogram_information, outlier_probabilities, statistics_maps
+from .depth_frames import Sampler, sample_frames
+from .labelled_frames import FrameCoding, draw_frames
+from .lidar import BACKSCATTER_SOURCES, FORMS, TABLE_EDGES, Lidar, signal_map, single_scatter_table
+
+__all__ = [
+    "BACKSCATTER_SOURCES",
+    "COUNT_LAWS",
+    "FORMS",
+    "TABLE_EDGES",
+    "FrameCoding",
+    "Lidar",
+    "Sampler",
+    "draw_frames",
+    "histogram_information",
+    "outlier_probabilities",
+    "sample_frames",
+    "signal_map",
+    "single_scatter_table",
+    "statistics_maps",
+]

@@ -1,0 +1,167 @@
+"""Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon in its place."""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.random.philox import STREAM_ANALYTIC, random_block, u01, u01_open
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Sampler:
+    """What is drawn.
+
+    Attributes:
+        laser: Position of the laser [m].
+        nearest, farthest: Paths at which the gate opens and closes [m].
+        pixels: Number of pixels of a frame.
+        first_frame, frames: The range of frames.
+        seed: Of the random numbers.
+    """
+
+    laser: wp.vec3
+    nearest: float
+    farthest: float
+    pixels: int
+    first_frame: int
+    frames: int
+    seed: wp.uint64
+
+
+@wp.func
+def path_at_share(paths: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=float), pixel: int, u: float) -> float:
+    """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
+    row = pixel % cumulative.shape[0]
+    edges = pixel % paths.shape[0]
+    low = wp.int32(0)
+    high = wp.int32(cumulative.shape[1] - 1)
+    while high - low > 1:
+        middle = (low + high) / 2
+        if cumulative[row, middle] <= u:
+            low = middle
+        else:
+            high = middle
+    below = cumulative[row, low]
+    width = cumulative[row, high] - below
+    w = wp.float32(0.5)
+    if width > 0.0:
+        w = wp.clamp((u - below) / width, 0.0, 1.0)
+    return paths[edges, low] + w * (paths[edges, high] - paths[edges, low])
+
+
+@wp.func
+def _depth_of_path(sampler: Sampler, view: wp.vec3, path: float) -> float:
+    baseline2 = wp.length_sq(sampler.laser)
+    if path * path <= baseline2:
+        return 0.0
+    return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, sampler.laser)))
+
+
+@wp.kernel
+def _frames(
+    first: int,
+    sampler: Sampler,
+    view: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    sigma_depth: wp.array(dtype=float),
+    probability: wp.array(dtype=float),
+    flat_share: wp.array(dtype=float),
+    paths: wp.array2d(dtype=float),
+    cumulative: wp.array2d(dtype=float),
+    # Out:
+    frames: wp.array2d(dtype=float),
+    labels: wp.array2d(dtype=wp.bool),
+):
+    """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
+
+    One block of random numbers serves two frames; a draw depends on seed, pixel and frame number alone.
+    """
+    tid = first + wp.tid()
+    pair = tid / sampler.pixels
+    pixel = tid - pair * sampler.pixels
+    pair += sampler.first_frame / 2
+    block = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair), STREAM_ANALYTIC)
+    radius = sigma_depth[pixel] * wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+    angle = 6.283185307179586 * u01(block[1])
+    p = probability[pixel]
+    for k in range(2):
+        frame = 2 * pair + k - sampler.first_frame
+        if frame >= 0 and frame < sampler.frames:
+            shift = radius * wp.cos(angle)
+            word = block[2]
+            if k == 1:
+                shift = radius * wp.sin(angle)
+                word = block[3]
+            value = depth[pixel] + shift
+            stray = u01(word) < p
+            if stray:
+                extra = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
+                kind = u01(extra[0])
+                draw = u01(extra[1])
+                if k == 1:
+                    kind = u01(extra[2])
+                    draw = u01(extra[3])
+                path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
+                if kind >= flat_share[pixel]:
+                    path = path_at_share(paths, cumulative, pixel, draw)
+                value = _depth_of_path(sampler, view[pixel], path)
+            frames[frame, pixel] = value
+            labels[frame, pixel] = stray
+
+
+def sample_frames(
+    view: wp.array,
+    depth: wp.array,
+    sigma_depth: wp.array,
+    probability: wp.array,
+    flat_share: wp.array,
+    paths: wp.array,
+    cumulative: wp.array,
+    *,
+    laser: Sequence[float],
+    gate_paths: tuple[float, float],
+    first_frame: int,
+    frames: int,
+    seed: int,
+    out: tuple[wp.array, wp.array] | None = None,
+) -> tuple[wp.array, wp.array]:
+    """Depth frames and which of their pixels report background: float32 and bool `[frames, pixel]`.
+
+    Frame n is the same whatever range of frames it is drawn in.
+
+    Args:
+        view: vec3 `[pixel]`, unit lines of sight.
+        depth, sigma_depth: float32 `[pixel]` [m]; NaN for no estimate.
+        probability: float32 `[pixel]`, that a pixel reports a background photon instead.
+        flat_share: float32 `[pixel]`, part of these that arrive at any time of the gate alike.
+        paths, cumulative: For the others edges in path [m] and distribution, float32 `[1 or pixel, n]`.
+        laser: Position of the laser [m].
+        gate_paths: Paths at which the gate opens and closes [m].
+        first_frame, frames: The range of frames.
+        seed: 64-bit.
+        out: Arrays to write into.
+    """
+    pixels, device = view.shape[0], view.device
+    if out is None:
+        out = (
+            wp.empty((frames, pixels), dtype=float, device=device),
+            wp.empty((frames, pixels), dtype=wp.bool, device=device),
+        )
+    # wp.tid() is a 32-bit integer, and a thread draws two frames.
+    step = 2 * max((1 << 30) // pixels, 1)
+    for start in range(0, frames, step):
+        stop = min(start + step, frames)
+        sampler = Sampler()
+        sampler.laser = wp.vec3(*map(float, laser))
+        sampler.nearest, sampler.farthest = gate_paths
+        sampler.pixels = pixels
+        sampler.first_frame = first_frame + start
+        sampler.frames = stop - start
+        sampler.seed = wp.uint64(seed)
+        pairs = (first_frame + stop + 1) // 2 - (first_frame + start) // 2
+        inputs = [sampler, view, depth, sigma_depth, probability, flat_share, paths, cumulative]
+        launch_pixels(_frames, pairs * pixels, [*inputs, out[0][start:stop], out[1][start:stop]], device=device)
+    return out

@@ -1,0 +1,178 @@
+"""Labelled frames of a dataset, as they are stored: depth and intensity as integers, labels as bits.
+
+The same draw as in `analytic`, μ + N(0, σ*²) or a background photon instead, for frames that differ in the part of
+their pixels that reports background, with the number of recorded photons beside the depth.
+"""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
+
+from .depth_frames import path_at_share
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+
+@wp.struct
+class FrameCoding:
+    """What is drawn, and how it is written.
+
+    Attributes:
+        laser: Position of the laser [m].
+        nearest, farthest: Paths at which the gate opens and closes [m].
+        width, pixels: Of a row, of a frame.
+        seed: Of the random numbers.
+        first_sample: Id of the first frame; the others follow.
+        depth_offset, depth_step: depth = offset + step · code [m]; code 0 is no return.
+        pulses: Pulses of a frame.
+        intensity_step: Recorded photons per unit of the intensity code.
+    """
+
+    laser: wp.vec3
+    nearest: float
+    farthest: float
+    width: int
+    pixels: int
+    seed: wp.uint64
+    first_sample: wp.int64
+    depth_offset: float
+    depth_step: float
+    pulses: float
+    intensity_step: float
+
+
+@wp.func
+def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
+    """Planar depth at which light has gone `path` from laser to target to lens [m]; 0 if there is none."""
+    baseline2 = wp.length_sq(laser)
+    if path * path <= baseline2:
+        return 0.0
+    return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
+
+
+@wp.func
+def count_quantile(z: float, pulses: float, alpha: float) -> float:
+    """The count of Binomial(pulses, 1 − exp(−alpha)) at the normal quantile z.
+
+    Below a mean of 8 by inversion; above it by the Cornish–Fisher expansion to the skewness, whose error in the
+    distribution function is below 0.2 % there.
+    """
+    p = 1.0 - wp.exp(-alpha)
+    if alpha < 1.0e-3:
+        p = alpha * (1.0 - 0.5 * alpha)
+    mean = pulses * p
+    if mean >= 8.0:
+        spread = wp.sqrt(mean * (1.0 - p))
+        x = mean + spread * z + (1.0 - 2.0 * p) * (z * z - 1.0) / 6.0
+        return wp.clamp(wp.floor(x + 0.5), 0.0, pulses)
+    rest = 0.5 * wp.erfc(-z * 0.7071067811865476)
+    probability = wp.exp(-pulses * alpha)
+    count = float(0.0)
+    while rest > probability and count < pulses and count < 64.0:
+        rest = rest - probability
+        count = count + 1.0
+        probability = probability * p / (1.0 - p) * (pulses + 1.0 - count) / count
+    return count
+
+
+@wp.kernel
+def _frames(
+    first: int,
+    coding: FrameCoding,
+    view: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    sigma_depth: wp.array(dtype=float),
+    alpha: wp.array(dtype=float),
+    probability: wp.array(dtype=float),
+    flat_share: wp.array(dtype=float),
+    paths: wp.array2d(dtype=float),
+    cumulative: wp.array2d(dtype=float),
+    fraction: wp.array(dtype=float),
+    # Out:
+    depth_codes: wp.array2d(dtype=wp.uint16),
+    intensity_codes: wp.array2d(dtype=wp.uint8),
+    label_bytes: wp.array2d(dtype=wp.uint8),
+):
+    """Launch grid: frames x bytes of labels. A thread draws the eight pixels of one byte."""
+    tid = first + wp.tid()
+    frame = tid / label_bytes.shape[1]
+    byte = tid - frame * label_bytes.shape[1]
+    row_bytes = (coding.width + 7) / 8
+    row = byte / row_bytes
+    column = 8 * (byte - row * row_bytes)
+    bits = int(0)
+    for k in range(8):
+        if column + k < coding.width:
+            pixel = row * coding.width + column + k
+            sample = wp.uint64(coding.first_sample + wp.int64(frame))
+            block = random_block(coding.seed, sample, wp.uint32(pixel), STREAM_FRAMES)
+            radius = wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+            angle = 6.283185307179586 * u01(block[1])
+            low = depth_of_path(coding.laser, view[pixel], coding.nearest)
+            high = depth_of_path(coding.laser, view[pixel], coding.farthest)
+            # NaN, no estimate, stays NaN.
+            value = depth[pixel] + sigma_depth[pixel] * radius * wp.cos(angle)
+            chance = probability[pixel] * fraction[frame]
+            kind = u01(block[2])
+            if kind < chance:
+                bits |= 128 >> k
+                draw = u01(block[3])
+                path = coding.nearest + draw * (coding.farthest - coding.nearest)
+                # Of those that are stray, kind / chance is uniform again.
+                if kind >= flat_share[pixel] * chance:
+                    path = path_at_share(paths, cumulative, pixel, draw)
+                value = depth_of_path(coding.laser, view[pixel], path)
+            code = int(0)
+            if value == value:
+                # A fit does not leave the gate.
+                value = wp.clamp(value, low, high)
+                code = wp.clamp(int((value - coding.depth_offset) / coding.depth_step + 0.5), 1, 65535)
+            depth_codes[frame, pixel] = wp.uint16(code)
+            count = count_quantile(radius * wp.sin(angle), coding.pulses, alpha[pixel])
+            level = wp.min(int(count / coding.intensity_step + 0.5), 255)
+            intensity_codes[frame, pixel] = wp.uint8(level)
+    label_bytes[frame, byte] = wp.uint8(bits)
+
+
+def draw_frames(
+    coding: FrameCoding,
+    view: wp.array,
+    depth: wp.array,
+    sigma_depth: wp.array,
+    alpha: wp.array,
+    probability: wp.array,
+    flat_share: wp.array,
+    paths: wp.array,
+    cumulative: wp.array,
+    fraction: wp.array,
+) -> Sequence[wp.array]:
+    """Frames `coding.first_sample` and on, one for each entry of `fraction`.
+
+    A frame depends on seed, sample id and the pixels' own values alone, whatever it is drawn with.
+
+    Args:
+        coding: A `FrameCoding`.
+        view: vec3 `[pixel]`, unit lines of sight.
+        depth, sigma_depth: float32 `[pixel]` [m]; NaN for no estimate.
+        alpha: float32 `[pixel]`, expected detections per pulse.
+        probability: float32 `[pixel]`; times `fraction` the probability that a pixel reports background.
+        flat_share: float32 `[pixel]`, part of these that arrive at any time of the gate alike.
+        paths, cumulative: For the others edges in path [m] and distribution, float32 `[1 or pixel, n]`.
+        fraction: float32 `[frame]`, in [0, 1].
+
+    Returns:
+        Depth codes uint16 `[frame, pixel]`, intensity codes uint8 `[frame, pixel]`, labels uint8 `[frame, byte]`: rows
+        of (width + 7)/8 bytes, the first pixel in the highest bit, as `np.packbits` has them.
+    """
+    device, frames = view.device, fraction.size
+    row_bytes = (coding.width + 7) // 8
+    label_count = coding.pixels // coding.width * row_bytes
+    depth_codes = wp.empty((frames, coding.pixels), dtype=wp.uint16, device=device)
+    intensity_codes = wp.empty((frames, coding.pixels), dtype=wp.uint8, device=device)
+    labels = wp.empty((frames, label_count), dtype=wp.uint8, device=device)
+    inputs = [coding, view, depth, sigma_depth, alpha, probability, flat_share, paths, cumulative, fraction]
+    launch_pixels(_frames, frames * label_count, [*inputs, depth_codes, intensity_codes, labels], device=device)
+    return depth_codes, intensity_codes, labels

@@ -1,0 +1,348 @@
+"""Depth frames: one arrival time per pixel from a histogram of counts, tallies or rates.
+
+Times are fractional bins from the start of the first bin: bin k covers [k, k + 1), so its centre is k + 0.5.
+Histograms are rows `[pixel, bin]` of int32, int64, float32 or float64; one thread a pixel.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.pixels import launch_pixels
+
+wp.set_module_options({"enable_backward": False})
+
+_PHASE_BITS = wp.constant(4)
+PHASES = wp.constant(16)
+"""Sub-bin shifts at which the response is tabulated; a parabola goes between them."""
+
+RESPONSE_FLOOR = 1e-6
+"""Smallest response, relative to its peak, that the logarithm sees: one stray count must not exclude every delay."""
+
+_NEWTON_STEPS = wp.constant(6)
+
+
+@wp.func
+def _offer(position: float, score: float, best: wp.vec3) -> wp.vec3:
+    """Keep (score, first position, last position) of the largest score: two positions tell a plateau from a peak."""
+    if score > best[0]:
+        return wp.vec3(score, position, position)
+    if score == best[0]:
+        return wp.vec3(score, best[1], position)
+    return best
+
+
+@wp.func
+def _parabola_vertex(left: float, centre: float, right: float) -> float:
+    """Offset of the maximum of the parabola through three equidistant scores, in steps, within half a step."""
+    curvature = left - 2.0 * centre + right
+    if curvature >= 0.0:
+        return 0.0
+    return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
+
+
+@cache
+def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def peak(
+        first_pixel: int,
+        histogram: wp.array2d(dtype=dtype),
+        background: wp.array2d(dtype=float),
+        first: int,
+        stop: int,
+        half_width: int,
+        # Out:
+        arrival: wp.array(dtype=float),
+    ):
+        pixel = first_pixel + wp.tid()
+        level = pixel % background.shape[0]
+        bins = background.shape[1]
+        peak_bin = int(-1)
+        highest = float(0.0)
+        for k in range(first, stop):
+            excess = float(histogram[pixel, k]) - background[level, wp.min(k, bins - 1)]
+            if excess > highest:
+                highest = excess
+                peak_bin = k
+        if peak_bin < 0:
+            arrival[pixel] = wp.nan
+            return
+        if wp.static(centroid):
+            weight = float(0.0)
+            moment = float(0.0)
+            for k in range(wp.max(first, peak_bin - half_width), wp.min(stop, peak_bin + half_width + 1)):
+                # Relative to the peak, so that rates of any size keep their digits.
+                excess = (float(histogram[pixel, k]) - background[level, wp.min(k, bins - 1)]) / highest
+                weight += excess
+                moment += excess * float(k - peak_bin)
+            shift = float(0.0)
+            if weight > 0.0:
+                shift = wp.clamp(moment / weight, -float(half_width), float(half_width))
+            arrival[pixel] = float(peak_bin) + 0.5 + shift
+        else:
+            arrival[pixel] = float(peak_bin) + 0.5
+
+    return peak
+
+
+@cache
+def _matched_kernel(dtype: Any) -> wp.Kernel:
+    @wp.func
+    def score_of(
+        histogram: wp.array2d(dtype=dtype),
+        gain: wp.array2d(dtype=float),
+        pixel: int,
+        first: int,
+        stop: int,
+        lowest_tap: int,
+        phases: int,
+    ) -> float:
+        phase = phases & (PHASES - 1)
+        base = (phases >> _PHASE_BITS) + lowest_tap
+        score = float(0.0)
+        for tap in range(wp.max(0, first - base), wp.min(gain.shape[1], stop - base)):
+            score += float(histogram[pixel, base + tap]) * gain[phase, tap]
+        return score
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def matched(
+        first_pixel: int,
+        histogram: wp.array2d(dtype=dtype),
+        gain: wp.array2d(dtype=float),
+        first: int,
+        stop: int,
+        lowest_tap: int,
+        coarse_step: int,
+        # Out:
+        arrival: wp.array(dtype=float),
+    ):
+        pixel = first_pixel + wp.tid()
+        best = wp.vec3(0.0, -1.0, -1.0)
+        for step in range(first * PHASES / coarse_step, stop * PHASES / coarse_step):
+            score = score_of(histogram, gain, pixel, first, stop, lowest_tap, step * coarse_step)
+            best = _offer(float(step * coarse_step), score, best)
+        if best[1] < 0.0:
+            arrival[pixel] = wp.nan
+            return
+        middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
+        fine = wp.vec3(-1.0, 0.0, 0.0)
+        for phases in range(middle - coarse_step, middle + coarse_step + 1):
+            score = score_of(histogram, gain, pixel, first, stop, lowest_tap, phases)
+            fine = _offer(float(phases), score, fine)
+        top = 0.5 * (fine[1] + fine[2])
+        if fine[1] == fine[2]:
+            left = score_of(histogram, gain, pixel, first, stop, lowest_tap, int(fine[1]) - 1)
+            right = score_of(histogram, gain, pixel, first, stop, lowest_tap, int(fine[1]) + 1)
+            top += _parabola_vertex(left, fine[0], right)
+        arrival[pixel] = top / float(PHASES)
+
+    return matched
+
+
+@cache
+def _likelihood_kernel(dtype: Any) -> wp.Kernel:
+    @wp.func
+    def profile_likelihood(
+        histogram: wp.array2d(dtype=dtype),
+        background: wp.array2d(dtype=float),
+        response: wp.array2d(dtype=float),
+        pixel: int,
+        level: int,
+        first: int,
+        stop: int,
+        lowest_tap: int,
+        phases: int,
+        least: float,
+        beat: float,
+    ) -> float:
+        # max over S >= 0 of sum n ln(1 + S h / B) - S sum h: the log-likelihood ratio of a return at this delay.
+        phase = phases & (PHASES - 1)
+        base = (phases >> _PHASE_BITS) + lowest_tap
+        low = wp.max(0, first - base)
+        high = wp.min(response.shape[1], stop - base)
+        last = background.shape[1] - 1
+        counts = float(0.0)
+        slope = float(0.0)
+        seen = float(0.0)
+        for tap in range(low, high):
+            h = response[phase, tap]
+            n = float(histogram[pixel, base + tap])
+            seen += h
+            if n > 0.0:
+                counts += n
+                slope += n * h / wp.max(background[level, wp.min(base + tap, last)], least)
+        if slope <= seen or seen <= 0.0:
+            return 0.0  # the likelihood falls with S from 0 on
+        # Jensen's inequality bounds the maximum by that of one bin with the mean h / B: most delays end here.
+        bound = counts * (wp.log(slope / seen) - 1.0 + seen / slope)
+        if bound < beat:
+            return -1.0
+        # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean): Newton from S = 0 rises to the root, not past it.
+        signal = float(0.0)
+        for _ in range(_NEWTON_STEPS):
+            slope = float(0.0)
+            curvature = float(0.0)
+            for tap in range(low, high):
+                n = float(histogram[pixel, base + tap])
+                if n > 0.0:
+                    h = response[phase, tap]
+                    ratio = h / (wp.max(background[level, wp.min(base + tap, last)], least) + signal * h)
+                    slope += n * ratio
+                    curvature += n * ratio * ratio
+            signal = wp.max(signal + (slope / seen - 1.0) * slope / curvature, signal)
+        value = -signal * seen
+        for tap in range(low, high):
+            n = float(histogram[pixel, base + tap])
+            if n > 0.0:
+                floor = wp.max(background[level, wp.min(base + tap, last)], least)
+                value += n * wp.log(1.0 + signal * response[phase, tap] / floor)
+        return value
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def likelihood(
+        first_pixel: int,
+        histogram: wp.array2d(dtype=dtype),
+        background: wp.array2d(dtype=float),
+        response: wp.array2d(dtype=float),
+        response_floor: float,
+        first: int,
+        stop: int,
+        lowest_tap: int,
+        coarse_step: int,
+        # Out:
+        arrival: wp.array(dtype=float),
+    ):
+        pixel = first_pixel + wp.tid()
+        level = pixel % background.shape[0]
+        total = float(0.0)
+        for k in range(first, stop):
+            total += float(histogram[pixel, k])
+        least = response_floor * total
+        best = wp.vec3(0.0, -1.0, -1.0)
+        if total > 0.0:
+            for step in range(first * PHASES / coarse_step, stop * PHASES / coarse_step):
+                score = profile_likelihood(
+                    histogram,
+                    background,
+                    response,
+                    pixel,
+                    level,
+                    first,
+                    stop,
+                    lowest_tap,
+                    step * coarse_step,
+                    least,
+                    best[0],
+                )
+                if score > 0.0:
+                    best = _offer(float(step * coarse_step), score, best)
+        if best[1] < 0.0:
+            arrival[pixel] = wp.nan
+            return
+        middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
+        fine = wp.vec3(-1.0, 0.0, 0.0)
+        for phases in range(middle - coarse_step, middle + coarse_step + 1):
+            score = profile_likelihood(
+                histogram, background, response, pixel, level, first, stop, lowest_tap, phases, least, 0.0
+            )
+            fine = _offer(float(phases), score, fine)
+        top = 0.5 * (fine[1] + fine[2])
+        if fine[1] == fine[2]:
+            centre = int(fine[1])
+            left = profile_likelihood(
+                histogram, background, response, pixel, level, first, stop, lowest_tap, centre - 1, least, 0.0
+            )
+            right = profile_likelihood(
+                histogram, background, response, pixel, level, first, stop, lowest_tap, centre + 1, least, 0.0
+            )
+            top += _parabola_vertex(left, fine[0], right)
+        arrival[pixel] = top / float(PHASES)
+
+    return likelihood
+
+
+@cache
+def _invalid_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):
+        pixel = first_pixel + wp.tid()
+        for k in range(values.shape[1]):
+            value = float(values[pixel, k])
+            if value < 0.0 or not wp.isfinite(value):
+                wp.atomic_min(worst, 0, pixel)
+                return
+
+    return invalid
+
+
+def first_invalid_row(values: wp.array) -> int | None:
+    """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
+    if values.shape[0] == 0:
+        return None
+    worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
+    launch_pixels(_invalid_kernel(values.dtype), values.shape[0], [values, worst], device=values.device)
+    row = int(worst.numpy()[0])
+    return None if row == 2**31 - 1 else row
+
+
+def arrival_bins(
+    histogram: wp.array,
+    *,
+    method: str = "centroid",
+    background: wp.array | None = None,
+    response: np.ndarray | None = None,
+    lowest_tap: int = 0,
+    first: int = 0,
+    stop: int | None = None,
+    half_width: int = 3,
+) -> wp.array:
+    """Arrival time of every pixel [bins from the start of bin 0], NaN where there is none.
+
+    Args:
+        histogram: `[pixel, bin]`, int32, int64, float32 or float64, not negative.
+        method: `"peak"`: centre of the largest bin. `"centroid"`: mean over the peak ± `half_width` bins.
+            `"matched"`: the delay μ that maximises Σ n_k ln h_k(μ), the log-matched filter, which is maximum
+            likelihood without background. `"likelihood"`: the maximum over delay and signal of
+            Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), with known background B.
+        background: expected background per bin, in the histogram's unit, float32 `[1 or pixel, 1 or bin]`; the row is
+            the pixel modulo the rows. Peak and centroid subtract it, the matched filter ignores it.
+        response: `[PHASES, tap]`: row p is the fraction of a return at time m + p / PHASES (m an integer) that falls in
+            bin m + lowest_tap + tap. Needed by matched and likelihood.
+        lowest_tap: bin of the first tap, relative to the bin of the return.
+        first, stop: the bins looked at, [first, stop).
+        half_width: of the centroid's window [bins].
+
+    Returns:
+        float32 `[pixel]` on the histogram's device. NaN: nothing returned (no counts, or none above the background).
+    """
+    device = histogram.device
+    pixels, bins = histogram.shape
+    stop = bins if stop is None else stop
+    arrival = wp.empty(pixels, dtype=float, device=device)
+    if background is None:
+        background = wp.zeros((1, 1), dtype=float, device=device)
+    if method in ("peak", "centroid"):
+        kernel = _peak_kernel(histogram.dtype, method == "centroid")
+        launch_pixels(kernel, pixels, [histogram, background, first, stop, half_width, arrival], device=device)
+        return arrival
+    if method not in ("matched", "likelihood"):
+        raise ValueError(f"method = {method!r} is not one of 'peak', 'centroid', 'matched', 'likelihood'")
+    if response is None:
+        raise ValueError(f"method = {method!r} needs a response")
+    if response.ndim != 2 or response.shape[0] != PHASES:
+        raise ValueError(f"response has shape {response.shape}, not ({PHASES}, taps)")
+    floor = RESPONSE_FLOOR * float(response.max())
+    # A narrow response loses signal between the delays of the coarse search, a wide one does not.
+    coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4
+    if method == "matched":
+        # ln(h / floor): counts outside the response add the same to every delay.
+        gain = wp.array(np.log(np.maximum(response, floor) / floor).astype(np.float32), device=device)
+        inputs = [histogram, gain, first, stop, lowest_tap, coarse_step, arrival]
+        launch_pixels(_matched_kernel(histogram.dtype), pixels, inputs, device=device)
+    else:
+        taps = wp.array(response.astype(np.float32), device=device)
+        inputs = [histogram, background, taps, floor, first, stop, lowest_tap, coarse_step, arrival]
+        launch_pixels(_likelihood_kernel(histogram.dtype), pixels, inputs, device=device)
+    return arrival

@@ -1,0 +1,29 @@
+"""The water: one, or plane layers of several; its box and the limits that end a history."""
+
+from .layers import (
+    HOMOGENEOUS,
+    LAYERED,
+    Layers,
+    Water,
+    layer_index,
+    layered_extinction,
+    layered_free_path,
+    layered_water,
+)
+from .limits import Limits, exit_distance
+from .water import Medium, free_path
+
+__all__ = [
+    "HOMOGENEOUS",
+    "LAYERED",
+    "Layers",
+    "Limits",
+    "Medium",
+    "Water",
+    "exit_distance",
+    "free_path",
+    "layer_index",
+    "layered_extinction",
+    "layered_free_path",
+    "layered_water",
+]

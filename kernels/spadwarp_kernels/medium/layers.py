@@ -1,0 +1,141 @@
+"""Water in plane layers, and the three questions that transport asks of any water.
+
+How far does a photon fly, what does a flight let through, and which water is at a point: `HOMOGENEOUS` answers from the
+medium alone, `LAYERED` from the layers. A boundary between equal extinctions is none: layers of one water give the bits
+of the homogeneous one. Light passes boundaries straight on; one index holds for all layers.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from .water import Medium, free_path
+
+
+@wp.struct
+class Layers:
+    """Layers across an axis, in the order in which the axis meets them.
+
+    In the frame of the photons: where a photon at x is at R x + o of the water's frame, with the axis a there, the axis
+    here is R^T a, and each start is less by a·o. A layer reaches to the start of the next, the first back without end.
+
+    Attributes:
+        axis: Unit vector.
+        start: Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read.
+        extinction: c [1/m], > 0.
+        albedo: Single-scattering albedo in [0, 1].
+        anisotropy: g in (-1, 1), for phase functions that use the medium's.
+    """
+
+    axis: wp.vec3
+    start: wp.array(dtype=float)
+    extinction: wp.array(dtype=float)
+    albedo: wp.array(dtype=float)
+    anisotropy: wp.array(dtype=float)
+
+
+@wp.func
+def layer_index(layers: Layers, along: float) -> int:
+    """The layer at a position along the axis [m]."""
+    k = int(0)
+    for i in range(1, layers.start.shape[0]):
+        if along >= layers.start[i]:
+            k = i
+    return k
+
+
+@wp.func
+def _boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: float) -> float:
+    """Distance [m] from `along`, at `slope` per metre, to the end of a layer; 1e30 where there is none."""
+    ahead = layer + step
+    if slope == 0.0 or ahead < 0 or ahead >= layers.start.shape[0]:
+        return 1.0e30
+    return (layers.start[wp.max(layer, ahead)] - along) / slope
+
+
+@wp.func
+def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float) -> float:
+    """Free flight [m] from x along u for uniform xi in [0, 1): where the optical depth reaches -ln(1 - xi)."""
+    along = wp.dot(layers.axis, x)
+    slope = wp.dot(layers.axis, u)
+    step = wp.where(slope > 0.0, 1, -1)
+    layer = layer_index(layers, along)
+    extinction = float(layers.extinction[layer])
+    depth = -wp.log(1.0 - xi)
+    begin = float(0.0)  # of the stretch of this extinction
+    boundary = _boundary_ahead(layers, layer, step, along, slope)
+    while boundary < 1.0e30 and extinction * (boundary - begin) < depth:
+        layer += step
+        if layers.extinction[layer] != extinction:
+            depth -= extinction * (boundary - begin)
+            begin = boundary
+            extinction = layers.extinction[layer]
+        boundary = _boundary_ahead(layers, layer, step, along, slope)
+    return begin + depth / extinction
+
+
+@wp.func
+def layered_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+    """Mean extinction [1/m] between x and x + length u, so that exp(-mean length) is what passes."""
+    along = wp.dot(layers.axis, x)
+    slope = wp.dot(layers.axis, u)
+    step = wp.where(slope > 0.0, 1, -1)
+    layer = layer_index(layers, along)
+    extinction = float(layers.extinction[layer])
+    depth = float(0.0)
+    begin = float(0.0)
+    boundary = _boundary_ahead(layers, layer, step, along, slope)
+    while boundary < length:
+        layer += step
+        if layers.extinction[layer] != extinction:
+            depth += extinction * (boundary - begin)
+            begin = boundary
+            extinction = layers.extinction[layer]
+        boundary = _boundary_ahead(layers, layer, step, along, slope)
+    if begin == 0.0:
+        return extinction
+    return (depth + extinction * (length - begin)) / length
+
+
+@wp.func
+def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    """The medium with the coefficients of the layer at x."""
+    layer = layer_index(layers, wp.dot(layers.axis, x))
+    water = medium
+    water.extinction = layers.extinction[layer]
+    water.albedo = layers.albedo[layer]
+    water.anisotropy = layers.anisotropy[layer]
+    return water
+
+
+@wp.func
+def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float) -> float:
+    return free_path(xi, medium.extinction)
+
+
+@wp.func
+def _extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+    return medium.extinction
+
+
+@wp.func
+def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    return medium
+
+
+class Water(NamedTuple):
+    """What transport asks of water, as Warp functions.
+
+    Attributes:
+        free_path: ``(medium, layers, x, u, xi) -> float``, free flight [m].
+        extinction: ``(medium, layers, x, u, length) -> float``, mean extinction of a flight [1/m].
+        at: ``(medium, layers, x) -> Medium``, the water at a point.
+    """
+
+    free_path: wp.Function
+    extinction: wp.Function
+    at: wp.Function
+
+
+HOMOGENEOUS = Water(_free_path, _extinction, _water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water)

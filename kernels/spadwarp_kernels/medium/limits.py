@@ -1,0 +1,115 @@
+"""Where photons may be: the water's box and the limits that end a history."""
+
+import warp as wp
+
+from spadwarp_kernels.tally.tally import EXIT, LATERAL_LIMIT
+
+
+@wp.struct
+class Limits:
+    """Limits of a history; 1e30 stands for none.
+
+    Attributes:
+        lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face.
+        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read by `..._turned` alone, the
+            others take lower and upper as they stand in the frame of the flight.
+        lateral: A history ends where |x| or |y| reaches this [m].
+        max_path: Geometric path [m].
+        weight_cutoff: A history ends after an event that leaves its analog weight below this.
+        max_collisions: A history ends after this many events, surfaces included.
+    """
+
+    lower: wp.vec3
+    upper: wp.vec3
+    rotation: wp.mat33
+    origin: wp.vec3
+    lateral: float
+    max_path: float
+    weight_cutoff: float
+    max_collisions: int
+
+
+@wp.func
+def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
+    if u > 0.0:
+        return wp.max((upper - x) / u, 0.0)
+    if u < 0.0:
+        return wp.max((lower - x) / u, 0.0)
+    return 1.0e30
+
+
+@wp.func
+def _to_sides(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    return wp.min(
+        _to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral)
+    )
+
+
+@wp.func
+def _to_faces(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    return wp.min(
+        _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
+        wp.min(
+            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]),
+            _to_plane(x[2], u[2], limits.lower[2], limits.upper[2]),
+        ),
+    )
+
+
+@wp.func
+def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
+    best = float(to_sides)
+    entry = LATERAL_LIMIT
+    for i in range(3):
+        distance = _to_plane(x[i], u[i], limits.lower[i], limits.upper[i])
+        if distance <= best:
+            best = distance
+            entry = EXIT + 2 * i + wp.where(u[i] > 0.0, 1, 0)
+    return entry
+
+
+@wp.func
+def _outside_sides(limits: Limits, x: wp.vec3) -> bool:
+    return wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
+
+
+@wp.func
+def _outside_faces(limits: Limits, x: wp.vec3) -> bool:
+    low = x[0] < limits.lower[0] or x[1] < limits.lower[1] or x[2] < limits.lower[2]
+    return low or x[0] > limits.upper[0] or x[1] > limits.upper[1] or x[2] > limits.upper[2]
+
+
+@wp.func
+def is_outside(limits: Limits, x: wp.vec3) -> bool:
+    """Whether x lies outside the domain or beyond the lateral limit."""
+    return _outside_sides(limits, x) or _outside_faces(limits, x)
+
+
+@wp.func
+def is_outside_turned(limits: Limits, x: wp.vec3) -> bool:
+    """As `is_outside`, for a domain with axes of its own."""
+    return _outside_sides(limits, x) or _outside_faces(limits, limits.rotation * x + limits.origin)
+
+
+@wp.func
+def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
+    return wp.min(_to_sides(limits, x, u), _to_faces(limits, x, u))
+
+
+@wp.func
+def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """Ledger entry of the limit that a ray from x along u meets first: a face of the domain, else the lateral limit."""
+    return _first_face(limits, _to_sides(limits, x, u), x, u)
+
+
+@wp.func
+def exit_distance_turned(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """As `exit_distance`, for a domain with axes of its own; the lateral limit keeps to the frame of the flight."""
+    return wp.min(_to_sides(limits, x, u), _to_faces(limits, limits.rotation * x + limits.origin, limits.rotation * u))
+
+
+@wp.func
+def exit_face_turned(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """As `exit_face`, for a domain with axes of its own; faces are named after them."""
+    return _first_face(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)

@@ -1,0 +1,34 @@
+"""The scattering medium and the free flight through it."""
+
+import warp as wp
+
+from spadwarp_kernels.random.density_tables import DensityTables
+
+
+@wp.struct
+class Medium:
+    """One water: all there is, or with `Layers` what they share.
+
+    Attributes:
+        extinction: c = a + b [1/m], >= 0; 0 is vacuum.
+        albedo: Single-scattering albedo b/c in [0, 1]; with the paper's model, the upper end of the uniform draw.
+        anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
+        axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
+            switches it off.
+        phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
+    """
+
+    extinction: float
+    albedo: float
+    anisotropy: float
+    axis_threshold: float
+    phase: DensityTables
+
+
+@wp.func
+def free_path(u: float, extinction: float) -> float:
+    """Free flight [m] = -ln(1 - u)/c for uniform u in [0, 1) (eq 12, 13); its mean is 1/c. Infinite (1e30) in
+    vacuum."""
+    if extinction <= 0.0:
+        return 1.0e30
+    return -wp.log(1.0 - u) / extinction

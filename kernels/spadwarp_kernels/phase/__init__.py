@@ -1,0 +1,34 @@
+"""Phase functions of the water, and what `guided` draws from in their place."""
+
+from .densities import (
+    fournier_forand_density,
+    henyey_greenstein_density,
+    interpolated_density,
+    sphere_integral,
+    two_term_henyey_greenstein_density,
+)
+from .henyey_greenstein import (
+    HENYEY_GREENSTEIN,
+    HENYEY_GREENSTEIN_GUIDE,
+    henyey_greenstein_pdf,
+    sample_henyey_greenstein,
+)
+from .phase_function import Guiding, PhaseFunction, PhaseGuide
+from .tabulated import TABULATED, make_phase_tables
+
+__all__ = [
+    "HENYEY_GREENSTEIN",
+    "HENYEY_GREENSTEIN_GUIDE",
+    "TABULATED",
+    "Guiding",
+    "PhaseFunction",
+    "PhaseGuide",
+    "fournier_forand_density",
+    "henyey_greenstein_density",
+    "henyey_greenstein_pdf",
+    "interpolated_density",
+    "make_phase_tables",
+    "sample_henyey_greenstein",
+    "sphere_integral",
+    "two_term_henyey_greenstein_density",
+]

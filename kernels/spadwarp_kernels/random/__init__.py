@@ -1,0 +1,52 @@
+"""Random numbers: Philox, uniforms, binomial counts, quantiles, tabulated densities."""
+
+from .binomial import binomial, expm1, log1p, uniforms
+from .density_tables import (
+    DensityTables,
+    fold,
+    folded_quadrature,
+    make_density_tables,
+    table_cumulative,
+    table_density,
+    table_sample,
+    tabulate,
+)
+from .philox import (
+    RoundKeys,
+    philox4x32,
+    random_block,
+    random_block_keyed,
+    round_keys,
+    u01,
+    u01_fine,
+    u01_high,
+    u01_last,
+    u01_low,
+    u01_open,
+)
+
+__all__ = [
+    "DensityTables",
+    "RoundKeys",
+    "binomial",
+    "expm1",
+    "fold",
+    "folded_quadrature",
+    "log1p",
+    "make_density_tables",
+    "philox4x32",
+    "random_block",
+    "random_block_keyed",
+    "round_keys",
+    "table_cumulative",
+    "table_density",
+    "table_sample",
+    "tabulate",
+    "u01",
+    "u01_fine",
+    "u01_high",
+    "u01_last",
+    "u01_low",
+    "u01_open",
+    "uniforms",
+]

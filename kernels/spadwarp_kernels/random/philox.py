@@ -1,0 +1,147 @@
+"""Counter-based random numbers: Philox4x32-10 (Salmon et al. 2011).
+
+A draw is a pure function of (seed, 64-bit id, event, stream): it does not depend on launch size, thread or history, so
+one id gives the same numbers however a launch is cut up.
+"""
+
+import warp as wp
+
+_M0 = wp.constant(wp.uint32(0xD2511F53))
+_M1 = wp.constant(wp.uint32(0xCD9E8D57))
+_W0 = wp.constant(wp.uint32(0x9E3779B9))
+_W1 = wp.constant(wp.uint32(0xBB67AE85))
+_LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
+_ROUNDS = 10
+_Keys = wp.types.vector(length=_ROUNDS, dtype=wp.uint32)
+
+# Streams: one block of four numbers per purpose and event.
+STREAM_EMISSION = wp.constant(wp.uint32(0))
+STREAM_TRANSPORT = wp.constant(wp.uint32(1))
+STREAM_FLIGHT_SAMPLE = wp.constant(wp.uint32(2))
+STREAM_ROULETTE = wp.constant(wp.uint32(3))
+STREAM_DETECTOR = wp.constant(wp.uint32(5))
+STREAM_ANALYTIC = wp.constant(wp.uint32(6))
+STREAM_SURFACE = wp.constant(wp.uint32(7))
+STREAM_FRAMES = wp.constant(wp.uint32(16))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(word));
+#endif
+    return word;
+""")
+def _opaque(word: wp.uint32) -> wp.uint32:
+    """The word itself, out of the compiler's sight: else it keeps all ten round keys in registers across a kernel's
+    loops."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // Both halves from one instruction: a compiler that sees the two computes the lower one twice.
+    unsigned int low, high;
+    asm("{.reg .u64 p; mul.wide.u32 p, %2, %3; mov.b64 {%0, %1}, p;}" : "=r"(low), "=r"(high) : "r"(a), "r"(b));
+    return wp::vec2ui(low, high);
+#else
+    const uint64_t product = static_cast<uint64_t>(a) * b;
+    return wp::vec2ui(static_cast<uint32_t>(product), static_cast<uint32_t>(product >> 32));
+#endif
+""")
+def _multiply(a: wp.uint32, b: wp.uint32) -> wp.vec2ui:
+    """(low, high) half of a product."""
+    ...
+
+
+@wp.func
+def _round(words: wp.vec4ui, x: wp.uint32, y: wp.uint32) -> wp.vec4ui:
+    p = _multiply(words[0], _M0)
+    q = _multiply(words[2], _M1)
+    return wp.vec4ui(q[1] ^ words[1] ^ x, q[0], p[1] ^ words[3] ^ y, p[0])
+
+
+@wp.func
+def philox4x32(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: wp.uint32, k1: wp.uint32) -> wp.vec4ui:
+    """Philox4x32 with ten rounds: four 32-bit words from a 128-bit counter and a 64-bit key."""
+    words = wp.vec4ui(c0, c1, c2, c3)
+    x = _opaque(k0)
+    y = _opaque(k1)
+    for _ in range(wp.static(_ROUNDS)):
+        words = _round(words, x, y)
+        x = x + _W0
+        y = y + _W1
+    return words
+
+
+@wp.func
+def random_block(seed: wp.uint64, id: wp.uint64, event: wp.uint32, stream: wp.uint32) -> wp.vec4ui:
+    """The four 32-bit random words of (seed, id, event, stream); id is 64-bit (a photon, a pixel, ...)."""
+    return philox4x32(
+        wp.uint32(id & _LOW32),
+        wp.uint32(id >> wp.uint64(32)),
+        event,
+        stream,
+        wp.uint32(seed & _LOW32),
+        wp.uint32(seed >> wp.uint64(32)),
+    )
+
+
+@wp.struct
+class RoundKeys:
+    """The keys of all rounds, from `round_keys`: as arguments of a kernel they cost a GPU no instruction."""
+
+    x: _Keys
+    y: _Keys
+
+
+def round_keys(seed: int) -> RoundKeys:
+    """The round keys of a seed of 64 bits."""
+    keys = RoundKeys()
+    for name, first, step in (("x", seed, int(_W0)), ("y", seed >> 32, int(_W1))):
+        setattr(keys, name, _Keys(*((first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS))))
+    return keys
+
+
+@wp.func
+def random_block_keyed(keys: RoundKeys, id: wp.uint64, event: wp.uint32, stream: wp.uint32) -> wp.vec4ui:
+    """`random_block` for the seed that the keys were made from."""
+    words = wp.vec4ui(wp.uint32(id & _LOW32), wp.uint32(id >> wp.uint64(32)), event, stream)
+    for i in range(wp.static(_ROUNDS)):
+        words = _round(words, keys.x[i], keys.y[i])
+    return words
+
+
+@wp.func
+def u01(word: wp.uint32) -> float:
+    """Uniform float32 in [0, 1) on the grid k / 2^24: never 1, so log(1 - u01) is finite."""
+    return float(word >> wp.uint32(8)) * 5.9604644775390625e-08
+
+
+@wp.func
+def u01_high(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the upper 16 bits, on the grid (k + 1/2) / 2^16."""
+    return (float(word >> wp.uint32(16)) + 0.5) * 1.52587890625e-05
+
+
+@wp.func
+def u01_low(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the lower 16 bits, on the grid (k + 1/2) / 2^16; independent of `u01_high`."""
+    return (float(word & wp.uint32(0xFFFF)) + 0.5) * 1.52587890625e-05
+
+
+@wp.func
+def u01_last(word: wp.uint32) -> float:
+    """Uniform in [0, 1) from the last 8 bits, on the grid (k + 1/2) / 2^8; independent of `u01` of the same word."""
+    return (float(word & wp.uint32(0xFF)) + 0.5) * 0.00390625
+
+
+@wp.func
+def u01_fine(word: wp.uint32) -> float:
+    """Uniform float32 in [0, 1 - 2^-24] with the full 32-bit resolution near 0, for densities that peak at 0."""
+    return wp.min(float(word) * 2.3283064365386963e-10, 0.99999994)
+
+
+@wp.func
+def u01_open(word: wp.uint32) -> float:
+    """Uniform in (0, 1] with full resolution near 0, for the logarithm of Box and Muller."""
+    return (float(word) + 0.5) * 2.3283064365386963e-10

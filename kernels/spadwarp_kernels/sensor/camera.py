@@ -1,0 +1,158 @@
+"""The camera: origin at the lens centre, +z along the optical axis, +x right, +y down.
+
+Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangents are x/z and y/z of a direction.
+"""
+
+import warp as wp
+
+from spadwarp_kernels.math.rotations import cos_sin_turn
+
+
+@wp.struct
+class Camera:
+    """A camera with a finite aperture disc in the plane z = 0.
+
+    Attributes:
+        width, height: Image size [pixels].
+        pixel_tangent: Pixel pitch over focal length.
+        aperture_radius: Radius of the entrance pupil [m].
+        aperture_area: Its area [m^2].
+        focal: Focal length in pixels along rows and columns; this and what follows is read by `CALIBRATED` alone.
+        principal: Image coordinates of the optical axis.
+        radial: k1, k2, k3 of Brown's model.
+        tangential: p1, p2 of Brown's model.
+        view: Least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it.
+        thin: 1 for a thin lens, 0 for a pinhole that images everything sharply.
+        inverse_focus: 1 over the depth that the thin lens images sharply [1/m]; 0 is infinity.
+    """
+
+    width: int
+    height: int
+    pixel_tangent: float
+    aperture_radius: float
+    aperture_area: float
+    focal: wp.vec2
+    principal: wp.vec2
+    radial: wp.vec3
+    tangential: wp.vec2
+    view: wp.vec4
+    thin: float
+    inverse_focus: float
+
+
+@wp.func
+def project(camera: Camera, x: wp.vec3) -> int:
+    """Row-major index of the pixel that images the point x (line through x and the lens centre), or -1 outside the
+    view."""
+    if x[2] <= 0.0:
+        return -1
+    scale = 1.0 / (x[2] * camera.pixel_tangent)
+    column = x[0] * scale + 0.5 * float(camera.width)
+    row = x[1] * scale + 0.5 * float(camera.height)
+    # Compared as floats: a float beyond the int range has no defined int value.
+    if column < 0.0 or row < 0.0 or column >= float(camera.width) or row >= float(camera.height):
+        return -1
+    return int(row) * camera.width + int(column)
+
+
+@wp.func
+def in_view(camera: Camera, x: wp.vec3) -> bool:
+    """Whether a pinhole camera has the point x in its field of view, up to rounding at its edge."""
+    half = 0.5 * camera.pixel_tangent * x[2]
+    return wp.abs(x[0]) < half * float(camera.width) and wp.abs(x[1]) < half * float(camera.height)
+
+
+@wp.func
+def distort(camera: Camera, t: wp.vec2) -> wp.vec2:
+    """Image coordinates at which the direction of tangents t through the lens centre is seen (Brown 1966)."""
+    x = t[0]
+    y = t[1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (camera.radial[0] + r2 * (camera.radial[1] + r2 * camera.radial[2]))
+    p1 = camera.tangential[0]
+    p2 = camera.tangential[1]
+    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    row = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return wp.vec2(column * camera.focal[0] + camera.principal[0], row * camera.focal[1] + camera.principal[1])
+
+
+@wp.func
+def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
+    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
+
+    Thin lens: the line through x and o meets the focus plane at a point that the lens centre sees in that direction,
+    x/z + o (1/focus - 1/z). Pinhole: x/z.
+    """
+    inverse = 1.0 / x[2]
+    shift = camera.thin * (camera.inverse_focus - inverse)
+    return wp.vec2(x[0] * inverse + shift * o[0], x[1] * inverse + shift * o[1])
+
+
+@wp.func
+def project_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images x by way of the lens point o, or -1 outside the view or the image, and
+    for any pixel but the target where that is not negative."""
+    if x[2] <= 0.0:
+        return -1
+    t = image_tangents(camera, x, o)
+    # Beyond the view the polynomial may turn over and lead back into the image. Also false for what is not a number.
+    if not (t[0] >= view[0] and t[1] >= view[1] and t[0] <= view[2] and t[1] <= view[3]):
+        return -1
+    place = distort(camera, t)
+    column = wp.floor(place[0])
+    row = wp.floor(place[1])
+    if column < 0.0 or row < 0.0 or column >= float(camera.width) or row >= float(camera.height):
+        return -1
+    pixel = int(row) * camera.width + int(column)
+    return wp.where(target >= 0 and pixel != target, -1, pixel)
+
+
+@wp.func
+def pixel_direction(camera: Camera, column: float, row: float) -> wp.vec3:
+    """Unit direction from the lens centre through image coordinates in pixels; (0.5, 0.5) is the first pixel's
+    centre."""
+    return wp.normalize(
+        wp.vec3(
+            (column - 0.5 * float(camera.width)) * camera.pixel_tangent,
+            (row - 0.5 * float(camera.height)) * camera.pixel_tangent,
+            1.0,
+        )
+    )
+
+
+@wp.func
+def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
+    """A uniform point on the aperture disc [m], for uniform xi1, xi2 in [0, 1)."""
+    r = camera.aperture_radius * wp.sqrt(xi1)
+    turn = cos_sin_turn(xi2)
+    return wp.vec3(r * turn[0], r * turn[1], 0.0)
+
+
+@wp.func
+def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.vec2:
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, in front of the origin and between the side planes
+    through it with the given tangents (left, top, right, bottom); empty where s0 >= s1."""
+    interval = wp.vec2(0.0, limit)
+    interval = _clip(x[2], u[2], interval)
+    interval = _clip(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
+    interval = _clip(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
+    interval = _clip(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
+    return _clip(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
+
+
+@wp.func
+def _clip(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
+    """The part of the interval of s in which value + slope s > 0."""
+    # Selected rather than branched to: half the lanes of a warp go either way.
+    crossing = -value / slope
+    lower = wp.where(slope > 0.0, wp.max(interval[0], crossing), interval[0])
+    upper = wp.where(slope < 0.0, wp.min(interval[1], crossing), interval[1])
+    return wp.vec2(lower, wp.where(slope == 0.0 and value <= 0.0, -1.0, upper))
+
+
+@wp.func
+def field(camera: Camera) -> wp.vec4:
+    """Tangents (left, top, right, bottom) of what the image of a pinhole camera shows."""
+    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
+    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
+    return wp.vec4(-half_width, -half_height, half_width, half_height)
