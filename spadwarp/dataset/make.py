@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -203,8 +205,9 @@ def _claim(plan: Plan, folder: Path) -> None:
     path, text = folder / "recipe.toml", plan.recipe.to_toml()
     try:
         if path.is_file():
-            if path.read_text(encoding="utf-8") == text:
-                return
+            with suppress(tomllib.TOMLDecodeError):
+                if tomllib.loads(path.read_text(encoding="utf-8")) == tomllib.loads(text):
+                    return
             raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
         if folder.exists() and not folder.is_dir():
             raise FileError(f"{folder}: is a file; a folder is needed")

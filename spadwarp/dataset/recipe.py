@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,7 +28,7 @@ from pydantic import (
 
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene import Scene
-from spadwarp.scene.load import parse_override, toml_value
+from spadwarp.scene.load import parse_override, toml_text
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole, listed
 
@@ -292,7 +291,7 @@ class Recipe(_Table):
 
     def to_toml(self) -> str:
         """The full text that `load_recipe` reads back to an equal recipe."""
-        return _toml(self.to_dict())
+        return toml_text(self.to_dict())
 
     def with_overrides(self, overrides: Mapping[str, Any] | list[str] | tuple[str, ...]) -> Recipe:
         """A changed recipe: `["seed=7", "frames.per_scene=2"]` or `{"frames.per_scene": 2}`. Raises `ConfigError`."""
@@ -338,28 +337,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _plain(one) for name, one in value.items()}
     return list(value) if isinstance(value, tuple) else value
-
-
-def _toml(tables: Mapping[str, Any]) -> str:
-    """TOML of a recipe: its own fields, then tables; the scene's sections are tables of their own."""
-
-    def lines(fields: Mapping[str, Any]) -> list[str]:
-        return [f"{_key(name)} = {_inline(value)}" for name, value in fields.items()]
-
-    blocks = ["\n".join(lines({name: value for name, value in tables.items() if not isinstance(value, dict)}))]
-    for name, fields in tables.items():
-        if isinstance(fields, dict) and name == "scene":
-            blocks += ["\n".join([f"[scene.{section}]", *lines(inner)]) for section, inner in fields.items()]
-        elif isinstance(fields, dict) and fields:
-            blocks.append("\n".join([f"[{name}]", *lines(fields)]))
-    return "\n\n".join(blocks) + "\n"
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else toml_value(name)
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + " }"
-    return toml_value(value)

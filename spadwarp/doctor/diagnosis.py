@@ -22,7 +22,7 @@ from spadwarp.scene import Scene
 __all__ = ["Diagnosis", "SelfTest", "doctor"]
 
 NEEDED = (
-    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py",
+    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py", "tomli-w",
     "matplotlib",
 )  # fmt: skip
 

@@ -6,7 +6,6 @@ exclude each other: there a later one displaces the earlier ones (`merge_section
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -233,38 +232,8 @@ def key_text(key: Sequence[str | int]) -> str:
 
 
 def toml_text(tables: Mapping[str, Any]) -> str:
-    """TOML of a scene: flat tables, and lists of flat tables for `targets` and `medium.layers`."""
-    return "\n\n".join(block for section, fields in tables.items() for block in _toml_blocks(section, fields)) + "\n"
+    """TOML of a scene's or a recipe's tables, each array on one line."""
+    import tomli_w
 
-
-def _toml_blocks(section: str, fields: Any) -> Iterator[str]:
-    tables, header = (fields, f"[[{section}]]") if isinstance(fields, list) else ([fields], f"[{section}]")
-    for table in tables:
-        inner = {name: value for name, value in table.items() if isinstance(value, list) and _are_tables(value)}
-        yield "\n".join([header, *(f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner)])
-        for name, value in inner.items():
-            yield from _toml_blocks(f"{section}.{name}", value)
-
-
-def _are_tables(value: list[Any]) -> bool:
-    return bool(value) and all(isinstance(one, Mapping) for one in value)
-
-
-def toml_value(value: Any) -> str:
-    """A boolean, number, string or list as TOML writes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + "".join(_ESCAPES.get(char) or _escape(char) for char in value) + '"'
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(toml_value, value)) + "]"
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)  # inf, -inf, nan are TOML's own words
-    return repr(value)
-
-
-_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-
-
-def _escape(char: str) -> str:
-    return f"\\u{ord(char):04x}" if ord(char) < 0x20 or ord(char) == 0x7F else char
+    # Strings are escaped to one line: a line that begins with a space, or with ] after a comma, belongs to an array.
+    return re.sub(r"\n +", " ", re.sub(r",\n *(?=\])|(?<=\[)\n +", "", tomli_w.dumps(tables)))
