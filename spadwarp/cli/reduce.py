@@ -226,9 +226,10 @@ def depth(
       spadwarp depth counts.npy --bin-width-ps 55 --group-index 1.3566 --horizontal-fov-deg 15 \\
           --irf-fwhm-ps 200 --method likelihood --out depth/
     """
+    from spadwarp.frames.depth import depth_of
     from spadwarp.frames.measured import read_histograms
     from spadwarp.io.atomic import file_within
-    from spadwarp.run.depth import depth_of, write_depth
+    from spadwarp.run.depth import write_depth
 
     if ply is not None:
         check_writable(ply.parent)

@@ -16,10 +16,10 @@ from spadwarp.denoise.frames import POOLED, depth_frames
 from spadwarp.denoise.inference import clues_of, denoise_frames, weights_card
 from spadwarp.errors import FileError
 from spadwarp.frames.arrival_time import Method
+from spadwarp.frames.depth import depth_of
 from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.run.depth import depth_of
 from spadwarp.scene import SPEED_OF_LIGHT
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
@@ -152,7 +152,7 @@ def read_depth(
     """Depth from a file.
 
     `.h5`: a result, or frames of counts. `.exr`: depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or
-    histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`: histograms. These become depth by `spadwarp.run.depth.depth_of`.
+    histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`: histograms. These become depth by `spadwarp.frames.depth.depth_of`.
 
     Args:
         path: The file.

@@ -1,136 +1,18 @@
-"""From histograms of any origin to depth: images, EXR, NumPy, point clouds."""
+"""Files of depth: images, EXR, NumPy, point clouds."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
-from spadwarp.frames.arrival_time import Method, arrival_time
-from spadwarp.frames.measured import Histograms
+from spadwarp.frames.depth import Reduction
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.io.ply import point_cloud, write_ply
-from spadwarp.result.result import pixel_directions, range_from_path
-from spadwarp.scene import SPEED_OF_LIGHT, Camera
 
-__all__ = ["Reduction", "depth_of", "write_depth"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Reduction:
-    """Depth of histograms.
-
-    Attributes:
-        quantity: `"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known.
-        values: float64 `[frames, H, W]` [m]; NaN where nothing returned.
-        range: The same along the line of sight.
-        intensity: Sum over the bins, `[frames, H, W]`.
-        directions: Lines of sight, unit vectors `[H, W, 3]`, or None.
-        method: Estimator of the arrival time.
-    """
-
-    quantity: Literal["depth", "range"]
-    values: NDArray[np.float64]
-    range: NDArray[np.float64]
-    intensity: NDArray[Any]
-    directions: NDArray[np.float64] | None
-    method: Method
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self.values)
-
-    @property
-    def first(self) -> NDArray[np.float64]:
-        """The first frame, `[H, W]` [m]."""
-        return self.values[0]
-
-
-def depth_of(
-    histograms: Histograms,
-    *,
-    method: Method = "centroid",
-    group_index: float | None = None,
-    horizontal_fov_deg: float | None = None,
-    background: float | Literal["median"] | None = None,
-    device: Any = None,
-) -> Reduction:
-    """Depth of histograms from a file.
-
-    Args:
-        histograms: From `spadwarp.frames.measured.read_histograms`.
-        method: See `spadwarp.arrival_time`; `"matched"` and `"likelihood"` need a response.
-        group_index: Vacuum speed of light over that of the pulse, ≥ 1; a simulation knows its own.
-        horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
-        background: Expected background per bin in the unit of the values, ≥ 0; `"median"`: the median bin of each
-            pixel. Default: what the file knows; else none, with `"likelihood"` the median.
-        device: Warp device.
-
-    Measured histograms count as those of a laser in the lens, whose pulse leaves at time 0.
-
-    Raises:
-        ValueError: Something that is needed is missing, given twice or out of range.
-    """
-    scene = histograms.scene
-    if histograms.bin_width is None:
-        raise ValueError("bin width is missing (--bin-width-ps): the file does not tell it")
-    if scene is None and group_index is None:
-        raise ValueError("group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
-    if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
-        raise ValueError("group index and field of view are those of the file's scene")
-    index = scene.medium.group_index if scene is not None else float(group_index or 0)
-    if not 1 <= index <= 3:
-        raise ValueError(f"group index = {index} is outside [1, 3]")
-    values = histograms.values
-    height, width = values.shape[-3:-1]
-    directions, laser = None, (0.0, 0.0, 0.0)
-    if scene is not None:
-        directions, laser = pixel_directions(scene.camera), scene.beam.position
-    elif horizontal_fov_deg is not None:
-        if not 0 < horizontal_fov_deg < 180:
-            raise ValueError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
-        camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
-        directions = pixel_directions(camera)
-
-    known: Any = background
-    if background is None:
-        known = histograms.background
-        if known is None and method == "likelihood":
-            background = "median"
-    if background == "median":
-        frames = values.reshape(-1, *values.shape[-3:])
-        # Of all frames together: the median of sparse counts would be 0.
-        known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
-    filtered = method in ("matched", "likelihood")
-    response = histograms.response if filtered else histograms.irf
-    if filtered and response is None:
-        raise ValueError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
-    time = arrival_time(
-        values,
-        gate_start=histograms.gate_start,
-        bin_width=histograms.bin_width,
-        method=method,
-        irf=response,
-        background=known,
-        device=device,
-    ).reshape(-1, height, width)
-    view = np.array([0.0, 0.0, 1.0]) if directions is None else directions
-    distance = range_from_path(time * (SPEED_OF_LIGHT / index), view, laser)
-    planar = directions is not None
-    return Reduction(
-        quantity="depth" if planar else "range",
-        values=distance * view[..., 2] if planar else distance,
-        range=distance,
-        intensity=values.sum(axis=-1).reshape(-1, height, width),
-        directions=directions,
-        method=method,
-    )
+__all__ = ["write_depth"]
 
 
 def write_depth(

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import spadwarp
+from spadwarp.frames.depth import depth_of
 from spadwarp.frames.measured import read_histograms
 from spadwarp.io.ply import point_cloud, write_ply
 from spadwarp.result.result import pixel_directions
-from spadwarp.run.depth import depth_of
 from spadwarp.scene import Camera
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
