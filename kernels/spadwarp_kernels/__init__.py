@@ -77,8 +77,8 @@ from .surface import (
 )
 from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, to_fixed_point
 from .transport import (
+    BRUTE_FORCE_FACES,
     ESTIMATORS,
-    FEW_FACES,
     Data,
     Model,
     Records,
@@ -99,13 +99,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BACKSCATTER_SOURCES",
+    "BRUTE_FORCE_FACES",
     "C0",
     "CALIBRATED",
     "COMPONENTS",
     "COUNTERS",
     "COUNT_LAWS",
     "ESTIMATORS",
-    "FEW_FACES",
     "HENYEY_GREENSTEIN",
     "LASER_PROFILES",
     "LEDGER_ENTRIES",

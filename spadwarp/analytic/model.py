@@ -291,7 +291,7 @@ def pixel_maps(
         signal_d,
         arrival_d,
         total_d,
-        count_law=chosen.count_law,
+        count_law=chosen.count_law.replace("paper", "lu2024"),
         acquisitions=chosen.pulses if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=per_frame,
         outliers=outliers,
@@ -376,7 +376,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     if problems:
         raise ConfigError(problems, source=_source(scene))
     lidar: Any = Lidar()
-    lidar.paper = int(paper)
+    lidar.lu2024 = int(paper)
     lidar.photons = laser.photons_per_pulse
     lidar.pde = scene.detector.pde
     lidar.extinction = scene.medium.extinction

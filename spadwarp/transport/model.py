@@ -168,9 +168,9 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
-        paper_albedo=scene.medium.albedo == "paper",
+        random_albedo=scene.medium.albedo == "paper",
         mesh=mesh is not None,
-        few_faces=mesh is not None and mesh.face_count <= sk.FEW_FACES,
+        brute_force=mesh is not None and mesh.face_count <= sk.BRUTE_FORCE_FACES,
         bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),
         roulette=scene.transport.termination == "roulette",
         pattern=mesh is not None and mesh.pattern is not None,
@@ -179,7 +179,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         lens=sk.PINHOLE if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED,
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode == "confocal",
-        turned=_is_turned(scene),
+        rotated_domain=_is_turned(scene),
     )
     return spec._replace(**choices)
 

@@ -116,7 +116,7 @@ class Lane:
                 tallies, squares, accounts = self.data.tally, None, [sk.read_ledger(self.data)]
             else:
                 tallies, accounts = self.batches.total, self.accounts or [sk.read_ledger(self.data)]
-                squares = np.stack([half.numpy().reshape(shape) for half in self.batches.squares])
+                squares = np.stack([half.numpy().reshape(shape) for half in self.batches.second_moment])
             ledger, counters = (
                 {name: sum(one[i][name] for one in accounts) for name in accounts[0][i]} for i in (0, 1)
             )
@@ -127,7 +127,7 @@ class Lane:
         self.accounts.clear()
         arrays = [self.data.tally, self.data.ledger]
         if self.batches is not None:
-            arrays += [self.batches.total, *self.batches.squares]
+            arrays += [self.batches.total, *self.batches.second_moment]
         for array in arrays:
             array.zero_()
 

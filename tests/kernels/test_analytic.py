@@ -21,7 +21,7 @@ def lidar(**changes):
     """A coaxial lidar in clear air of index 1, one photon a pulse; `changes` are fields of the struct."""
     half_angle = changes.pop("half_angle", math.radians(5.0))
     fields = {
-        "paper": 0,
+        "lu2024": 0,
         "photons": 1.0,
         "pde": 1.0,
         "extinction": 0.0,
@@ -99,7 +99,7 @@ def test_equations_3_to_6_combine_to_equation_7():
         photons = 532e-9 / crlb.PLANCK_TIMES_C
         assert chain * photons == pytest.approx(expected, rel=1e-12)
         one = lidar(
-            paper=1,
+            lu2024=1,
             photons=E0 * photons,
             pde=q * fill,
             extinction=c,
@@ -195,14 +195,14 @@ def scatter_table(one, view, distance, g, device="cpu"):
 def test_coaxial_backscatter_is_the_single_scatter_formula():
     """C_back = (λE0/hc)·PDE·v·b·p(π)·pitch²·e^{−2cR}/(8N²tan²θ·R²); in radiometry 2π(1−cosθ) stands for πtan²θ."""
     g, half, c = 0.924, math.radians(3.0), 0.4
-    for paper in (0, 1):
+    for lu2024 in (0, 1):
         one = lidar(
-            paper=paper, half_angle=half, extinction=c, scattering=0.3, photons=1e9, pde=0.1, start=1.2e-8, stop=4e-8
+            lu2024=lu2024, half_angle=half, extinction=c, scattering=0.3, photons=1e9, pde=0.1, start=1.2e-8, stop=4e-8
         )
         paths, cumulative, total = scatter_table(one, [AXIS, AXIS], [0.0, 3.0], g)
         back = (1 - g * g) / (4 * math.pi * (1 + g) ** 3)
         pitch2_per_n2 = 4 * one.aperture_area * one.pixel_tangent**2 / math.pi
-        cone = math.tan(half) ** 2 if paper else 2 * (1 - math.cos(half))
+        cone = math.tan(half) ** 2 if lu2024 else 2 * (1 - math.cos(half))
         for row, stop in enumerate((4e-8, 6.0 / C0)):
             t = np.linspace(1.2e-8, stop, 200_001)
             R = C0 * t / 2
@@ -335,7 +335,7 @@ def test_count_laws():
         for law, recorded in {
             "per_pulse": 500 * -math.expm1(-alpha),
             "per_frame": 500 * -math.expm1(-alpha * 40),
-            "per_frame_paper": 500 * (1 - (1 - alpha) ** 40),
+            "per_frame_lu2024": 500 * (1 - (1 - alpha) ** 40),
         }.items():
             _, fisher, sigma_star, _ = statistics(
                 lidar(), np.array([level]), np.array([5e-8]), count_law=law, acquisitions=500, pulses_per_frame=40

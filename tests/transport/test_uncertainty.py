@@ -33,7 +33,7 @@ def test_squares_are_exact_to_128_bits(device):
         assert not tally.numpy().any()
     sums = [[int(v) // 3 for v in row.ravel()] for row in rows]
     expected = [sum((row[i] + row[50 + i] + row[100 + i]) ** 2 for row in sums) for i in range(50)]
-    low, high = (half.numpy() for half in batches.squares)
+    low, high = (half.numpy() for half in batches.second_moment)
     assert [int(h) << 64 | int(l) for l, h in zip(low, high, strict=True)] == expected
     assert batches.count == 300
 

@@ -3,12 +3,11 @@
 from .cramer_rao import COUNT_LAWS, histogram_information, outlier_probabilities, statistics_maps
 from .depth_frames import Sampler, sample_frames
 from .labelled_frames import FrameCoding, draw_frames
-from .lidar import BACKSCATTER_SOURCES, FORMS, TABLE_EDGES, Lidar, signal_map, single_scatter_table
+from .lidar import BACKSCATTER_SOURCES, TABLE_EDGES, Lidar, signal_map, single_scatter_table
 
 __all__ = [
     "BACKSCATTER_SOURCES",
     "COUNT_LAWS",
-    "FORMS",
     "TABLE_EDGES",
     "FrameCoding",
     "Lidar",

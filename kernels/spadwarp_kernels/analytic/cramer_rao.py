@@ -23,7 +23,7 @@ _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
 
-COUNT_LAWS = ("per_pulse", "per_frame", "per_frame_paper")
+COUNT_LAWS = ("per_pulse", "per_frame", "per_frame_lu2024")
 
 
 @wp.func

@@ -19,7 +19,6 @@ _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
 
-FORMS = ("radiometric", "paper")
 BACKSCATTER_SOURCES = ("constant", "single_scatter", "monte_carlo")
 
 TABLE_EDGES = 65
@@ -33,7 +32,7 @@ class Lidar:
     """Laser, water, camera and gate as the analytic model needs them.
 
     Attributes:
-        paper: Whether the paper's photon budget (K = 8, small angles, no cosines) replaces radiometry.
+        lu2024: 1 if the photon budget of Lu et al. 2024 (K = 8, small angles, no cosines) replaces radiometry, else 0.
         photons: Photons per pulse, E0 λ/hc.
         pde: Photon detection efficiency, PDP times fill factor.
         extinction, scattering: Of the water [1/m].
@@ -54,7 +53,7 @@ class Lidar:
         bin_width: Of the Monte Carlo profile [s] (source 2).
     """
 
-    paper: int
+    lu2024: int
     photons: wp.float64
     pde: wp.float64
     extinction: wp.float64
@@ -111,7 +110,7 @@ def pixel_energy(fluence: wp.float64, pdp: wp.float64, focal_length: wp.float64,
 
 
 @wp.func
-def paper_signal(lidar: Lidar, distance: wp.float64, reflectance: wp.float64) -> wp.float64:
+def lu2024_signal(lidar: Lidar, distance: wp.float64, reflectance: wp.float64) -> wp.float64:
     """Signal detections per pulse, eq 3 to 6 in a row, which is eq 7 with K = 8.
 
     The focal length cancels; here it is 1 m: the pixel's sides are pixel_tangent, the f-number is 1/(2 radius).
@@ -278,8 +277,8 @@ def _signal(
     time = wp.float64(wp.nan)
     if r > _ZERO:
         time = (beam_path(lidar, r * view[i]) + r) / lidar.speed
-        if lidar.paper == 1:
-            value = paper_signal(lidar, r, gamma)
+        if lidar.lu2024 == 1:
+            value = lu2024_signal(lidar, r, gamma)
         else:
             value = radiometric_signal(lidar, view[i], r, normal[i], gamma)
         if not (value > _ZERO):
@@ -318,7 +317,7 @@ def single_scatter_per_metre(
 
     For a laser in the lens, a narrow cone and the axis it is C_back(t) of the paper's geometry times dt/dr.
     """
-    if lidar.paper == 1:
+    if lidar.lu2024 == 1:
         scale = lidar.photons * lidar.pde * lidar.scattering * phase[phase.shape[0] - 1]
         # pitch^2/N^2 = 4 A (pitch/f)^2/pi
         etendue = wp.float64(4.0) / _PI * lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent
@@ -349,7 +348,7 @@ def single_scatter_rate(
 def lit_interval(lidar: Lidar, view: wp.vec3d) -> wp.vec2d:
     """The part [near, far] of a line of sight inside the laser's uniform cone; far < near if there is none."""
     far = wp.float64(1.0e30)
-    if lidar.profile != 0 or lidar.spread >= _ONE or lidar.paper == 1:
+    if lidar.profile != 0 or lidar.spread >= _ONE or lidar.lu2024 == 1:
         return wp.vec2d(_ZERO, far)
     cos_half = _ONE - lidar.spread
     k = cos_half * cos_half

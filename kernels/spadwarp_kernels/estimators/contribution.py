@@ -105,7 +105,7 @@ def make_score(spec: Any) -> wp.Function:
     `TransportSpec` with next events."""
     guided = spec.estimator == "guided"
     layered, specular, confocal = spec.layered, spec.specular, spec.confocal
-    local_albedo = layered and not spec.paper_albedo
+    local_albedo = layered and not spec.random_albedo
     _, water_extinction, water_at = LAYERED if layered else HOMOGENEOUS
     project = spec.lens[1]
     phase_pdf = spec.phase.pdf

@@ -11,7 +11,7 @@ class Limits:
 
     Attributes:
         lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face.
-        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read by `..._turned` alone, the
+        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read by `..._rotated` alone, the
             others take lower and upper as they stand in the frame of the flight.
         lateral: A history ends where |x| or |y| reaches this [m].
         max_path: Geometric path [m].
@@ -86,7 +86,7 @@ def is_outside(limits: Limits, x: wp.vec3) -> bool:
 
 
 @wp.func
-def is_outside_turned(limits: Limits, x: wp.vec3) -> bool:
+def is_outside_rotated(limits: Limits, x: wp.vec3) -> bool:
     """As `is_outside`, for a domain with axes of its own."""
     return _outside_sides(limits, x) or _outside_faces(limits, limits.rotation * x + limits.origin)
 
@@ -104,12 +104,12 @@ def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
 
 
 @wp.func
-def exit_distance_turned(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+def exit_distance_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     """As `exit_distance`, for a domain with axes of its own; the lateral limit keeps to the frame of the flight."""
     return wp.min(_to_sides(limits, x, u), _to_faces(limits, limits.rotation * x + limits.origin, limits.rotation * u))
 
 
 @wp.func
-def exit_face_turned(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+def exit_face_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
     """As `exit_face`, for a domain with axes of its own; faces are named after them."""
     return _first_face(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)

@@ -22,16 +22,16 @@ class Lens(NamedTuple):
             that holds all of it that the view shows by way of o; empty where s0 >= s1.
         may_be_hidden: Warp function (camera, near depth map, x) -> whether a point that is seen may have something
             before it.
-        sees: Warp function (camera, view, target, x) -> whether x lies in the view, up to rounding.
-        inward: Warp function (view, x) -> vector across the optical axis from x towards the middle of the view.
+        in_view: Warp function (camera, view, target, x) -> whether x lies in the view, up to rounding.
+        toward_axis: Warp function (view, x) -> vector across the optical axis from x towards the middle of the view.
     """
 
     name: str
     project: wp.Function
     clip: wp.Function
     may_be_hidden: wp.Function
-    sees: wp.Function
-    inward: wp.Function
+    in_view: wp.Function
+    toward_axis: wp.Function
 
 
 @wp.func
@@ -45,12 +45,12 @@ def _clip_pinhole(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.v
 
 
 @wp.func
-def _sees_pinhole(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
+def _in_view_pinhole(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
     return in_view(camera, x)
 
 
 @wp.func
-def _inward_pinhole(view: wp.vec4, x: wp.vec3) -> wp.vec3:
+def _toward_axis_pinhole(view: wp.vec4, x: wp.vec3) -> wp.vec3:
     return wp.vec3(-x[0], -x[1], 0.0)
 
 
@@ -66,20 +66,20 @@ def _clip_calibrated(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: w
 
 
 @wp.func
-def _sees_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
+def _in_view_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3) -> bool:
     return project_calibrated(camera, view, target, x, wp.vec3(0.0, 0.0, 0.0)) >= 0
 
 
 @wp.func
-def _inward_calibrated(view: wp.vec4, x: wp.vec3) -> wp.vec3:
+def _toward_axis_calibrated(view: wp.vec4, x: wp.vec3) -> wp.vec3:
     depth = 0.5 * wp.max(x[2], 0.0)
     return wp.vec3(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1], 0.0)
 
 
-PINHOLE = Lens("pinhole", _project_pinhole, _clip_pinhole, may_be_hidden, _sees_pinhole, _inward_pinhole)
+PINHOLE = Lens("pinhole", _project_pinhole, _clip_pinhole, may_be_hidden, _in_view_pinhole, _toward_axis_pinhole)
 """Square pixels about the optical axis, everything sharp: the first five attributes of `Camera`."""
 
 CALIBRATED = Lens(
-    "calibrated", project_calibrated, _clip_calibrated, may_be_hidden_in, _sees_calibrated, _inward_calibrated
+    "calibrated", project_calibrated, _clip_calibrated, may_be_hidden_in, _in_view_calibrated, _toward_axis_calibrated
 )
 """Focal lengths and principal point in pixels, Brown's distortion, pinhole or thin lens: all of `Camera`."""

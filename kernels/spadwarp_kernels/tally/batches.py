@@ -47,7 +47,7 @@ class Batches:
 
     Attributes:
         total: int64, as the tally.
-        squares: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
+        second_moment: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
         count: Batches closed.
     """
 
@@ -55,16 +55,16 @@ class Batches:
         self._component_count = component_count
         voxels = tally.size // component_count
         self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device) if total is None else total
-        self.squares = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
+        self.second_moment = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
         self.count = 0
 
     def close(self, tally: wp.array) -> None:
         """Takes the tally over as one batch and sets it to zero."""
         wp.launch(
             close_batch_kernel,
-            dim=self.squares[0].size,
+            dim=self.second_moment[0].size,
             inputs=[self._component_count, tally],
-            outputs=[self.total, *self.squares],
+            outputs=[self.total, *self.second_moment],
             device=tally.device,
         )
         self.count += 1

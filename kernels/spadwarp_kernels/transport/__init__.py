@@ -1,6 +1,6 @@
 """The transport kernel, what it takes and writes, and its launch."""
 
-from .kernel import ESTIMATORS, FEW_FACES, Records, TransportSpec, make_transport_kernel
+from .kernel import BRUTE_FORCE_FACES, ESTIMATORS, Records, TransportSpec, make_transport_kernel
 from .launch import (
     Data,
     Model,
@@ -16,8 +16,8 @@ from .launch import (
 )
 
 __all__ = [
+    "BRUTE_FORCE_FACES",
     "ESTIMATORS",
-    "FEW_FACES",
     "Data",
     "Model",
     "Records",

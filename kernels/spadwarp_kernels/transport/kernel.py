@@ -36,11 +36,11 @@ from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
 from spadwarp_kernels.medium.limits import (
     Limits,
     exit_distance,
-    exit_distance_turned,
+    exit_distance_rotated,
     exit_face,
-    exit_face_turned,
+    exit_face_rotated,
     is_outside,
-    is_outside_turned,
+    is_outside_rotated,
 )
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import (
@@ -122,7 +122,7 @@ WALKING_LANES = 8
 START_LANES = 3
 
 # Meshes of at most this many faces need no BVH.
-FEW_FACES = 12
+BRUTE_FORCE_FACES = 12
 
 # Registers a thread, without and with a BVH: fewer spill, more leave too few warps to hide latency.
 MAX_REGISTERS = {"none": (56, 64), "analog": (64, 64), "next_event": (64, 64), "guided": (96, 72)}
@@ -134,9 +134,9 @@ class TransportSpec(NamedTuple):
     Attributes:
         estimator: One of ESTIMATORS; "none" transports without a camera.
         phase: Phase function of the water.
-        paper_albedo: Draw the albedo uniformly from [0, medium.albedo] at each collision.
+        random_albedo: Draw the albedo uniformly from [0, medium.albedo] at each collision.
         mesh: Trace rays against a mesh.
-        few_faces: On CUDA, try every face rather than walk the tree; for meshes of up to FEW_FACES faces.
+        brute_force: On CUDA, try every face rather than walk the tree; for meshes of up to BRUTE_FORCE_FACES faces.
         bounded: Honour the domain and the lateral limit.
         roulette: Russian roulette in place of the weight cut-off.
         records: Write the terminal state of each photon.
@@ -146,14 +146,14 @@ class TransportSpec(NamedTuple):
         lens: How the camera images.
         measured_beam: Emit from the laser's measured profile.
         confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
-        turned: The domain has axes of its own.
+        rotated_domain: The domain has axes of its own.
     """
 
     estimator: str = "next_event"
     phase: PhaseFunction = HENYEY_GREENSTEIN
-    paper_albedo: bool = False
+    random_albedo: bool = False
     mesh: bool = True
-    few_faces: bool = False
+    brute_force: bool = False
     bounded: bool = False
     roulette: bool = False
     records: bool = False
@@ -163,7 +163,7 @@ class TransportSpec(NamedTuple):
     lens: Lens = PINHOLE
     measured_beam: bool = False
     confocal: bool = False
-    turned: bool = False
+    rotated_domain: bool = False
 
 
 @wp.struct
@@ -256,29 +256,29 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     analog = spec.estimator == "analog"
     next_event = spec.estimator == "next_event"
     guided = spec.estimator == "guided"
-    paper_albedo, has_mesh, few_faces, bounded, roulette, records = spec[2:8]
+    random_albedo, has_mesh, brute_force, bounded, roulette, records = spec[2:8]
     layered, pattern, specular = spec.layered, spec.pattern, spec.specular
-    local_albedo = layered and not paper_albedo
+    local_albedo = layered and not random_albedo
     water_free_path, _, water_at = LAYERED if layered else HOMOGENEOUS
     confocal = spec.confocal
     pinhole = spec.lens.name == PINHOLE.name
     if confocal and pinhole:
         raise ValueError("confocal = True needs lens = CALIBRATED")
-    project, clip_to_view, may_be_hidden, sees, inward_of = spec.lens[1:]
+    project, clip_to_view, may_be_hidden, in_view, toward_axis = spec.lens[1:]
     emit = emit_measured if spec.measured_beam else emit_along
     to_exit, face_of_exit, outside = (
-        (exit_distance_turned, exit_face_turned, is_outside_turned)
-        if spec.turned
+        (exit_distance_rotated, exit_face_rotated, is_outside_rotated)
+        if spec.rotated_domain
         else (exit_distance, exit_face, is_outside)
     )
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
-    few_faces = few_faces and cuda
-    has_bvh = has_mesh and not few_faces
+    brute_force = brute_force and cuda
+    has_bvh = has_mesh and not brute_force
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
     reflectance_at = pattern_reflectance if pattern else face_reflectance
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
-    aimed = spec.phase.guide is not None
+    has_phase_guide = spec.phase.guide is not None
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     ray_lanes = RAY_LANES if has_bvh else 32
     scores = next_event or guided
@@ -348,7 +348,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.distance = water_free_path(medium, layers, s.x, s.u, u01(s.block[0]))
                     limit = limits.max_path - s.path
                     s.reach = wp.min(s.distance, limit)
-                    if wp.static(paper_albedo):
+                    if wp.static(random_albedo):
                         draw = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)
                         s.albedo = medium.albedo * u01(draw[1])
                     s.stage = _EVENT
@@ -513,7 +513,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                             surfaces.lower,
                                             surfaces.upper,
                                         )
-                                        if wp.static(few_faces):
+                                        if wp.static(brute_force):
                                             if not seen:
                                                 s.shadow_queries += 1
                                                 to = found.lens - found.origin
@@ -594,16 +594,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(guided):
                             # Towards the lens, or back into the view, with some chance; the weight makes up for it.
                             v = -wp.normalize(s.x)
-                            if wp.static(aimed):
+                            if wp.static(has_phase_guide):
                                 # To the point of the lens at which the flight to come will be scored: a lobe about
                                 # the lens's centre could not have a peak narrower than the lens.
                                 id = first_id + wp.uint64(s.photon)
                                 ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
                                 v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
-                            inward = inward_of(s.view, s.x)
+                            inward = toward_axis(s.view, s.x)
                             to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
                             to_view_chance = float(0.0)
-                            if wp.dot(inward, inward) > 0.0 and not sees(camera, s.view, s.target, s.x):
+                            if wp.dot(inward, inward) > 0.0 and not in_view(camera, s.view, s.target, s.x):
                                 to_view_chance = guiding.return_probability
                                 inward = wp.normalize(inward)
                             choice = u01(s.block[3])

@@ -22,7 +22,7 @@ from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces, Textures
 from spadwarp_kernels.tally.tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
 
-from .kernel import FEW_FACES, Records, TransportSpec, make_transport_kernel
+from .kernel import BRUTE_FORCE_FACES, Records, TransportSpec, make_transport_kernel
 
 
 @dataclass(frozen=True)
@@ -262,8 +262,8 @@ def launch_transport(
     """
     if not 0 < photon_count <= 1 << 26:
         raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    if spec.few_faces and not 0 < model.surfaces.order.size <= FEW_FACES:
-        raise ValueError(f"spec.few_faces = True is for meshes of 1 to {FEW_FACES} faces")
+    if spec.brute_force and not 0 < model.surfaces.order.size <= BRUTE_FORCE_FACES:
+        raise ValueError(f"spec.brute_force = True is for meshes of 1 to {BRUTE_FORCE_FACES} faces")
     for name, needed in surface_choices(model.surfaces).items():
         if spec.mesh and getattr(spec, name) != needed:
             raise ValueError(
