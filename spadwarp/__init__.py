@@ -42,12 +42,12 @@ _HOMES = {
     "Truth": "result.result",
     "load_result": "result.file",
     "detect": "frames.spad",
-    "Detection": "frames.spad",
+    "Frames": "frames.spad",
     "coates": "frames.spad",
     "InstrumentResponse": "frames.response",
     "instrument_response": "frames.response",
     "arrival_time": "frames.arrival_time",
-    "crlb_map": "frames.cramer_rao",
+    "crlb": "frames.cramer_rao",
     "simulate_analytic": "analytic.model",
     "AnalyticResult": "analytic.model",
     "load_truth_exr": "result.rendered_truth",
@@ -90,9 +90,9 @@ if TYPE_CHECKING:
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.frames.arrival_time import arrival_time
-    from spadwarp.frames.cramer_rao import crlb_map
+    from spadwarp.frames.cramer_rao import crlb
     from spadwarp.frames.response import InstrumentResponse, instrument_response
-    from spadwarp.frames.spad import Detection, coates, detect
+    from spadwarp.frames.spad import Frames, coates, detect
     from spadwarp.interop.torch import TorchResult, to_torch
     from spadwarp.parallel import Ray, interruptible, run_jobs
     from spadwarp.result.file import load_result

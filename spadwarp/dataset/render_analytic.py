@@ -16,7 +16,7 @@ from spadwarp.result.result import Truth, pixel_directions, range_from_path
 from spadwarp.scene import SPEED_OF_LIGHT, Scene
 from spadwarp.transport.model import truth_maps
 
-__all__ = ["PROFILE_BINS", "Frames", "Histograms", "RenderedScene", "intensity_step", "render_scene"]
+__all__ = ["PROFILE_BINS", "Histograms", "RenderedScene", "StoredFrames", "intensity_step", "render_scene"]
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""
@@ -28,7 +28,7 @@ Profile = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class StoredFrames:
     """Frames as they are stored.
 
     Attributes:
@@ -79,7 +79,7 @@ class RenderedScene:
     profile: Profile
     signal: float
     backscatter: float
-    frames: Frames
+    frames: StoredFrames
     histograms: Histograms | None = None
 
 
@@ -181,7 +181,7 @@ def _draw_frames(
     bound: NDArray[np.float64],
     *,
     device: str | None,
-) -> Frames:
+) -> StoredFrames:
     import warp as wp
 
     from spadwarp.device import pick_device
@@ -217,7 +217,7 @@ def _draw_frames(
         put(fractions),
     )
     count = len(draw.fractions)
-    return Frames(
+    return StoredFrames(
         depth=depth.numpy().reshape(count, *shape),
         intensity=intensity.numpy().reshape(count, *shape),
         labels=labels.numpy().reshape(count, shape[0], -1),

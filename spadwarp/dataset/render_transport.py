@@ -6,10 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import depth_per_time
-from spadwarp.dataset.render_analytic import Frames, Histograms, RenderedScene, exposed, intensity_step, water_profile
+from spadwarp.dataset.render_analytic import (
+    Histograms,
+    RenderedScene,
+    StoredFrames,
+    exposed,
+    intensity_step,
+    water_profile,
+)
 from spadwarp.dataset.sampling import Plan, SceneDraw
-from spadwarp.frames.cramer_rao import crlb_map
-from spadwarp.frames.spad import Detection, detect
+from spadwarp.frames.cramer_rao import crlb
+from spadwarp.frames.spad import Frames, detect
 from spadwarp.result.result import Result, pixel_directions, range_from_path
 from spadwarp.scene import SPEED_OF_LIGHT, Scene
 from spadwarp.transport.simulate import simulate
@@ -34,7 +41,7 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
         scene = exposed(scene, draw, returned[seen], most=_MOST_PULSES)
     pulses = min(scene.analytic.pulses, _MOST_PULSES)
     taken = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
-    time_bound = crlb_map(result, pulses=pulses, device=device)
+    time_bound = crlb(result, pulses=pulses, device=device)
     view = pixel_directions(scene.camera)
     distances = np.nan_to_num(result.truth.range.reshape(-1).astype(np.float64))
     per_time = depth_per_time(scene, view.reshape(-1, 3), distances).reshape(seen.shape)
@@ -55,7 +62,7 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
     )
 
 
-def _frames(plan: Plan, scene: Scene, result: Result, taken: Detection, *, device: str | None) -> Frames:
+def _frames(plan: Plan, scene: Scene, result: Result, taken: Frames, *, device: str | None) -> StoredFrames:
     """Depth from the counts, and whether it is background that was most likely reported."""
     time = taken.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
     view = pixel_directions(scene.camera)
@@ -66,7 +73,7 @@ def _frames(plan: Plan, scene: Scene, result: Result, taken: Detection, *, devic
     codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
     counts = taken.counts.sum(axis=-1, dtype=np.int64)
     step = intensity_step(float((taken.expected.sum(axis=-1) * taken.pulses).max()))
-    return Frames(
+    return StoredFrames(
         depth=codes,
         intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
         labels=np.packbits(_stray(taken, time), axis=-1),
@@ -74,7 +81,7 @@ def _frames(plan: Plan, scene: Scene, result: Result, taken: Detection, *, devic
     )
 
 
-def _stray(taken: Detection, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _stray(taken: Frames, time: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether background is more likely than the target at the time that a pixel reports, `[K, H, W]`."""
     bins = taken.expected.shape[-1]
     at = np.nan_to_num((time - taken.gate_start) / taken.bin_width).astype(np.int64).clip(0, bins - 1)

@@ -14,7 +14,7 @@ from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, instrum
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
-__all__ = ["crlb_from_histogram", "crlb_map"]
+__all__ = ["crlb", "crlb_from_histogram"]
 
 Map = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def crlb_from_histogram(
     return np.where(information > 0, sigma, np.nan).reshape(signal.shape[:-1])
 
 
-def crlb_map(
+def crlb(
     result: Result,
     *,
     pulses: float | None = None,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames.arrival_time import METHODS, Method
-from spadwarp.frames.spad import Detection, detect
+from spadwarp.frames.spad import Frames, detect
 from spadwarp.io.hdf5 import hdf5_file
 from spadwarp.result.result import Result, pixel_directions, range_from_path
 from spadwarp.scene.intrinsics import camera_attributes
@@ -58,7 +58,7 @@ class Recording:
 
     Attributes:
         path: The file.
-        first: Detection of the first frame, its counts `[1, H, W, T]`.
+        first: The first frame, its counts `[1, H, W, T]`.
         depth: First frame by each estimator, float64 `[H, W]` [m].
         errors: By estimator; of at most the first 256 MiB of counts.
         bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m].
@@ -67,7 +67,7 @@ class Recording:
     """
 
     path: Path
-    first: Detection
+    first: Frames
     depth: dict[Method, NDArray[np.float64]]
     errors: dict[Method, FrameErrors]
     bound_time: NDArray[np.float64]
@@ -112,7 +112,7 @@ def record_frames(
         FileError: The file cannot be written.
     """
 
-    from spadwarp.frames.cramer_rao import crlb_map
+    from spadwarp.frames.cramer_rao import crlb
 
     scene = result.scene
     pulses = scene.detector.pulses if pulses is None else pulses
@@ -122,10 +122,10 @@ def record_frames(
     bound_time = np.full(result.truth.depth.shape, np.nan)
     if scene.laser.pulse_fwhm_ps or scene.detector.jitter_fwhm_ps or scene.detector.irf.lower().endswith(".csv"):
         law: Any = "poisson" if scene.detector.mode == "free_running" else "first_photon"
-        bound_time = crlb_map(result, pulses=pulses, law=law, device=device)
+        bound_time = crlb(result, pulses=pulses, law=law, device=device)
     bound_depth = bound_time * _depth_per_time(result)
 
-    first: Detection | None = None
+    first: Frames | None = None
     depth: dict[Method, NDArray[np.float64]] = {}
     errors: dict[Method, FrameErrors] = {}
     detections = 0
@@ -198,7 +198,7 @@ def _errors(depth: NDArray[np.float64], result: Result) -> FrameErrors:
 # HDF5
 
 
-def _begin(file: Any, result: Result, some: Detection, frames: int, methods: Sequence[Method], tags: bool) -> None:
+def _begin(file: Any, result: Result, some: Frames, frames: int, methods: Sequence[Method], tags: bool) -> None:
     """Everything but the frames, and room for them."""
     scene = result.scene
     _, height, width, bins = some.counts.shape

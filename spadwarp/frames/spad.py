@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from spadwarp.frames.arrival_time import Method
 
 __all__ = [
-    "Detection",
+    "Frames",
     "InstrumentResponse",
     "TimeTags",
     "coates",
@@ -43,7 +43,7 @@ class TimeTags(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Detection:
+class Frames:
     """What the camera reports; `counts`, `expected` and `background` are torch tensors if it was asked by them.
 
     Attributes:
@@ -155,7 +155,7 @@ def detect(
     camera_seed: int = 0,
     out: Any = None,
     device: Any = None,
-) -> Detection:
+) -> Frames:
     """Frames of counts that the camera would record.
 
     First-photon counts are exact multinomials, drawn bin after bin as binomials at a cost that does not depend on
@@ -313,7 +313,7 @@ def detect(
         counts = counts.reshape(frames, height, width, axis.recorded).sum(0, dtype=counts.dtype)
         if as_torch:
             counts = out.copy_(counts)
-    return Detection(
+    return Frames(
         counts=counts.reshape(*shape, axis.recorded),
         pulses=pulses,
         frames=frames,

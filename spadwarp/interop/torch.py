@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import torch
     import warp as wp
 
-    from spadwarp.frames.spad import Detection
+    from spadwarp.frames.spad import Frames
     from spadwarp.scene import Scene
 
 __all__ = [
@@ -91,18 +91,18 @@ class TorchResult:
 @overload
 def to_torch(source: Result, *, tallies: torch.Tensor | None = None) -> TorchResult: ...
 @overload
-def to_torch(source: Detection) -> Detection: ...
+def to_torch(source: Frames) -> Frames: ...
 def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
     """A result or frames for torch, without copying what is large.
 
     Args:
-        source: A `Result`: its tallies become a tensor on the CPU that shares their memory. A `Detection`: the same
+        source: A `Result`: its tallies become a tensor on the CPU that shares their memory. `Frames`: the same
             with `counts`, `expected` and `background` as tensors.
         tallies: The caller's tensor that `spadwarp.simulate(…, tallies=…)` has filled, on any device; the result's
             tallies are then not looked at.
 
     Returns:
-        `TorchResult`, or a `Detection` whose arrays are tensors.
+        `TorchResult`, or `Frames` whose arrays are tensors.
 
     Raises:
         ValueError: The tensor is not int64 or has not as many elements as the result.

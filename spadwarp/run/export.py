@@ -16,7 +16,7 @@ from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.run.exposures import Exposure, Exposures, opened
 
 if TYPE_CHECKING:
-    from spadwarp.frames.spad import Detection
+    from spadwarp.frames.spad import Frames
     from spadwarp.scene import Scene
 
 __all__ = ["FORMATS", "export"]
@@ -28,7 +28,7 @@ _LARGEST_DTIME = 32768  # bins that a T3 record of PicoQuant can tell apart
 
 
 def export(
-    source: Result | Detection | str | os.PathLike[str],
+    source: Result | Frames | str | os.PathLike[str],
     path: str | os.PathLike[str],
     *,
     frames: int | slice | None = None,
@@ -51,12 +51,12 @@ def export(
       result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
 
     Args:
-        source: A `Result`, a `Detection`, the file of one (`result.h5`, `frames.h5`, `analytic.h5`), or the folder of a
+        source: A `Result`, `Frames`, the file of one (`result.h5`, `frames.h5`, `analytic.h5`), or the folder of a
             dataset.
         path: The file. Of many frames `.mat` and `.exr` hold one each: `name-00000.mat`, `name-00001.mat`, …
         frames: Only this one, from 0, or these.
         split: Of a dataset: "train", "validation", "test" or "all".
-        result: What a `Detection` was drawn from; `.mat` needs its truth.
+        result: What the `Frames` were drawn from; `.mat` needs its truth.
 
     Returns:
         The files that were written.

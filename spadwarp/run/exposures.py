@@ -19,7 +19,7 @@ from spadwarp.result.result import Result, pixel_directions
 from spadwarp.scene import SPEED_OF_LIGHT, Scene
 
 if TYPE_CHECKING:
-    from spadwarp.frames.spad import Detection
+    from spadwarp.frames.spad import Frames
 
 __all__ = ["Exposure", "Exposures", "opened"]
 
@@ -94,7 +94,7 @@ def opened(source: Any, *, result: Result | None = None, split: str = "all") -> 
     elif hasattr(source, "counts"):
         yield _of_detection(source, result)
     else:
-        raise ValueError(f"source is a {type(source).__name__}; a Result, a Detection or a file of one is needed")
+        raise ValueError(f"source is a {type(source).__name__}; a Result, Frames or a file of one is needed")
 
 
 @contextmanager
@@ -124,7 +124,7 @@ def _opened_place(path: Path, split: str) -> Iterator[Result | Exposures]:
     yield load_result(path)
 
 
-def _of_detection(detection: Detection, result: Result | None) -> Exposures:
+def _of_detection(detection: Frames, result: Result | None) -> Exposures:
     counts, expected, background = map(on_host, (detection.counts, detection.expected, detection.background))
     counts = counts[None] if detection.summed else counts
     truth = None if result is None else result.truth.depth
@@ -144,7 +144,7 @@ def _of_detection(detection: Detection, result: Result | None) -> Exposures:
         )
 
     return Exposures(
-        place="Detection", count=len(counts), frame=frame, most=int(counts.sum(axis=-1, dtype=np.int64).max())
+        place="Frames", count=len(counts), frame=frame, most=int(counts.sum(axis=-1, dtype=np.int64).max())
     )
 
 

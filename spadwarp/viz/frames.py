@@ -14,7 +14,7 @@ from spadwarp.viz.result import image_panels, show_image, shown_limits
 if TYPE_CHECKING:
     from spadwarp.analytic.model import AnalyticResult
     from spadwarp.frames.file import Recording
-    from spadwarp.frames.spad import Detection
+    from spadwarp.frames.spad import Frames
     from spadwarp.result.result import Result
 
 __all__ = ["draw_analytic", "draw_depth", "draw_recording", "expected_counts"]
@@ -66,7 +66,7 @@ def draw_recording(recording: Recording, result: Result, path: str | Path) -> Pa
 
 
 def expected_counts(
-    detection: Detection, result: Result, row: int, column: int
+    detection: Frames, result: Result, row: int, column: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean counts of one pixel in one frame and the background's part of them, float64 `[T]` each.
 

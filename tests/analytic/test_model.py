@@ -12,7 +12,7 @@ from helpers.scenes import scene
 from reference import crlb
 from spadwarp.analytic.model import simulate_analytic
 from spadwarp.errors import ConfigError
-from spadwarp.frames.cramer_rao import crlb_from_histogram, crlb_map
+from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result.result import Truth
 
@@ -357,7 +357,7 @@ def test_the_bound_of_a_monte_carlo_result_is_the_analytic_one_in_clear_water():
         transport={"estimator": "next_event", "max_collisions": 4},
     )
     one = one.with_overrides({"laser.pulse_energy": 1e-12})
-    bound = crlb_map(spadwarp.simulate(one, photons=3_000_000, seed=1))
+    bound = spadwarp.crlb(spadwarp.simulate(one, photons=3_000_000, seed=1))
     expected = simulate_analytic(one, frames=0).sigma_time
     assert bound.shape == (4, 4)
     # 600 photons land on a pixel's part of the plate: 2 % on the bound.

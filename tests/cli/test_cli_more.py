@@ -110,7 +110,7 @@ def test_frames_are_those_of_detect(done, tmp_path):
         assert np.array_equal(file["counts"], twin.counts)
         assert np.array_equal(file["intensity"], twin.intensity)
         assert np.array_equal(file["tags/bin"], twin.tags.bin) and np.array_equal(file["tags/y"], twin.tags.y)
-        assert np.array_equal(file["bound/time"], spadwarp.crlb_map(result, pulses=2000, device="cpu"), equal_nan=True)
+        assert np.array_equal(file["bound/time"], spadwarp.crlb(result, pulses=2000, device="cpu"), equal_nan=True)
         assert sorted(file["depth"]) == ["centroid", "likelihood", "matched", "peak"]
         depth = file["depth/likelihood"][...]
         bound = file["bound/depth"][...]
