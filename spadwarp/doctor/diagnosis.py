@@ -22,8 +22,8 @@ from spadwarp.scene import Scene
 __all__ = ["Diagnosis", "SelfTest", "doctor"]
 
 NEEDED = (
-    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py", "tomli-w",
-    "matplotlib",
+    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py",
+    "matplotlib", "tomli-w", "PyYAML",
 )  # fmt: skip
 
 # Package → extra that brings it.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import yaml
 
 from spadwarp.errors import ConfigError, FileError
 
@@ -27,7 +29,6 @@ _NAMES = {
     "width": ("image_width", "width"),
     "height": ("image_height", "height"),
 }
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def load_calibration(path: str | Path) -> dict[str, Any]:
@@ -44,21 +45,39 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
         ConfigError: It holds no calibration, or one of a lens model other than Brown's.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise FileError(f"{path}: not a text file") from None
     try:
-        entries = _json_entries(text) if text.lstrip().startswith("{") else _yaml_entries(text)
-        return _fields(entries)
+        return _fields(_entries(text))
     except ValueError as error:
         raise ConfigError(f"camera.calibration = {str(path)!r}: {error}") from None
 
 
+def _entries(text: str) -> dict[str, Any]:
+    is_json = text.lstrip().startswith("{")
+    try:  # OpenCV's first line is no YAML
+        entries = json.loads(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"not valid {'JSON' if is_json else 'YAML'}: {' '.join(str(error).split())}") from None
+    return entries if isinstance(entries, dict) else {}
+
+
+class _Loader(yaml.BaseLoader):
+    """Every scalar as text, every tag ignored (`!!opencv-matrix`), no aliases: with them a small file can be huge."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError(f"an alias stands in line {self.peek_event().start_mark.line + 1}")
+        return super().compose_node(parent, index)
+
+
 def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
-    def find(key: str) -> Any:
-        return next((entries[name] for name in _NAMES[key] if name in entries), None)
+    def find(key: str) -> list[float] | None:
+        name = next((name for name in _NAMES[key] if name in entries), None)
+        return None if name is None else _numbers(name, entries[name])
 
     model = entries.get("distortion_model", entries.get("camera_model", "plumb_bob"))
     if str(model).lower() not in ("plumb_bob", "brown", "pinhole", "opencv", "radtan"):
@@ -78,39 +97,15 @@ def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
     fields: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": coefficients}
     for name in ("width", "height"):
         if (pixels := find(name)) is not None:
-            fields[name] = int(pixels)
+            if len(pixels) != 1 or not 1 <= pixels[0] < 2**31:
+                raise ValueError(f"image_{name} = {pixels} is not a number of pixels")
+            fields[name] = int(pixels[0])
     return fields
 
 
-def _json_entries(text: str) -> dict[str, Any]:
+def _numbers(name: str, value: Any) -> list[float]:
+    """The numbers of a matrix as OpenCV and ROS write it, of a list of rows, or of a list; or the one number."""
     try:
-        tables = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"not valid JSON: {error}") from None
-    entries: dict[str, Any] = {}
-    for name, value in tables.items():
-        if isinstance(value, Mapping):
-            value = value.get("data", value)
-        if isinstance(value, list):
-            flat = [one for row in value for one in (row if isinstance(row, list) else [row])]
-            flat = [one for row in flat for one in (row if isinstance(row, list) else [row])]
-            if all(isinstance(one, (int, float)) for one in flat):
-                entries[name] = [float(one) for one in flat]
-        elif isinstance(value, (int, float, str)):
-            entries[name] = value
-    return entries
-
-
-def _yaml_entries(text: str) -> dict[str, Any]:
-    """Top-level numbers, words and matrices of the YAML that OpenCV and ROS write; nothing else of YAML."""
-    entries: dict[str, Any] = {}
-    for match in re.finditer(r"^(\w+)\s*:[ \t]*(.*(?:\n[ \t]+.*|\n(?=\s*$))*)", text, re.MULTILINE):
-        name, body = match.groups()
-        data = re.search(r"(?:\bdata\s*:\s*)?\[([^\]]*)\]", body)
-        if data is not None:
-            entries[name] = [float(number) for number in re.findall(_NUMBER, data.group(1))]
-        elif re.fullmatch(_NUMBER, body.strip()):
-            entries[name] = float(body)
-        elif body.strip():
-            entries[name] = body.strip().strip("\"'")
-    return entries
+        return np.array(value["data"] if isinstance(value, Mapping) else value, np.float64).ravel().tolist()
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{name} is neither a number nor a matrix") from None

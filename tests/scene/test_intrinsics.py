@@ -182,6 +182,11 @@ def test_a_calibration_file_becomes_fields(tmp_path, text):
         (_ROS_YAML.replace("61.0, 0, 29.2", "61.0, 0.3, 29.2"), "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]"),
         (_PLAIN_JSON.replace("-0.01, 0, 0, 0", "-0.01, 0, 0.1, 0"), "no rational, prism or tilt terms"),
         ('{"K": ', "not valid JSON"),
+        ('{"K": ' + "[" * 100_000, "not valid JSON"),
+        ("K: [61.0, 0,\n", "not valid YAML: while parsing a flow"),
+        ("K: &a [61.0]\nD: *a\n", "not valid YAML: an alias stands in line 2"),
+        (_ROS_YAML.replace("61.0", "abc"), "camera_matrix is neither a number nor a matrix"),
+        (_ROS_YAML.replace("width: 64", "width: [64, 48]"), "image_width = [64.0, 48.0] is not a number of pixels"),
     ],
 )
 def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
