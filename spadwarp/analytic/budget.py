@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.model import dark_rate, pixel_maps, simulate_analytic
 from spadwarp.errors import ConfigError
-from spadwarp.result.result import SPEED_OF_LIGHT
+from spadwarp.scene.geometry import path_from_range, pixel_directions
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -219,11 +219,9 @@ def _waters(scene: Scene, media: Iterable[str] | Mapping[str, Mapping[str, Any]]
 def _axis_rows(
     scene: Scene, name: str, distances: NDArray[np.float64], reflectance: float, device: str | None
 ) -> list[BudgetRow]:
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
     gate = (scene.gate.start, scene.gate.stop)
-    laser = np.asarray(scene.beam.position)
-    points = distances[:, None] * np.array([0.0, 0.0, 1.0])
-    arrival = (np.linalg.norm(points - laser, axis=1) + distances) / speed
+    path = path_from_range(distances, np.array([0.0, 0.0, 1.0]), scene.beam.position)
+    arrival = path / scene.medium.pulse_speed
     if gate[0] <= arrival.min() and arrival.max() <= gate[1]:
         gates = [(gate, distances)]
     else:
@@ -304,7 +302,6 @@ def _pulses_needed(
 
 
 def _central_row(scene: Scene, device: str | None) -> BudgetRow:
-    from spadwarp.result.result import pixel_directions
     from spadwarp.transport.model import truth_maps
 
     truth = truth_maps(scene)

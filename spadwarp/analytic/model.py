@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result.result import SPEED_OF_LIGHT, Result, Truth, pixel_directions
+from spadwarp.result.result import Result, Truth
+from spadwarp.scene.geometry import depth_per_time, gate_deviation, pixel_directions
 from spadwarp.scene.phase_function import phase_function
 
 if TYPE_CHECKING:
@@ -264,7 +265,7 @@ def pixel_maps(
     signal_d, arrival_d = kernels.signal_map(lidar, view_d, distance_d, normal_d, reflectance_d)
 
     profile = np.zeros((1, 1), np.float32)
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    speed = scene.medium.pulse_speed
     if chosen.backscatter == "single_scatter":
         paths_d, cumulative_d, total_d = kernels.single_scatter_table(lidar, phase_d, view_d, distance_d)
         paths, cumulative = paths_d.numpy(), cumulative_d.numpy()
@@ -381,7 +382,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     lidar.pde = scene.detector.pde
     lidar.extinction = scene.medium.extinction
     lidar.scattering = scene.medium.scattering
-    lidar.speed = SPEED_OF_LIGHT / scene.medium.group_index
+    lidar.speed = scene.medium.pulse_speed
     lidar.laser = wp.vec3d(*laser.position)
     lidar.axis = wp.vec3d(*laser.axis)
     lidar.profile = LASER_PROFILES.index(laser.profile)
@@ -405,17 +406,6 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
 def _phase_table(scene: Scene) -> Map:
     """Density [1/sr] at scattering angles uniform on [0, π]; at 0, where it may be infinite, that of 2e-5 rad."""
     return phase_function(scene.medium).density(np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5))
-
-
-def depth_per_time(scene: Scene, view: Map, distance: Map) -> Map:
-    """dz/dt along lines of sight u [m/s]: path = |r·u − p| + r, so that d path/dr = 1 + (direction of the light)·u."""
-    laser = scene.beam
-    if laser.profile == "collimated":
-        light = np.broadcast_to(np.asarray(laser.axis), view.shape)
-    else:
-        y = distance[:, None] * view - np.asarray(laser.position)
-        light = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-300)
-    return SPEED_OF_LIGHT / scene.medium.group_index / (1.0 + (light * view).sum(axis=1)) * view[:, 2]
 
 
 def _profile(scene: Scene, given: Result | ArrayLike | None) -> NDArray[np.float32] | None:
@@ -479,7 +469,7 @@ def _sample(
     device = pick_device(device)
     scene, shape = result.scene, result.truth.depth.shape
     pixels = result.truth.depth.size
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    speed = scene.medium.pulse_speed
     to = {"dtype": wp.float32, "device": device}
 
     def flat(values: NDArray[Any]) -> Any:
@@ -487,11 +477,10 @@ def _sample(
 
     view = pixel_directions(scene.camera)
     # No bound is worse than a guess anywhere in the gate.
-    guess = 0.5 * speed * (scene.gate.stop - scene.gate.start) / math.sqrt(12.0) * view[..., 2]
     inputs = [
         wp.array(view.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device),
         flat(np.where(np.isnan(result.sigma_depth), np.nan, result.truth.depth)),
-        flat(np.minimum(result.sigma_depth, guess)),
+        flat(np.minimum(result.sigma_depth, gate_deviation(scene, view))),
         flat(result.stray_probability),
         flat(result._stray.flat_share),
         wp.array(result._stray.paths, **to),

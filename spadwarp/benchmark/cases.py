@@ -21,7 +21,8 @@ import numpy as np
 
 from spadwarp.device import core_count, pick_device
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.scene import Scene
+from spadwarp.units import path_from_time, time_from_path
 
 if TYPE_CHECKING:
     import warp as wp
@@ -154,7 +155,7 @@ def _confocal() -> dict[str, Any]:
 
 def _plane() -> dict[str, Any]:
     """A grey wall at 5 m in index 1, 16 bins of 0.8 m of path from 2 m on."""
-    metre = 1.0 / SPEED_OF_LIGHT
+    start, width = time_from_path(2.0, 1.0), time_from_path(0.8, 1.0)
     return {
         "medium": {**_WATER, "group_index": 1.0, "phase_index": 1.0},
         "laser": {"half_angle_deg": 2.5, "position": [-0.1, 0.0, 0.0]},
@@ -164,7 +165,7 @@ def _plane() -> dict[str, Any]:
             "horizontal_fov_deg": 10.0,
             "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
         },
-        "gate": {"start_ns": 2.0 * metre * 1e9, "bin_width_ps": 0.8 * metre * 1e12, "bins": 16},
+        "gate": {"start_ns": start * 1e9, "bin_width_ps": width * 1e12, "bins": 16},
         "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}],
         "transport": {"estimator": "guided", "max_collisions": 20, "weight_cutoff": 2e-4, "axis_threshold": 1.0},
     }
@@ -194,7 +195,7 @@ def _cube60() -> dict[str, Any]:
         "gate": {"bin_width_ps": 5000.0, "bins": 1},
         "domain": {"shape": "box", "lower": 0.0, "upper": 0.06},
         "transport": {
-            "max_path": 5e-9 * SPEED_OF_LIGHT / 1.37,
+            "max_path": path_from_time(5e-9, 1.37),
             "weight_cutoff": 0.0,
             "max_collisions": 2**31 - 1,
             "axis_threshold": 1.0,

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.scene import SPEED_OF_LIGHT, Laser, Layer, Medium, Scene
+from spadwarp.scene import Laser, Layer, Medium, Scene
 from spadwarp.scene.beam_profile import profile_extent
 from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
 from spadwarp.scene.intrinsics import image_points
 from spadwarp.scene.phase_function import phase_function
 from spadwarp.scene.pose import to_world
 from spadwarp.scene.presets import WATER_INDICES
+from spadwarp.units import path_from_time, range_from_time, time_from_path
 from spadwarp.water.seawater import group_index, molecular_density, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
@@ -127,12 +128,12 @@ class _Shape:
         """First and last unscattered return of the target."""
         if self.target_path is None:
             return None
-        nanoseconds = 1e9 * self.scene.medium.group_index / SPEED_OF_LIGHT
-        return self.target_path[0] * nanoseconds, self.target_path[1] * nanoseconds
+        first, last = (1e9 * time_from_path(path, self.scene.medium.group_index) for path in self.target_path)
+        return first, last
 
     def range_of(self, time: float) -> float:
         """Range [m] of a round trip of `time` [s], laser at the lens."""
-        return time * SPEED_OF_LIGHT / (2.0 * self.scene.medium.group_index)
+        return range_from_time(time, self.scene.medium.group_index)
 
     @property
     def irf_fwhm_ps(self) -> float:
@@ -235,8 +236,7 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
         yield CheckMessage("warning", name, text, {"nearest_angle_deg": math.degrees(angles.min())})
         return
     paths = np.linalg.norm(lit - np.array(scene.beam.position), axis=1) + np.linalg.norm(lit, axis=1)
-    nanoseconds = 1e9 * scene.medium.group_index / SPEED_OF_LIGHT
-    first, last = float(paths.min()) * nanoseconds, float(paths.max()) * nanoseconds
+    first, last = (1e9 * time_from_path(float(path), scene.medium.group_index) for path in (paths.min(), paths.max()))
     start, stop = scene.gate.start * 1e9, scene.gate.stop * 1e9
     values = {"first_ns": first, "last_ns": last, "start_ns": start, "stop_ns": stop}
     times = (
@@ -247,7 +247,7 @@ def _placement(shape: _Shape, name: str, triangles: Points) -> Iterator[CheckMes
     elif first < start or last > stop:
         yield CheckMessage("warning", name, f"partly outside the gate: {times}", values)
     limit = scene.path_limit
-    if paths.max() > limit < SPEED_OF_LIGHT / scene.medium.group_index * scene.gate.stop:
+    if paths.max() > limit < path_from_time(scene.gate.stop, scene.medium.group_index):
         text = f"max_path = {limit:.4g} m ends photons before they return from {name}, up to {paths.max():.4g} m"
         yield CheckMessage("warning", "transport.max_path", text, {"max_path": limit, "path": float(paths.max())})
     side = float(np.abs(lit[:, :2]).max())

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import dark_rate, pixel_maps
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.errors import ConfigError
-from spadwarp.result.result import Truth, pixel_directions, range_from_path
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.result.result import Truth
+from spadwarp.scene import Scene
+from spadwarp.scene.geometry import gate_deviation, pixel_directions, range_from_path
 from spadwarp.transport.model import truth_maps
+from spadwarp.units import path_from_time
 
 __all__ = ["PROFILE_BINS", "Histograms", "RenderedScene", "StoredFrames", "intensity_step", "render_scene"]
 
@@ -101,8 +103,8 @@ def intensity_step(brightest: float) -> float:
 def water_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> Profile:
     """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
     axis = np.array([0.0, 0.0, 1.0])
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
-    ends = range_from_path(np.array([scene.gate.start, scene.gate.stop]) * speed, axis, scene.beam.position)
+    gate = path_from_time(np.array([scene.gate.start, scene.gate.stop]), scene.medium.group_index)
+    ends = range_from_path(gate, axis, scene.beam.position)
     edges = np.linspace(ends[0], ends[1], PROFILE_BINS + 1)
     below = np.interp(edges, range_from_path(paths, axis, scene.beam.position), cumulative)
     return (np.diff(below) / np.diff(edges)).astype(np.float32), edges.astype(np.float32)
@@ -151,9 +153,8 @@ def _render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rend
         scene = exposed(scene, draw, signal[seen])
     maps, table = maps_of(scene, ..., outliers=by_rates)
     seen = maps["fisher"] > 0
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
     # No bound is worse than a guess anywhere in the gate.
-    guess = 0.5 * speed * (scene.gate.stop - scene.gate.start) / math.sqrt(12.0) * view.reshape(-1, 3)[:, 2]
+    guess = gate_deviation(scene, view.reshape(-1, 3))
     bound = np.where(seen, np.minimum(maps["sigma_depth"], guess), np.nan)
     axis = np.array([[0.0, 0.0, 1.0]])
     paths, cumulative = pixel_maps(
@@ -190,7 +191,7 @@ def _draw_frames(
     on = pick_device(device)
     shape, view = truth.depth.shape, pixel_directions(scene.camera).reshape(-1, 3)
     probability, flat, fractions = _stray(scene, draw, maps)
-    speed, pulses = SPEED_OF_LIGHT / scene.medium.group_index, scene.analytic.pulses
+    speed, pulses = scene.medium.pulse_speed, scene.analytic.pulses
 
     def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import depth_per_time
 from spadwarp.dataset.render_analytic import (
     Histograms,
     RenderedScene,
@@ -17,8 +16,9 @@ from spadwarp.dataset.render_analytic import (
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames.cramer_rao import crlb
 from spadwarp.frames.spad import Frames, detect
-from spadwarp.result.result import Result, pixel_directions, range_from_path
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.result.result import Result
+from spadwarp.scene import Scene
+from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
 from spadwarp.transport.simulate import simulate
 
 __all__ = ["render_traced"]
@@ -46,13 +46,12 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
     distances = np.nan_to_num(result.truth.range.reshape(-1).astype(np.float64))
     per_time = depth_per_time(scene, view.reshape(-1, 3), distances).reshape(seen.shape)
     profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
     return RenderedScene(
         draw=draw,
         scene=scene,
         truth=result.truth,
         bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
-        profile=water_profile(scene, result.bin_edges * speed, profile / max(profile[-1], 1e-300)),
+        profile=water_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
         frames=_frames(plan, scene, result, taken, device=device),
@@ -65,10 +64,8 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
 def _frames(plan: Plan, scene: Scene, result: Result, taken: Frames, *, device: str | None) -> StoredFrames:
     """Depth from the counts, and whether it is background that was most likely reported."""
     time = taken.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
-    view = pixel_directions(scene.camera)
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
     start, stop = taken.gate_start, taken.gate_start + taken.expected.shape[-1] * taken.bin_width
-    depth = range_from_path(np.clip(time, start, stop) * speed, view, scene.beam.position) * view[..., 2]
+    depth = depth_from_time(np.clip(time, start, stop), scene=scene)
     code = np.rint((depth - plan.depth_offset) / plan.depth_step)
     codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
     counts = taken.counts.sum(axis=-1, dtype=np.int64)

@@ -17,7 +17,8 @@ import numpy as np
 
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
 from spadwarp.dataset.targets import find_targets
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.scene import Scene
+from spadwarp.units import time_from_range
 
 __all__ = ["Plan", "SceneDraw", "Shard"]
 
@@ -163,10 +164,10 @@ class Plan:
         window = recipe.gate
         near = max(distance - draw("gate.before", window.before), _SHORTEST_RANGE)
         far = distance + draw("gate.behind", window.behind)
-        per_metre = 2.0 * scene.medium.group_index / SPEED_OF_LIGHT
+        group_index = scene.medium.group_index
         gate = {
-            "start_ns": near * per_metre * 1e9,
-            "bin_width_ps": (far - near) * per_metre / window.bins * 1e12,
+            "start_ns": time_from_range(near, group_index) * 1e9,
+            "bin_width_ps": time_from_range(far - near, group_index) / window.bins * 1e12,
             "bins": window.bins,
         }
         exposure = recipe.exposure

@@ -8,8 +8,8 @@ import numpy as np
 
 from spadwarp.dataset.render_analytic import PROFILE_BINS, RenderedScene
 from spadwarp.dataset.sampling import Plan
-from spadwarp.scene import SPEED_OF_LIGHT
 from spadwarp.scene.phase_function import phase_function
+from spadwarp.units import range_from_time
 
 __all__ = ["FORMAT_VERSION", "FRAME_COLUMNS", "scene_columns", "scene_row"]
 
@@ -84,7 +84,6 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
     config = scene.to_toml()
     if (mesh := plan.targets[draw.target].mesh) is not None:
         config = config.replace(str(mesh), mesh.name)  # where it lies on this machine is nobody's business
-    per_second = 0.5 * SPEED_OF_LIGHT / medium.group_index
     return {
         "depth": one.truth.depth,
         "bound": one.bound,
@@ -105,8 +104,8 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "extinction": medium.extinction,
         "anisotropy": phase_function(medium).mean_cosine,
         "group_index": medium.group_index,
-        "gate_near": per_second * scene.gate.start,
-        "gate_far": per_second * scene.gate.stop,
+        "gate_near": range_from_time(scene.gate.start, medium.group_index),
+        "gate_far": range_from_time(scene.gate.stop, medium.group_index),
         "reflectance": np.nan if target is None else target.reflectance,
         "pulses": scene.analytic.pulses,
         "photons": draw.photons or 0,

@@ -20,7 +20,7 @@ from spadwarp.frames.depth import depth_of
 from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.scene import SPEED_OF_LIGHT
+from spadwarp.units import range_from_time
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 
@@ -219,11 +219,10 @@ def read_depth(
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
-    half = 0.5 * SPEED_OF_LIGHT / index
     return DepthReading(
         depth=reduced.values.astype(np.float32),
         frames=reduced.frames > 1,
-        gate=(half * histograms.gate_start, half * gate_stop),
+        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
         profile=_profile(histograms),
         source=f"{reduced.quantity} by {method} from histograms",
         histograms=histograms if counted else None,
@@ -232,7 +231,7 @@ def read_depth(
 
 def _clues(histograms: Histograms, *, group_index: float | None, device: str | None) -> NDArray[np.float32]:
     """What counts tell beyond each pixel's depth, `[N, CLUES, H, W]`, pooled depths in metres."""
-    from spadwarp.frames.file import depth_from_time
+    from spadwarp.scene.geometry import depth_from_time
 
     bins, width = histograms.values.shape[-1], float(histograms.bin_width or 0.0)
     counts = histograms.values.reshape(-1, *histograms.values.shape[-3:])
@@ -246,7 +245,7 @@ def _clues(histograms: Histograms, *, group_index: float | None, device: str | N
         if scene is not None:
             clues[:, channel] = depth_from_time(time, scene=scene)
         else:
-            clues[:, channel] = 0.5 * SPEED_OF_LIGHT / float(group_index or 1.0) * time
+            clues[:, channel] = range_from_time(time, float(group_index or 1.0))
     return clues
 
 

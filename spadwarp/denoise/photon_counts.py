@@ -22,10 +22,10 @@ from spadwarp.denoise.inference import METHODS, clues_of, denoise_frames, own_we
 from spadwarp.errors import SpadwarpError
 from spadwarp.frames.arrival_time import arrival_time
 from spadwarp.frames.cramer_rao import crlb_from_histogram
-from spadwarp.frames.file import depth_from_time
 from spadwarp.frames.response import InstrumentResponse, instrument_response
 from spadwarp.io.atomic import atomic_path
-from spadwarp.result.result import SPEED_OF_LIGHT
+from spadwarp.scene.geometry import depth_from_time
+from spadwarp.units import range_from_time
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
@@ -197,13 +197,13 @@ def photon_frame(
     )
     depth = depth_from_time(time.reshape(seen.shape), scene=scene)
     sigma = crlb_from_histogram(signal * scale, background, bin_width=scene.gate.bin_width, pulses=1.0, irf=response)
-    half = 0.5 * SPEED_OF_LIGHT / scene.medium.group_index
-    gate = (half * scene.gate.start, half * scene.gate.stop)
+    index = scene.medium.group_index
+    gate = (range_from_time(scene.gate.start, index), range_from_time(scene.gate.stop, index))
     clues = clues_of(counts[None], background=background[0, 0], response=matrix, device=device)
     for channel in range(POOLED):
         time = scene.gate.start + clues[0, channel].astype(np.float64) * (scene.gate.stop - scene.gate.start)
         clues[0, channel] = depth_from_time(time, scene=scene)
-    return depth_frames(depth, gate=gate, profile=profile, clues=clues), sigma * half
+    return depth_frames(depth, gate=gate, profile=profile, clues=clues), range_from_time(sigma, index)
 
 
 def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:

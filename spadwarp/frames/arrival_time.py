@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.interop.torch import in_torch_order, is_torch, tensor_of
+from spadwarp.arrays import as_warp, in_torch_order, is_torch, tensor_of
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
@@ -105,43 +105,6 @@ def arrival_time(
         found: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
     found = found.double() if is_torch(found) else found.astype(np.float64)
     return gate_start + (found.reshape(frame) - offset) * bin_width
-
-
-def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
-    """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
-
-    Raises:
-        TypeError: the data is of another kind (complex, text).
-    """
-    import warp as wp
-
-    from spadwarp.device import start_warp
-
-    start_warp()
-    if isinstance(array, wp.array):
-        result = array if device is None else array.to(device)
-    elif type(array).__module__.partition(".")[0] == "torch":
-        tensor = array.detach().contiguous()
-        if not tensor.is_floating_point() and tensor.element_size() < 4:
-            tensor = tensor.int()
-        elif tensor.element_size() < 4:
-            tensor = tensor.float()
-        result = wp.from_torch(tensor)
-        result = result if device is None else result.to(device)
-    else:
-        values = np.asarray(array)
-        if values.dtype.kind in "bui":
-            small = values.dtype.itemsize < 4 or values.dtype == np.int32
-            values = values.astype(np.int32 if small else np.int64, copy=False)
-        elif values.dtype.kind == "f":
-            values = values.astype(np.float64 if values.dtype.itemsize >= 8 else np.float32, copy=False)
-        else:
-            raise TypeError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
-        device = wp.get_preferred_device() if device is None else wp.get_device(device)
-        result = wp.array(np.ascontiguousarray(values), device=device, copy=device.is_cuda)
-    if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
-        raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
-    return result if result.is_contiguous else result.contiguous()
 
 
 def _background_rows(background: Any, rows: Any, frame: tuple[int, ...], wp: Any) -> Any:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from spadwarp.frames.arrival_time import Method, arrival_time
 from spadwarp.frames.measured import Histograms
-from spadwarp.result.result import pixel_directions, range_from_path
-from spadwarp.scene import SPEED_OF_LIGHT, Camera
+from spadwarp.scene import Camera
+from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_path
+from spadwarp.units import path_from_time
 
 __all__ = ["Reduction", "depth_of"]
 
@@ -116,11 +117,11 @@ def depth_of(
         device=device,
     ).reshape(-1, height, width)
     view = np.array([0.0, 0.0, 1.0]) if directions is None else directions
-    distance = range_from_path(time * (SPEED_OF_LIGHT / index), view, laser)
+    distance = range_from_path(path_from_time(time, index), view, laser)
     planar = directions is not None
     return Reduction(
         quantity="depth" if planar else "range",
-        values=distance * view[..., 2] if planar else distance,
+        values=depth_from_range(distance, view) if planar else distance,
         range=distance,
         intensity=values.sum(axis=-1).reshape(-1, height, width),
         directions=directions,

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from spadwarp.frames.arrival_time import METHODS, Method
 from spadwarp.frames.spad import Frames, detect
 from spadwarp.io.hdf5 import hdf5_file
-from spadwarp.result.result import Result, pixel_directions, range_from_path
+from spadwarp.result.result import Result
+from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
 from spadwarp.scene.intrinsics import camera_attributes
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Scene
+    pass
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "FrameErrors", "Recording", "depth_from_time", "record_frames"]
 
@@ -168,18 +169,7 @@ def record_frames(
     )
 
 
-def depth_from_time(time: NDArray[np.float64], *, scene: Scene) -> NDArray[np.float64]:
-    """Planar depth [m] at which light of a time of flight [s] was reflected; both `[..., H, W]`."""
-    from spadwarp.scene import SPEED_OF_LIGHT
-
-    view = pixel_directions(scene.camera)
-    path = time * (SPEED_OF_LIGHT / scene.medium.group_index)
-    return range_from_path(path, view, scene.beam.position) * view[..., 2]
-
-
 def _depth_per_time(result: Result) -> NDArray[np.float64]:
-    from spadwarp.analytic.model import depth_per_time
-
     distance = result.truth.range.astype(np.float64)
     view = pixel_directions(result.scene.camera)
     return depth_per_time(result.scene, view.reshape(-1, 3), distance.reshape(-1)).reshape(distance.shape)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import as_warp, in_torch_order, is_torch, output_tensor, tensor_of
 from spadwarp.frames.response import InstrumentResponse, instrument_response, response_matrix
-from spadwarp.interop.torch import in_torch_order, is_torch, output_tensor, tensor_of
 from spadwarp.scene import Detector, Laser
 
 if TYPE_CHECKING:
@@ -393,7 +393,6 @@ def _check_numbers(**numbers: int) -> None:
 
 def _rows(array: Any, name: str, device: Any, *, dimensions: int | None = 3) -> tuple[Any, tuple[int, ...]]:
     """Warp rows `[pixel, bin]` of a cube and the cube's shape; finite and not negative."""
-    from spadwarp.frames.arrival_time import as_warp
     from spadwarp_kernels.detection import first_invalid_row
 
     cube = as_warp(array, name=name, device=device)

@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.scene import SPEED_OF_LIGHT
+from spadwarp.scene.geometry import depth_from_range, path_from_range, pixel_directions, range_from_path
 
 if TYPE_CHECKING:
     from spadwarp.frames.arrival_time import Method
-    from spadwarp.scene import Camera, Scene
+    from spadwarp.scene import Scene
 
-__all__ = ["COMPONENTS", "Component", "Result", "Truth", "pixel_directions", "range_from_path"]
+__all__ = ["COMPONENTS", "Component", "Result", "Truth"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
 COMPONENTS: tuple[Component, ...] = ("ballistic", "forward_scattered", "backscatter")
@@ -201,12 +201,12 @@ class Result:
     @property
     def path_edges(self) -> NDArray[np.float64]:
         """Edges of the bins in geometric path, laser to target to lens [m], `[T + 1]`."""
-        return self.bin_edges * np.float64(self.water_speed)
+        return self.bin_edges * np.float64(self.pulse_speed)
 
     @property
-    def water_speed(self) -> float:
-        """Speed at which a pulse travels, c0 / group index [m/s]."""
-        return SPEED_OF_LIGHT / self.scene.medium.group_index
+    def pulse_speed(self) -> float:
+        """Speed of a pulse, c0 over the group index [m/s]."""
+        return self.scene.medium.pulse_speed
 
     # Depth
 
@@ -227,14 +227,13 @@ class Result:
         gate = self.scene.gate
         time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
         directions = pixel_directions(self.scene.camera)
-        distance = range_from_path(time * self.water_speed, directions, self.scene.beam.position)
-        return distance * directions[..., 2] if quantity == "depth" else distance
+        distance = range_from_path(time * self.pulse_speed, directions, self.scene.beam.position)
+        return depth_from_range(distance, directions) if quantity == "depth" else distance
 
     def true_path(self) -> NDArray[np.float64]:
         """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
-        distance = self.truth.range.astype(np.float64)
-        points = distance[..., None] * pixel_directions(self.scene.camera)
-        return np.linalg.norm(points - np.asarray(self.scene.beam.position), axis=-1) + distance
+        scene = self.scene
+        return path_from_range(self.truth.range, pixel_directions(scene.camera), scene.beam.position)
 
     # Accounts
 
@@ -314,47 +313,3 @@ def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]])
     for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
         count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
     return np.maximum(count, 1.0).reshape(shape)
-
-
-def pixel_directions(camera: Camera) -> NDArray[np.float64]:
-    """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
-    from spadwarp.scene.intrinsics import image_tangents
-
-    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
-    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def scan_axes(scene: Scene) -> NDArray[np.float64]:
-    """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
-
-    From the laser to the point of the line of sight at `scan.distance`; parallel to it where that is infinite.
-    """
-    view = pixel_directions(scene.camera)
-    if math.isinf(scene.scan.distance):
-        return view
-    axes = scene.scan.distance * view - np.asarray(scene.beam.position)
-    return axes / np.linalg.norm(axes, axis=-1, keepdims=True)
-
-
-def range_from_path(path: ArrayLike, directions: ArrayLike, laser_position: ArrayLike) -> NDArray[np.float64]:
-    """Distance along a line of sight at which light has gone `path` from the laser by the target to the lens.
-
-    The points of one path lie on an ellipsoid with laser p and lens 0 as foci. |r·u − p| + r = L has one solution along
-    u: r = (L² − |p|²) / (2 (L − u·p)). For a laser in the lens it is L/2.
-
-    Args:
-        path: Geometric path L [m], any shape.
-        directions: Unit vectors u from the lens, `[..., 3]`, broadcast against `path`.
-        laser_position: p [m], `[3]`.
-
-    Returns:
-        Range r [m]; NaN where L is NaN or too short to go from laser to lens.
-    """
-    length = np.asarray(path, dtype=np.float64)
-    laser = np.asarray(laser_position, dtype=np.float64)
-    baseline = np.linalg.norm(laser)
-    possible = length > baseline
-    safe = np.where(possible, length, baseline + 1.0)  # keeps the unused branch free of 0/0
-    distance = (safe - baseline) * (safe + baseline) / (2.0 * (safe - np.asarray(directions) @ laser))
-    return np.where(possible, distance, np.nan)

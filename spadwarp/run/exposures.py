@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import on_host
 from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.interop.torch import on_host
 from spadwarp.result.file import load_result
-from spadwarp.result.result import Result, pixel_directions
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.result.result import Result
+from spadwarp.scene import Scene
+from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.units import time_from_path
 
 if TYPE_CHECKING:
     from spadwarp.frames.spad import Frames
@@ -57,9 +59,9 @@ class Exposure:
         """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
         assert self.scene is not None and self.depth is not None and self.counts is not None
         view = pixel_directions(self.scene.camera)
-        distance = self.depth.astype(np.float64) / view[..., 2]
-        path = np.linalg.norm(distance[..., None] * view - np.asarray(self.scene.beam.position), axis=-1) + distance
-        time = path * (self.scene.medium.group_index / SPEED_OF_LIGHT) - self.gate_start
+        distance = range_from_depth(self.depth.astype(np.float64), view)
+        path = path_from_range(distance, view, self.scene.beam.position)
+        time = time_from_path(path, self.scene.medium.group_index) - self.gate_start
         if self.period is not None:
             time = np.mod(time, self.period)
         found = np.floor(time / self.bin_width) + 1.0

@@ -10,11 +10,9 @@ from spadwarp.scene.medium import Layer, Medium
 from spadwarp.scene.methods import Analytic, Output, Transport
 from spadwarp.scene.optics import Camera, Laser, Scan
 from spadwarp.scene.scene import Scene, load_scene
-from spadwarp.scene.sections import SPEED_OF_LIGHT
 from spadwarp.scene.surroundings import Domain, Target
 
 __all__ = [
-    "SPEED_OF_LIGHT",
     "Analytic",
     "Camera",
     "Detector",

@@ -14,6 +14,7 @@ from spadwarp.scene import load as _layers
 from spadwarp.scene.optics import Laser
 from spadwarp.scene.presets import PHASE_TABLES, PRESETS, WATER_INDICES
 from spadwarp.scene.sections import Section, Vector, listed
+from spadwarp.units import pulse_speed
 
 
 class _Water(Section):
@@ -198,6 +199,11 @@ class Medium(_Water):
             water.__dict__.update({name: getattr(optics, name) for name in names})
             if water is self and self.chlorophyll is not None and not self.layers:
                 self._molecular_share = optics.water_scattering / optics.scattering
+
+    @property
+    def pulse_speed(self) -> float:
+        """Speed of a pulse, c0 over the group index [m/s]."""
+        return pulse_speed(self.group_index)
 
     @property
     def phase_parameters(self) -> dict[str, float | str]:

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from spadwarp.scene.sections import PLANCK, SPEED_OF_LIGHT, Brown, Section, Vector, Whole
+from spadwarp.scene.sections import Brown, Section, Vector, Whole
+from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 
 
 class Laser(Section):

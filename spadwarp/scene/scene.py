@@ -17,8 +17,9 @@ from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
 from spadwarp.scene.methods import Analytic, Output, Transport
 from spadwarp.scene.optics import Camera, Laser, Scan
-from spadwarp.scene.sections import SPEED_OF_LIGHT, listed
+from spadwarp.scene.sections import listed
 from spadwarp.scene.surroundings import Domain, Target
+from spadwarp.units import path_from_time
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
@@ -90,7 +91,7 @@ class Scene(BaseModel):
     @property
     def path_limit(self) -> float:
         """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
-        gate_end = SPEED_OF_LIGHT / self.medium.group_index * self.gate.stop
+        gate_end = path_from_time(self.gate.stop, self.medium.group_index)
         return min(self.transport.max_path or gate_end, gate_end)
 
     def to_dict(self) -> dict[str, Any]:

@@ -11,9 +11,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_valida
 from spadwarp.scene import load as _layers
 from spadwarp.scene.presets import PRESETS
 
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], vacuum
-PLANCK = 6.626_070_15e-34  # [J s]
-
 
 def _whole(value: Any) -> Any:
     """TOML writes 2e9 as a float; a whole one is as good as an integer."""

@@ -10,9 +10,10 @@ import numpy as np
 
 from spadwarp.device import physical_memory, pick_device
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.result.result import COMPONENTS, Truth, pixel_directions, scan_axes
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.result.result import COMPONENTS, Truth
+from spadwarp.scene import Scene
 from spadwarp.scene.beam_profile import load_profile, profile_extent
+from spadwarp.scene.geometry import pixel_directions, scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.phase_function import phase_function
 from spadwarp.scene.pose import rotation_matrix, to_world
@@ -63,7 +64,7 @@ def build_model(
 
     laser, lens = _laser(scene, device), _camera(scene)
 
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    speed = scene.medium.pulse_speed
     gate = sk.Gate()
     gate.start, gate.stop = scene.gate.start * speed, scene.gate.stop * speed
     gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.interop.torch import caller_tallies
 from spadwarp.result.merge import Sums
 from spadwarp.result.photon_ids import Queue, Range, Ranges, count, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth

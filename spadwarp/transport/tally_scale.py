@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spadwarp.scene import SPEED_OF_LIGHT, Laser, Scene
+from spadwarp.scene import Laser, Scene
 from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.frustum import view_planes
 
@@ -30,7 +30,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     for what scatters more than once.
     """
     camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
-    speed = SPEED_OF_LIGHT / medium.group_index
+    speed = medium.pulse_speed
     pixels = camera.width * camera.height
     half_field = 0.5 * camera.width * camera.pixel_tangent
     spread = _spread(laser)
@@ -88,7 +88,7 @@ def _crossing(scene: Scene, lit: Callable[[float], float]) -> float:
     place = np.array(laser.position)
     if np.linalg.norm(place) < camera.aperture_radius or scene.scan_positions > 1:
         return 0.0
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
+    speed = scene.medium.pulse_speed
     along = np.geomspace(1e-3, max(scene.path_limit, 2e-3), 400)
     points = place + along[:, None] * np.array(laser.axis)
     away = np.linalg.norm(points, axis=1)

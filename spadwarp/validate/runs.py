@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.scene import SPEED_OF_LIGHT, Scene
+from spadwarp.scene import Scene
 from spadwarp.scene.phase_function import phase_function
+from spadwarp.units import time_from_path
 from spadwarp.validate.statistics import Quantity
 
 __all__ = ["PENCIL", "Case", "Run", "point_source", "scene"]
@@ -106,8 +107,8 @@ def scene(
     """Tables of a scene with index 1 and exact transport; `path_edges` is (start [m], stop [m], bins) of the gate."""
     start, stop, bins = path_edges
     medium = {"group_index": 1.0, "phase_index": 1.0, **medium}
-    to_time = medium["group_index"] / SPEED_OF_LIGHT
-    gate = {"start_ns": start * to_time * 1e9, "bin_width_ps": (stop - start) / bins * to_time * 1e12, "bins": bins}
+    first, width = (time_from_path(path, medium["group_index"]) for path in (start, (stop - start) / bins))
+    gate = {"start_ns": first * 1e9, "bin_width_ps": width * 1e12, "bins": bins}
     tables: dict[str, Any] = {
         "medium": medium,
         "laser": dict(laser),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.units import path_from_time
 from spadwarp.validate import references as known
 from spadwarp.validate.runs import PENCIL, Case, Run, point_source, scene, slab_domain
 from spadwarp.validate.statistics import Quantity, ScoreMeans
@@ -176,7 +177,7 @@ def _cube60(run: Run) -> list[Quantity]:
         "pencil at (29, 29, 0) mm": {**PENCIL, "position": [0.029, 0.029, 0.0]},
         "isotropic at (29, 29, 29) mm": point_source(0.029, 0.029, 0.029),
     }
-    gate = 5e-9 * 299_792_458.0 / 1.37
+    gate = path_from_time(5e-9, medium["group_index"])
     quantities = []
     for (name, source), reference in zip(sources.items(), known.CUBE60, strict=True):
         tables = scene(medium, source, domain=cube, max_path=gate)

@@ -115,7 +115,7 @@ def _plot_counts(recording: Recording, result: Result, axis: Any) -> None:
     axis.stairs(values, edges, fill=True, color="0.72", label="counts of the frame")
     axis.stairs(expected, edges, baseline=None, color=_BLUE, linewidth=1.4, label=label)
     axis.stairs(floor, edges, baseline=None, color=_GREEN, linewidth=1.0, label="of that, background")
-    arrival = 1e9 * result.true_path()[row, column] / result.water_speed
+    arrival = 1e9 * result.true_path()[row, column] / result.pulse_speed
     if edges[0] <= arrival < edges[-1]:
         axis.axvline(arrival, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), label="true arrival")
     top = float(max(values.max(), expected.max(), 1.0))

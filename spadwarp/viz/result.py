@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.frames.arrival_time import Method
 from spadwarp.io.atomic import atomic_path
-from spadwarp.result.result import COMPONENTS, Component, Result, pixel_directions, range_from_path
+from spadwarp.result.result import COMPONENTS, Component, Result
 from spadwarp.scene import Medium
+from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_path
 
 __all__ = ["image_panels", "show_image", "shown_limits", "write_previews"]
 
@@ -166,14 +167,14 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     for name, values in zip(COMPONENTS, parts, strict=True):
         # Zeros lie below the axis, so that a single bin still shows as a spike.
         axis.stairs(np.maximum(values, 0.01 * bottom), time, baseline=None, **_STYLES[name])
-    arrival = 1e9 * result.true_path()[row, column] / result.water_speed
+    arrival = 1e9 * result.true_path()[row, column] / result.pulse_speed
     if time[0] <= arrival < time[-1]:
         axis.axvline(arrival, color="0.2", linewidth=0.9, linestyle=(0, (4, 3)), label="true arrival")
     axis.set(yscale="log", ylim=(bottom, 3.0 * top), ylabel="detections per pulse and bin")
     axis.grid(which="major", color="0.92", linewidth=0.6)
     axis.set_axisbelow(True)
 
-    speed, laser = 1e-9 * result.water_speed, np.asarray(result.scene.beam.position)
+    speed, laser = 1e-9 * result.pulse_speed, result.scene.beam.position
     direction = pixel_directions(result.scene.camera)[row, column]
 
     def to_range(at: ArrayLike) -> NDArray[np.float64]:
@@ -181,8 +182,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
         return np.nan_to_num(range_from_path(np.asarray(at) * speed, direction, laser))
 
     def to_time(at: ArrayLike) -> NDArray[np.float64]:
-        distance = np.asarray(at, dtype=np.float64)
-        return (np.linalg.norm(distance[..., None] * direction - laser, axis=-1) + distance) / speed
+        return path_from_range(at, direction, laser) / speed
 
     axis.secondary_xaxis("top", functions=(to_range, to_time)).set_xlabel("range [m]")
 

@@ -75,7 +75,6 @@ def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64]
     import h5py
 
     from spadwarp.frames.measured import frames_scene
-    from spadwarp.scene import SPEED_OF_LIGHT
     from spadwarp.viz.viewer import find_run, holds_frames
 
     if not isinstance(source, Result):
@@ -86,10 +85,10 @@ def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64]
                 if not 0 <= frame < count:
                     raise ValueError(f"frame = {frame} is outside [0, {count}), the frames of {place}")
                 edges = 1e9 * (float(file.attrs["gate_start"]) + file["edges"][...])
-                speed = SPEED_OF_LIGHT / frames_scene(file).medium.group_index
+                speed = frames_scene(file).medium.pulse_speed
                 return file["counts"][frame].astype(np.float64), edges, "counts per pixel", 1e-9 * speed
         source = load_result(place)
-    return source.detections, 1e9 * source.bin_edges, "detections per pulse, pixel", 1e-9 * source.water_speed
+    return source.detections, 1e9 * source.bin_edges, "detections per pulse, pixel", 1e-9 * source.pulse_speed
 
 
 def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:

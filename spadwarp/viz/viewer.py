@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path, file_within
 from spadwarp.result.file import load_result
-from spadwarp.result.result import COMPONENTS, Result, pixel_directions
+from spadwarp.result.result import COMPONENTS, Result
+from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
 
 if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse
@@ -218,14 +219,11 @@ def _name(scene: Scene) -> str:
 
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
-    from spadwarp.scene import SPEED_OF_LIGHT
-
     scene = page.scene
     directions, laser = pixel_directions(scene.camera), np.asarray(scene.beam.position, dtype=np.float64)
-    speed = SPEED_OF_LIGHT / scene.medium.group_index
-    distance = page.truth / directions[..., 2]
-    arrival = (np.linalg.norm(distance[..., None] * directions - laser, axis=-1) + distance) / speed
-    cloud = (page.depth / directions[..., 2])[..., None] * directions
+    path = path_from_range(range_from_depth(page.truth, directions), directions, laser)
+    arrival = path / scene.medium.pulse_speed
+    cloud = range_from_depth(page.depth, directions)[..., None] * directions
     histograms, block, merged = _histograms(page.layers)
     edges = page.edges[::merged]
     if edges[-1] != page.edges[-1]:
@@ -240,7 +238,7 @@ def _data(page: _Page) -> dict[str, Any]:
         "arrival": _packed(1e9 * arrival, "<f4"),
         "towards": _packed(directions @ laser, "<f4"),
         "laser": float(laser @ laser),
-        "speed": 1e-9 * speed,
+        "speed": 1e-9 * scene.medium.pulse_speed,
         "method": page.method,
         "intensityLabel": page.intensity_label,
         "histograms": histograms,

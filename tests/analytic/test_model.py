@@ -37,7 +37,7 @@ def lidar_scene(**sections):
 
 def flat_truth(one, depth=2.2, reflectance=0.5):
     shape = (one.camera.height, one.camera.width)
-    from spadwarp.result.result import pixel_directions
+    from spadwarp.scene.geometry import pixel_directions
 
     z = np.full(shape, depth, np.float32)
     return Truth(

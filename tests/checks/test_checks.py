@@ -8,7 +8,8 @@ import pytest
 
 from spadwarp.checks.checks import CheckMessage, check, summary
 from spadwarp.mesh.targets import TriangleMesh
-from spadwarp.scene import SPEED_OF_LIGHT, Scene, load_scene
+from spadwarp.scene import Scene, load_scene
+from spadwarp.units import SPEED_OF_LIGHT
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
 

@@ -25,7 +25,7 @@ from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.sampling import Plan
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh.targets import build_mesh
-from spadwarp.scene import SPEED_OF_LIGHT
+from spadwarp.units import SPEED_OF_LIGHT
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import spadwarp
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.measured import read_histograms
 from spadwarp.io.ply import point_cloud, write_ply
-from spadwarp.result.result import pixel_directions
 from spadwarp.scene import Camera
+from spadwarp.scene.geometry import pixel_directions
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
 

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.mesh.targets import TriangleMesh, build_mesh
-from spadwarp.result.result import Result, Truth, pixel_directions
+from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
+from spadwarp.scene.geometry import pixel_directions
 
 UNIT = 2.0**-60
 

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.synthetic_result import UNIT, make_result, make_scene
-from spadwarp.result.result import COMPONENTS, Result, pixel_directions, range_from_path
+from spadwarp.result.result import COMPONENTS, Result
+from spadwarp.scene.geometry import pixel_directions, range_from_path
 
 SPEED = 299_792_458.0 / 1.3638
 

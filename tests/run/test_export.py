@@ -12,7 +12,7 @@ from spadwarp.cli import app
 from spadwarp.errors import FileError
 from spadwarp.frames.file import record_frames
 from spadwarp.frames.measured import read_histograms
-from spadwarp.scene import SPEED_OF_LIGHT
+from spadwarp.units import SPEED_OF_LIGHT
 
 WIDTH, HEIGHT, BINS, PULSES, FRAMES = 8, 5, 48, 20_000, 2
 LASER = {"position": [0.1, 0.0, 0.0], "pulse_energy": 1e-7, "repetition_rate": 4e6}  # a period of 34.6 m of path

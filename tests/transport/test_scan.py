@@ -11,8 +11,8 @@ import spadwarp_kernels as sk
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp.mesh.targets import build_mesh
-from spadwarp.result.result import scan_axes
 from spadwarp.scene import Camera
+from spadwarp.scene.geometry import scan_axes
 from spadwarp.transport.model import build_model, pick_device, transport_spec
 
 CONFOCAL = {"scan": {"mode": "confocal"}, "laser": {"half_angle_deg": 3.0}}
@@ -143,7 +143,7 @@ def test_a_scan_survives_its_file_and_gives_depth(tmp_path):
 def test_beam_and_line_of_sight_cross_at_the_distance_of_the_scan():
     one = scene(scan={"mode": "confocal", "distance": 2.5}, laser={"position": [-0.3, 0.1, 0.0]})
     axes = scan_axes(one)
-    view = spadwarp.result.result.pixel_directions(one.camera)
+    view = spadwarp.scene.geometry.pixel_directions(one.camera)
     np.testing.assert_allclose(np.cross(axes, 2.5 * view - np.array([-0.3, 0.1, 0.0])), 0.0, atol=1e-12)
     np.testing.assert_array_equal(scan_axes(scene(scan={"mode": "confocal"})), view)
     assert isinstance(one.camera, Camera)

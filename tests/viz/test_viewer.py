@@ -82,7 +82,7 @@ def test_a_page_holds_the_results_numbers(result, page):
     np.testing.assert_allclose(x / z, np.broadcast_to((np.arange(16) + 0.5 - 8) * tangent, shape), rtol=1e-5)
     np.testing.assert_allclose(y / z, np.broadcast_to((np.arange(12)[:, None] + 0.5 - 6) * tangent, shape), rtol=1e-5)
     arrival = unpacked(data["arrival"], "<f4", shape)
-    np.testing.assert_allclose(arrival, 1e9 * result.true_path() / result.water_speed, rtol=1e-6)
+    np.testing.assert_allclose(arrival, 1e9 * result.true_path() / result.pulse_speed, rtol=1e-6)
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
     for layer, name in zip(data["histograms"], COMPONENTS, strict=True):
         values, exact = shown(layer, (12, 16, 48)), result.component(name) * per_pulse
@@ -165,10 +165,10 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
             "(({ tickvals, ticktext }) => tickvals.map((time, k) => [time, Number(ticktext[k])]))"
             "(document.getElementById('histogram').layout.xaxis2)"
         )
-        u = spadwarp.result.result.pixel_directions(result.scene.camera)[7, 10]
+        u = spadwarp.scene.geometry.pixel_directions(result.scene.camera)[7, 10]
         for time, distance in ticks:
             path = distance + np.linalg.norm(distance * u - np.array(result.scene.laser.position))
-            assert time == pytest.approx(1e9 * path / result.water_speed, rel=1e-5)
+            assert time == pytest.approx(1e9 * path / result.pulse_speed, rel=1e-5)
         assert len(ticks) >= 3
     finally:
         browser.close()
