@@ -23,7 +23,7 @@ __all__ = ["Diagnosis", "SelfTest", "doctor"]
 
 NEEDED = (
     "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py",
-    "matplotlib", "tomli-w", "PyYAML",
+    "matplotlib", "tomli-w", "PyYAML", "jinja2",
 )  # fmt: skip
 
 # Package → extra that brings it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import html
 import json
 import textwrap
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from spadwarp.denoise.evaluation import Evaluation, Sample
 from spadwarp.denoise.metrics import LARGER_IS_BETTER
 from spadwarp.io.atomic import atomic_path
+from spadwarp.viz.pages import write_page
 
 __all__ = ["COLOURS", "TITLES", "write_report"]
 
@@ -75,9 +75,21 @@ def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
         written.append(place / name)
     with atomic_path(place / "scores.json") as temporary:
         temporary.write_text(json.dumps(_plain(evaluation.to_dict()), indent=1) + "\n")
-    pictures = {name: (title, (place / name).read_bytes()) for name, (title, _) in figures.items()}
-    with atomic_path(place / "report.html") as temporary:
-        temporary.write_text(_page(evaluation, pictures), encoding="utf-8")
+    tables = [_ranking_table(evaluation), _gain_table(evaluation)]
+    if evaluation.steps:
+        tables.append(_step_table(evaluation))
+    write_page(
+        place / "report.html",
+        "evaluation.html",
+        data=evaluation.data,
+        frames=sum(evaluation.frames.values()),
+        targets=evaluation.targets,
+        about=evaluation.about,
+        tables=tables,
+        pictures=[
+            (title, base64.b64encode((place / name).read_bytes()).decode()) for name, (title, _) in figures.items()
+        ],
+    )
     return [place / "report.html", *written, place / "scores.json"]
 
 
@@ -231,44 +243,12 @@ def _level_name(evaluation: Evaluation) -> str:
     return "signal photons a pixel" if counted else "BS, part of pixels that report backscatter"
 
 
-# The page
+# Tables: a title, the names of the columns, and rows of a name and cells (text, whether it is the best)
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem } p.about { color: #555 }
-table { border-collapse: collapse; font-size: 14px } th, td { padding: .25rem .7rem; text-align: right }
-th { border-bottom: 2px solid #444 } td { border-bottom: 1px solid #ddd }
-td:first-child, th:first-child { text-align: left }
-td.best { font-weight: 700 } img { max-width: 100%; height: auto } .wide { overflow-x: auto }
-"""
+_Table = tuple[str, list[str], list[tuple[str, list[tuple[str, bool]]]]]
 
 
-def _page(evaluation: Evaluation, pictures: dict[str, tuple[str, bytes]]) -> str:
-    parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width'><title>Denoisers compared</title>",
-        f"<style>{_STYLE}</style></head><body><h1>Denoisers compared</h1>",
-        f"<p class='about'>{html.escape(evaluation.data)}: {sum(evaluation.frames.values())} frames of "
-        f"{html.escape(', '.join(evaluation.targets))}. {html.escape(evaluation.about)}.</p>",
-        "<h2>Ranking: means over targets and levels (the paper's table 4)</h2><div class='wide'>",
-        _table(evaluation),
-        "</div><h2>Gain over the noisy input, level by level</h2><div class='wide'>",
-        _gains(evaluation),
-        "</div>",
-    ]
-    if evaluation.steps:
-        parts += ["<h2>Steps of 10 cm that the staircase's frames resolve to 3 cm</h2><div class='wide'>"]
-        parts += [_step_table(evaluation), "</div>"]
-    for title, png in pictures.values():
-        data = base64.b64encode(png).decode()
-        parts.append(
-            f"<h2>{html.escape(title)}</h2><img alt='{html.escape(title)}' src='data:image/png;base64,{data}'>"
-        )
-    parts.append("</body></html>\n")
-    return "\n".join(parts)
-
-
-def _table(evaluation: Evaluation) -> str:
+def _ranking_table(evaluation: Evaluation) -> _Table:
     means = {method: dataclasses.asdict(evaluation.mean(method)) for method in evaluation.methods}
     best = {
         field: (max if larger else min)(values[field] for values in means.values())
@@ -281,10 +261,11 @@ def _table(evaluation: Evaluation) -> str:
             for field, (_, template) in _FIELDS.items()
         ]
         rows.append((TITLES[method], cells))
-    return _html_table(["method", *(name for name, _ in _FIELDS.values())], rows)
+    title = "Ranking: means over targets and levels (the paper's table 4)"
+    return title, ["method", *(name for name, _ in _FIELDS.values())], rows
 
 
-def _gains(evaluation: Evaluation) -> str:
+def _gain_table(evaluation: Evaluation) -> _Table:
     """PSNR in dB and SSIM in percent above the input's."""
     rows = []
     for method in evaluation.ranking():
@@ -303,25 +284,17 @@ def _gains(evaluation: Evaluation) -> str:
                 )
         window = " (" + ", ".join(map(str, evaluation.windows.values())) + ")" if method == "median" else ""
         rows.append((TITLES[method] + window, cells))
-    return _html_table(["PSNR, SSIM", *evaluation.levels], rows)
+    return "Gain over the noisy input, level by level", ["PSNR, SSIM", *evaluation.levels], rows
 
 
-def _step_table(evaluation: Evaluation) -> str:
+def _step_table(evaluation: Evaluation) -> _Table:
     rows = []
     for method in evaluation.ranking():
         found = [evaluation.steps.get((method, level)) for level in evaluation.levels]
         rows.append(
             (TITLES[method], [("–" if one is None else f"{one.resolved} of {one.total}", False) for one in found])
         )
-    return _html_table(["method", *evaluation.levels], rows)
-
-
-def _html_table(head: list[str], rows: list[tuple[str, list[tuple[str, bool]]]]) -> str:
-    lines = ["<table><tr>" + "".join(f"<th>{html.escape(one)}</th>" for one in head) + "</tr>"]
-    for name, cells in rows:
-        inner = "".join(f"<td{' class=best' if best else ''}>{html.escape(text)}</td>" for text, best in cells)
-        lines.append(f"<tr><td>{html.escape(name)}</td>{inner}</tr>")
-    return "\n".join([*lines, "</table>"])
+    return "Steps of 10 cm that the staircase's frames resolve to 3 cm", ["method", *evaluation.levels], rows
 
 
 def _plain(value: Any) -> Any:

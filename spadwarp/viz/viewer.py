@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
-import json
-import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path, file_within
+from spadwarp.io.atomic import file_within
 from spadwarp.result.file import load_result
 from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.viz.pages import write_page
 
 if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse
@@ -102,16 +100,7 @@ def view(
     except ImportError as error:
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
     page = _of_result(source, method, device) if isinstance(source, Result) else _of_file(source, method, frame, device)
-    template = (Path(__file__).parent / "viewer.html").read_text(encoding="utf-8")
-    filled = {
-        "__TITLE__": html.escape(page.title),
-        "__CAPTION__": html.escape(page.caption),
-        "__DATA__": json.dumps(_data(page)).replace("</", "<\\/"),
-        "__PLOTLY__": get_plotlyjs(),
-    }
-    text = re.sub("|".join(filled), lambda mark: filled[mark.group()], template)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
     return Path(path)
 
 
