@@ -91,9 +91,9 @@ class AnalyticResult:
         `FileError` where it cannot be written.
         """
 
-        from spadwarp.io.hdf5 import hdf5_file
+        from spadwarp.io.hdf5 import write_hdf5
 
-        with hdf5_file(path) as file:
+        with write_hdf5(path) as file:
             file.attrs.update(_attributes(self))
             file.create_dataset("config", data=self.scene.to_toml())
             for name, unit in _MAP_UNITS.items():

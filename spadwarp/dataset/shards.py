@@ -18,7 +18,7 @@ from spadwarp.dataset.sampling import Plan, Shard
 from spadwarp.dataset.schema import FORMAT_VERSION, FRAME_COLUMNS, scene_columns, scene_row
 from spadwarp.device import core_count, pick_device
 from spadwarp.errors import DeviceError
-from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.io.hdf5 import write_hdf5
 
 __all__ = ["checksum", "write_scene_index", "write_shard"]
 
@@ -38,7 +38,7 @@ def write_shard(
     for name in names:
         _remove_leftovers(folder / name)
     with ExitStack() as stack:
-        files = [stack.enter_context(hdf5_file(folder / name, libver=_LIBRARY)) for name in names]
+        files = [stack.enter_context(write_hdf5(folder / name, libver=_LIBRARY)) for name in names]
         for name, file in zip(names, files, strict=True):
             file.attrs.update(_attributes(plan, shard, name))
         _fill(plan, shard, files, device=device, threads=threads)
@@ -49,7 +49,7 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
     """`scenes.h5`: the scenes of all shards as one, by reference; rows of shards that are not there are NaN or 0."""
     from h5py import h5d, h5p, h5s, h5t
 
-    with hdf5_file(folder / "scenes.h5", libver=_LIBRARY) as file:
+    with write_hdf5(folder / "scenes.h5", libver=_LIBRARY) as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
         for name, (shape, kind, unit, text) in scene_columns(plan).items():
             # h5py's own virtual datasets hold the time of day.

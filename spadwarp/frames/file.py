@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.frames.arrival_time import METHODS, Method
 from spadwarp.frames.spad import Frames, detect
-from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.io.hdf5 import write_hdf5
 from spadwarp.result.result import Result
 from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
 from spadwarp.scene.intrinsics import camera_attributes
@@ -130,7 +130,7 @@ def record_frames(
     depth: dict[Method, NDArray[np.float64]] = {}
     errors: dict[Method, FrameErrors] = {}
     detections = 0
-    with hdf5_file(path) as file:
+    with write_hdf5(path) as file:
         for start in range(0, frames, part) if frames > 0 else (0,):
             some = detect(result, frames=min(part, frames - start), first_frame=start, **options)
             depths = {

@@ -1,4 +1,4 @@
-"""HDF5 files to write to."""
+"""HDF5 files: opened for writing so that they appear whole or not at all, and for reading with checks."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.atomic import atomic_path
 
 if TYPE_CHECKING:
     import h5py
+
+__all__ = ["hdf5_format", "read_hdf5", "write_hdf5"]
 
 
 class _Patient(io.RawIOBase):
@@ -52,7 +55,7 @@ class _Patient(io.RawIOBase):
 
 
 @contextmanager
-def hdf5_file(path: str | Path, **options: Any) -> Iterator[h5py.File]:
+def write_hdf5(path: str | Path, **options: Any) -> Iterator[h5py.File]:
     """An HDF5 file to write to, which is at `path` when the block ends well; see `atomic_path`."""
     import h5py
 
@@ -65,3 +68,54 @@ def hdf5_file(path: str | Path, **options: Any) -> Iterator[h5py.File]:
                 raise
         if patient.error is not None:
             raise patient.error
+
+
+@contextmanager
+def read_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Iterator[h5py.File]:
+    """An HDF5 file to read from, for the length of a block that does nothing else.
+
+    Args:
+        path: The file.
+        format: What its attribute `format` has to be, such as "spadwarp result"; None: anything.
+        version: The newest `format_version` that can be read; None: any.
+
+    Raises:
+        FileError: No such file, not HDF5, of another format or a newer version, damaged, or without something that the
+            block looked for (KeyError, ValueError, TypeError, AttributeError, SpadwarpError); says which.
+    """
+    import h5py
+
+    hdf5_format(path)
+    try:
+        with h5py.File(path, "r") as file:
+            found = file.attrs.get("format", "unknown")
+            if format not in (None, found):
+                raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}")
+            if version is not None and (newer := int(file.attrs["format_version"])) > version:
+                raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
+            yield file
+    except FileError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
+        raise FileError(f"{path}: not a whole {format or 'HDF5 file of this kind'}: {error}") from error
+
+
+def hdf5_format(path: str | Path) -> str | None:
+    """The attribute `format` of an HDF5 file, such as "spadwarp frames"; None without one.
+
+    Raises:
+        FileError: No such file, or not HDF5.
+    """
+    import h5py
+
+    place = Path(path)
+    if not place.is_file():
+        raise FileError(f"{path}: {'is not a file' if place.exists() else 'no such file'}")
+    try:
+        with h5py.File(place, "r") as file:
+            return file.attrs.get("format")
+    except OSError as error:
+        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(place) else "not an HDF5 file"
+        raise FileError(f"{path}: {problem}") from error

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.errors import FileError
 from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result, Truth
@@ -65,7 +65,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
     packed = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
 
-    with hdf5_file(path) as file:
+    with write_hdf5(path) as file:
         file.attrs.update(
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )
@@ -91,49 +91,25 @@ def load_result(path: str | Path) -> Result:
     Raises:
         FileError: No such file, not a spadwarp result, of a newer format version, or damaged; says which.
     """
-    import h5py
-
     from spadwarp.result.result import Result, Truth
     from spadwarp.scene import Scene
 
-    if not Path(path).is_file():
-        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
-    if not h5py.is_hdf5(path):
-        raise FileError(f"{path}: not an HDF5 file")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                kind = file.attrs.get("format", "unknown")
-                raise FileError(
-                    f"{path}: an HDF5 file, but not a spadwarp result: its format is {kind!r}, not {FORMAT!r}"
-                )
-            version = int(file.attrs["format_version"])
-            if version > FORMAT_VERSION:
-                raise FileError(
-                    f"{path}: format version {version} is newer than {FORMAT_VERSION}, the newest that can be read here"
-                )
-            source = file.attrs.get("source")
-            return Result(
-                scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=source),
-                tallies=file["tallies"][...],
-                unit=float(file.attrs["unit"]),
-                photons=int(file.attrs["photons"]),
-                seed=int(file.attrs["seed"]),
-                ledger_unit=float(file.attrs["ledger_unit"]),
-                partial=bool(file.attrs["partial"]),
-                batch_size=int(file.attrs.get("batch_size", 0)),
-                squares=file["squares"][...] if "squares" in file else None,
-                photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
-                requested=_requested(file),
-                truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
-                **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
-            )
-    except FileError:
-        raise
-    except (OSError, RuntimeError) as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
-    except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
-        raise FileError(f"{path}: not a whole spadwarp result: {error}") from error
+    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+        return Result(
+            scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs.get("source")),
+            tallies=file["tallies"][...],
+            unit=float(file.attrs["unit"]),
+            photons=int(file.attrs["photons"]),
+            seed=int(file.attrs["seed"]),
+            ledger_unit=float(file.attrs["ledger_unit"]),
+            partial=bool(file.attrs["partial"]),
+            batch_size=int(file.attrs.get("batch_size", 0)),
+            squares=file["squares"][...] if "squares" in file else None,
+            photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
+            requested=_requested(file),
+            truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
+            **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
+        )
 
 
 def _requested(file: Any) -> tuple[int, int]:

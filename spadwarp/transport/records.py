@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.scene.pose import rotation_matrix, to_world
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.passes import CPU_PASS, CUDA_PASS, Lane, check_range
@@ -128,7 +127,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
         FileError: The file cannot be written.
     """
 
-    with hdf5_file(path) as file:
+    with write_hdf5(path) as file:
         file.attrs.update(
             {
                 "format": FORMAT,
@@ -152,21 +151,10 @@ def load_records(path: str | Path) -> PhotonRecords:
     Raises:
         FileError: No such file, not photon records, or damaged; says which.
     """
-    import h5py
-
-    if not Path(path).is_file() or not h5py.is_hdf5(path):
-        raise FileError(f"{path}: {'not an HDF5 file' if Path(path).is_file() else 'no such file'}")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT or file.attrs["format_version"] > FORMAT_VERSION:
-                raise FileError(f"{path}: not photon records of format version {FORMAT_VERSION} or older")
-            return PhotonRecords(
-                **{name: file[name][...] for name in _ARRAYS},
-                reasons=tuple(file.attrs["reasons"]),
-                ledger=json.loads(file["ledger"].asstr()[()]),
-                ledger_unit=float(file.attrs["ledger_unit"]),
-            )
-    except SpadwarpError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+        return PhotonRecords(
+            **{name: file[name][...] for name in _ARRAYS},
+            reasons=tuple(file.attrs["reasons"]),
+            ledger=json.loads(file["ledger"].asstr()[()]),
+            ledger_unit=float(file.attrs["ledger_unit"]),
+        )

@@ -18,7 +18,7 @@ from helpers.synthetic_result import make_result, make_scene
 from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.io.hdf5 import hdf5_file
+from spadwarp.io.hdf5 import write_hdf5
 from spadwarp.result.file import load_result, load_truth_exr, save_depth_exr, save_result, save_truth_exr
 from spadwarp.result.result import Result
 
@@ -131,7 +131,7 @@ def test_a_write_that_fails_midway_says_where_and_cleans_up(tmp_path: Path) -> N
 
 
 def test_hdf5_does_not_wait_in_memory(tmp_path: Path) -> None:
-    with hdf5_file(tmp_path / "large.h5") as file:
+    with write_hdf5(tmp_path / "large.h5") as file:
         file["zeros"] = np.zeros(1 << 20)
         file.flush()
         assert sum(one.stat().st_size for one in tmp_path.iterdir()) > 8 << 20
