@@ -41,13 +41,13 @@ _HOMES = {
     "merge": "result.merge",
     "Truth": "result.result",
     "load_result": "result.file",
-    "detect": "frames.spad",
-    "Frames": "frames.spad",
-    "coates": "frames.spad",
-    "InstrumentResponse": "frames.response",
-    "instrument_response": "frames.response",
-    "arrival_time": "frames.arrival_time",
-    "crlb": "frames.cramer_rao",
+    "detect": "frames",
+    "Frames": "frames",
+    "coates": "frames",
+    "InstrumentResponse": "frames",
+    "instrument_response": "frames",
+    "arrival_time": "frames",
+    "crlb": "frames",
     "simulate_analytic": "analytic.model",
     "AnalyticResult": "analytic.model",
     "load_truth_exr": "result.rendered_truth",
@@ -89,10 +89,7 @@ if TYPE_CHECKING:
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.frames.arrival_time import arrival_time
-    from spadwarp.frames.cramer_rao import crlb
-    from spadwarp.frames.response import InstrumentResponse, instrument_response
-    from spadwarp.frames.spad import Frames, coates, detect
+    from spadwarp.frames import Frames, InstrumentResponse, arrival_time, coates, crlb, detect, instrument_response
     from spadwarp.interop.torch import TorchResult, to_torch
     from spadwarp.parallel import Ray, interruptible, run_jobs
     from spadwarp.result.file import load_result

@@ -15,14 +15,23 @@ if TYPE_CHECKING:
     import torch
     import warp as wp
 
-__all__ = ["as_warp", "caller_tallies", "in_torch_order", "is_torch", "on_host", "output_tensor", "tensor_of"]
+__all__ = [
+    "as_warp",
+    "caller_tallies",
+    "histogram_rows",
+    "in_torch_order",
+    "is_torch",
+    "on_host",
+    "output_tensor",
+    "tensor_of",
+]
 
 
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
 
     Raises:
-        TypeError: the data is of another kind (complex, text).
+        TypeError: The data is of another kind (complex, text).
     """
     import warp as wp
 
@@ -53,6 +62,35 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
         raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
     return result if result.is_contiguous else result.contiguous()
+
+
+def histogram_rows(
+    array: Any, *, name: str, device: Any = None, shape: str = "[..., bin]", dimensions: range = range(1, 16)
+) -> tuple[Any, tuple[int, ...]]:
+    """Warp rows `[pixel, bin]` of histograms and the shape that these had.
+
+    Args:
+        array: `[..., bin]`, finite and not negative.
+        name: What to call it in an error.
+        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+        shape: The shape in words, for the error.
+        dimensions: Allowed numbers of dimensions.
+
+    Raises:
+        ValueError: No pixel or no bin, another number of dimensions, a negative or non-finite value.
+        TypeError: See `as_warp`.
+    """
+    from spadwarp_kernels.detection import first_invalid_row
+
+    cube = as_warp(array, name=name, device=device)
+    sizes = tuple(int(n) for n in cube.shape)
+    if cube.size == 0 or cube.ndim not in dimensions:
+        raise ValueError(f"{name} has shape {sizes}; {shape} with at least one pixel and one bin is needed")
+    rows = cube.reshape((cube.size // sizes[-1], sizes[-1]))
+    if (row := first_invalid_row(rows)) is not None:
+        pixel = tuple(int(i) for i in np.unravel_index(row, sizes[:-1])) if len(sizes) > 1 else ()
+        raise ValueError(f"{name} holds a negative or non-finite value in pixel {pixel}")
+    return rows, sizes
 
 
 def on_host(array: Any) -> Any:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import dark_rate, pixel_maps, simulate_analytic
+from spadwarp.analytic.model import pixel_maps, simulate_analytic
 from spadwarp.errors import ConfigError
 from spadwarp.scene.geometry import path_from_range, pixel_directions
 
@@ -240,7 +240,7 @@ def _axis_rows(
             device=device,
             gate=(start, stop),
         )
-        background = maps["backscatter"] + dark_rate(scene) * (stop - start)
+        background = maps["backscatter"] + scene.detector.noise_rate * (stop - start)
         needed = _pulses_needed(scene, maps, background, stop - start, device)
         for i, distance in enumerate(some):
             rows.append(

@@ -189,7 +189,7 @@ def simulate_analytic(
     fraction = scene.analytic.backscatter_fraction
     seen = maps["fisher"] > 0
     if fraction is None:
-        dark = dark_rate(scene) * (scene.gate.stop - scene.gate.start)
+        dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
         noise = maps["backscatter"] + dark
         stray = np.where(seen, maps["outlier_probability"], 0.0)
         flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
@@ -344,11 +344,6 @@ def _source(scene: Scene) -> str | None:
     return str(scene.source) if scene.source else None
 
 
-def dark_rate(scene: Scene) -> float:
-    """Mean rate of counts without light of the laser [1/s]."""
-    return scene.detector.dark_count_rate + scene.detector.ambient_rate
-
-
 def _lidar(scene: Scene, start: float, stop: float) -> Any:
     """The kernels' picture of a scene; raises `ConfigError` for what the model does not cover."""
     import warp as wp
@@ -394,7 +389,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     lidar.start = start
     lidar.stop = stop
     lidar.sigma = response_sigma(scene)
-    lidar.dark = dark_rate(scene)
+    lidar.dark = scene.detector.noise_rate
     lidar.source = BACKSCATTER_SOURCES.index(chosen.backscatter)
     lidar.constant = chosen.backscatter_rate
     # Nearer than its own diameter the aperture's solid angle is not area over distance squared.

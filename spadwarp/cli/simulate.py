@@ -276,14 +276,9 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
     written.append(text)
     options: dict[str, Any] = {}
     if output.depth_method == "matched":
-        from spadwarp.frames.spad import instrument_response
+        from spadwarp.frames import detector_response
 
-        options["irf"] = instrument_response(
-            pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
-            jitter_fwhm=scene.detector.jitter_fwhm_ps * 1e-12,
-            shape=scene.detector.irf,
-            tail=scene.detector.irf_tail_ps * 1e-12,
-        )
+        options["irf"] = detector_response(scene.detector, scene.laser)
     frame = result.depth(method=output.depth_method, device=device, **options)
     if output.exr:
         written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_exr(result, out / "truth.exr")]

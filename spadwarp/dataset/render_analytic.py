@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import dark_rate, pixel_maps
+from spadwarp.analytic.model import pixel_maps
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.errors import ConfigError
 from spadwarp.result.result import Truth
@@ -234,7 +234,7 @@ def _stray(
     if not math.isnan(draw.fractions[0]):
         # BS is the part of the pixels that report backscatter: also of those that look into open water.
         return np.where(backscatter > 0, 1.0, 0.0), np.zeros_like(backscatter), np.array(draw.fractions)
-    dark = dark_rate(scene) * (scene.gate.stop - scene.gate.start)
+    dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
     noise = backscatter + dark
     # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
     alone = -np.expm1(-scene.analytic.pulses * noise)

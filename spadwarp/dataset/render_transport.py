@@ -15,7 +15,8 @@ from spadwarp.dataset.render_analytic import (
 )
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames.cramer_rao import crlb
-from spadwarp.frames.spad import Frames, detect
+from spadwarp.frames.frames import Frames
+from spadwarp.frames.spad import detect
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions

@@ -22,7 +22,7 @@ from spadwarp.denoise.inference import METHODS, clues_of, denoise_frames, own_we
 from spadwarp.errors import SpadwarpError
 from spadwarp.frames.arrival_time import arrival_time
 from spadwarp.frames.cramer_rao import crlb_from_histogram
-from spadwarp.frames.response import InstrumentResponse, instrument_response
+from spadwarp.frames.response import detector_response
 from spadwarp.io.atomic import atomic_path
 from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time
@@ -173,7 +173,11 @@ def photon_frame(
     from scipy.ndimage import convolve1d
 
     scene = result.scene
-    response = _response(scene)
+    response = detector_response(scene.detector, scene.laser)
+    if not response.is_smooth:
+        raise SpadwarpError(
+            "the scene has no instrument response: laser.pulse_fwhm_ps and detector.jitter_fwhm_ps are 0"
+        )
     matrix = response.per_bin(scene.gate.bin_width)
     signal = result.component("ballistic") + result.component("forward_scattered")
     back = result.component("backscatter")
@@ -236,17 +240,3 @@ def draw_photon_sweep(sweep: PhotonSweep, path: str | Path) -> Path:
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150, format="png")
     return Path(path)
-
-
-def _response(scene: Any) -> InstrumentResponse:
-    detector = scene.detector
-    if not (scene.laser.pulse_fwhm_ps or detector.jitter_fwhm_ps or detector.irf.lower().endswith(".csv")):
-        raise SpadwarpError(
-            "the scene has no instrument response: laser.pulse_fwhm_ps and detector.jitter_fwhm_ps are 0"
-        )
-    return instrument_response(
-        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
-        jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
-        shape=detector.irf,
-        tail=detector.irf_tail_ps * 1e-12,
-    )

@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import as_warp, in_torch_order, is_torch, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
@@ -24,35 +24,33 @@ def arrival_time(
 ) -> NDArray[np.float64]:
     """Arrival time of the return in every pixel [s].
 
-    A torch tensor gives a torch tensor, on its device.
+    From a torch tensor comes a torch tensor, on its device.
 
     Args:
         histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
             rates (float) in any unit, not negative.
-        gate_start: time of the lower edge of bin 0 [s].
+        gate_start: Time of the lower edge of bin 0 [s].
         bin_width: [s], > 0.
         method: `"peak"`: centre of the largest bin. `"centroid"`: mean about the peak, over ± 1.5 FWHM of `irf` (± 3
             bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
             where there is no background. `"likelihood"`: argmax over μ and the signal S of
             Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
-        irf: instrument response: an `InstrumentResponse`, or an array of response per bin, whose time
-            zero is then its mean. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its
+        irf: Instrument response: an `InstrumentResponse`, or an array of response per bin, whose time zero is then its
+            mean. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its
             mode and its mean.
         device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
-        background: expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
+        background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
             does not use it.
-        gate: (start, stop) [s]: only bins whose centres lie in it are looked at.
+        gate: (start, stop) [s]: only bins whose centres lie in it are used.
 
     Returns:
         float64, `histogram.shape[:-1]`, in the histogram's own time [s]. NaN: nothing returned in the gate, or nothing
         above the background.
 
     Raises:
-        ValueError: naming the argument, its value and what is allowed.
+        ValueError: Names the argument, its value and what is allowed.
     """
-    import warp as wp
-
     from spadwarp_kernels import detection as kernels
 
     if method not in METHODS:
@@ -61,41 +59,25 @@ def arrival_time(
         raise ValueError(f"bin_width = {bin_width} s is outside (0, inf)")
     if not np.isfinite(gate_start):
         raise ValueError(f"gate_start = {gate_start} s is not finite")
-    if irf is None and method in ("matched", "likelihood"):
+    filtered = method in ("matched", "likelihood")
+    if irf is None and filtered:
         raise ValueError(f"method = {method!r} needs an irf")
 
     with in_torch_order(histogram, background):
-        cube = as_warp(histogram, name="histogram", device=device)
-        if cube.ndim < 2 or cube.size == 0:
-            raise ValueError(
-                f"histogram has shape {tuple(cube.shape)}; [..., bin] with at least one pixel and one bin is needed"
-            )
-        frame, bins = tuple(cube.shape[:-1]), cube.shape[-1]
-        rows = cube.reshape((cube.size // bins, bins))
-        if (row := kernels.first_invalid_row(rows)) is not None:
-            pixel = tuple(int(i) for i in np.unravel_index(row, frame))
-            raise ValueError(f"histogram holds a negative or non-finite value in pixel {pixel}")
-
-        first, stop = 0, bins
-        if gate is not None:
-            # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
-            edges = [(t - gate_start) / bin_width - 0.5 for t in gate]
-            first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
-            if first >= stop:
-                end = gate_start + bins * bin_width
-                raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
-
+        rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
+        frame, bins = shape[:-1], shape[-1]
+        first, stop = (0, bins) if gate is None else _bins_of_gate(gate, gate_start, bin_width, bins)
         response, lowest_tap, half_width, offset = None, 0, 3, 0.0
         if irf is not None:
             mean, mode, fwhm = _moments(irf, bin_width)
             half_width = max(1, int(np.ceil(1.5 * fwhm)))
             offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
-            if method in ("matched", "likelihood"):
-                response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
+        if filtered:
+            response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
         bins_from_start = kernels.arrival_bins(
             rows,
             method=method,
-            background=_background_rows(background, rows, frame, wp),
+            background=None if background is None else _background_rows(background, rows, frame),
             response=response,
             lowest_tap=lowest_tap,
             first=first,
@@ -107,18 +89,26 @@ def arrival_time(
     return gate_start + (found.reshape(frame) - offset) * bin_width
 
 
-def _background_rows(background: Any, rows: Any, frame: tuple[int, ...], wp: Any) -> Any:
+def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float, bins: int) -> tuple[int, int]:
+    """The bins [first, stop) whose centres lie in the gate."""
+    # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
+    edges = [(time - gate_start) / bin_width - 0.5 for time in gate]
+    first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
+    if first >= stop:
+        end = gate_start + bins * bin_width
+        raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
+    return first, stop
+
+
+def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
     """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
+    import warp as wp
+
     from spadwarp_kernels.detection import first_invalid_row
 
-    if background is None:
-        return None
     bins = rows.shape[1]
     shape = tuple(background.shape) if np.ndim(background) else ()
-    shapes = (
-        [(), (bins,)] + [(*frame[i:], bins) for i in range(len(frame))] + [(*frame[i:], 1) for i in range(len(frame))]
-    )
-    if shape not in shapes:
+    if shape not in ((), (bins,), *((*frame[i:], last) for i in range(len(frame)) for last in (bins, 1))):
         raise ValueError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
     last = shape[-1] if shape else 1
     if isinstance(background, wp.array) and background.dtype != wp.float32:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.model import dark_rate
-from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response
+from spadwarp.device import pick_device
+from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
@@ -38,7 +38,7 @@ def crlb_from_histogram(
         signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
         background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
         bin_width: [s], > 0.
-        pulses: Pulses of one depth frame, > 0.
+        pulses: Of one depth frame, > 0.
         irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
             value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
@@ -52,7 +52,6 @@ def crlb_from_histogram(
     """
     import warp as wp
 
-    from spadwarp.transport.model import pick_device
     from spadwarp_kernels import analytic as kernels
 
     signal = np.ascontiguousarray(signal_cube, np.float32)
@@ -93,26 +92,23 @@ def crlb(
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
-    The scene's instrument response is applied. `pulses`: the scene's `analytic.pulses` if not given. See
-    `crlb_from_histogram`.
+    The scene's instrument response is applied.
+
+    Args:
+        result: Of `spadwarp.simulate`.
+        pulses: Of one depth frame; default: the scene's `analytic.pulses`.
+        law, device: See `crlb_from_histogram`.
     """
     scene = result.scene
-    detector = scene.detector
-    response = instrument_response(
-        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
-        jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
-        shape=detector.irf,
-        tail=detector.irf_tail_ps * 1e-12,
-    )
-    scale = scene.laser.photons_per_pulse * detector.pde
+    scale = scene.laser.photons_per_pulse * scene.detector.pde
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
-    background = result.component("backscatter") * scale + dark_rate(scene) * scene.gate.bin_width
+    background = result.component("backscatter") * scale + scene.detector.noise_rate * scene.gate.bin_width
     return crlb_from_histogram(
         signal,
         background,
         bin_width=scene.gate.bin_width,
         pulses=scene.analytic.pulses if pulses is None else pulses,
-        irf=response,
+        irf=detector_response(scene.detector, scene.laser),
         law=law,
         device=device,
     )
@@ -129,12 +125,9 @@ def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width
             raise ValueError(f"irf = {irf} s is outside (0, inf)")
         irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
     if isinstance(irf, InstrumentResponse):
-        if irf.times is None and irf.sigma == 0:
+        if not irf.is_smooth:
             raise ValueError("irf has no width: a step has no derivative")
-        reach = math.ceil(max(map(abs, irf.support)) / bin_width) + 2
-        edges = np.arange(-reach - 1, reach + 2) * bin_width
-        # Light spread evenly over a bin, through the response, collected in bins: second differences of the integrals.
-        return np.diff(irf.cumulative_integral(edges), 2) / bin_width, -np.diff(irf.cumulative(edges), 2)
+        return irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
     taps = np.asarray(irf, np.float64)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and (taps >= 0).all() and taps.sum() > 0):
         raise ValueError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames.arrival_time import METHODS, Method
-from spadwarp.frames.spad import Frames, detect
+from spadwarp.frames.frames import Frames
+from spadwarp.frames.spad import detect
 from spadwarp.io.hdf5 import write_hdf5
 from spadwarp.result.result import Result
 from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions

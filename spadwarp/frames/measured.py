@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.frames.response import InstrumentResponse, instrument_response
+from spadwarp.frames.response import InstrumentResponse, detector_response
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -105,7 +105,7 @@ def _read_own(path: Path) -> Histograms:
         bin_width=scene.gate.bin_width,
         gate_start=scene.gate.start,
         background=result.component("backscatter").astype(np.float32),
-        response=scene_response(scene),
+        response=detector_response(scene.detector, scene.laser),
         scene=scene,
     )
 
@@ -140,16 +140,6 @@ def frames_response(file: Any) -> InstrumentResponse:
     if "irf" in file:
         return InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
     return InstrumentResponse(sigma=float(file.attrs["irf_sigma"]), tail=float(file.attrs["irf_tail"]))
-
-
-def scene_response(scene: Scene) -> InstrumentResponse:
-    """The instrument response of a scene's laser and detector."""
-    return instrument_response(
-        pulse_fwhm=scene.laser.pulse_fwhm_ps * 1e-12,
-        jitter_fwhm=scene.detector.jitter_fwhm_ps * 1e-12,
-        shape=scene.detector.irf,
-        tail=scene.detector.irf_tail_ps * 1e-12,
-    )
 
 
 def _read_npy(path: Path) -> Histograms:

@@ -7,12 +7,22 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FWHM_PER_SIGMA", "InstrumentResponse", "SparseResponse", "instrument_response", "response_matrix"]
+if TYPE_CHECKING:
+    from spadwarp.scene import Detector, Laser
+
+__all__ = [
+    "FWHM_PER_SIGMA",
+    "InstrumentResponse",
+    "SparseResponse",
+    "detector_response",
+    "instrument_response",
+    "response_matrix",
+]
 
 Floats = NDArray[np.float64]
 
@@ -29,9 +39,9 @@ class InstrumentResponse:
     closed form: integrals over bins are exact however narrow the response is. With `sigma` and `tail` 0 it is a delta.
 
     Attributes:
-        sigma: standard deviation of the Gaussian [s]; time 0 is its centre.
-        tail: time constant of the exponential [s], 0: none.
-        times, values: a measured curve instead: ascending times [s] and values ≥ 0 of any scale.
+        sigma: Standard deviation of the Gaussian [s]; time 0 is its centre.
+        tail: Time constant of the exponential [s], 0: none.
+        times, values: A measured curve instead: ascending times [s] and values ≥ 0 of any scale.
     """
 
     sigma: float = 0.0
@@ -101,11 +111,22 @@ class InstrumentResponse:
 
     def per_bin(self, bin_width: float) -> Floats:
         """Fractions of a return in the bins about its own, `[2 r + 1]`, for returns spread evenly over a bin."""
-        reach = int(np.ceil(max(map(abs, self.support)) / bin_width)) + 2
-        edges = np.arange(-reach - 1, reach + 2) * bin_width
-        return np.diff(self.cumulative_integral(edges), 2) / bin_width
+        return np.diff(self.cumulative_integral(self._edges_about(bin_width)), 2) / bin_width
 
-    # Its numbers
+    def per_bin_slope(self, bin_width: float) -> Floats:
+        """Derivative of `per_bin` by the delay in bins, `[2 r + 1]`."""
+        return -np.diff(self.cumulative(self._edges_about(bin_width)), 2)
+
+    def _edges_about(self, bin_width: float) -> Floats:
+        reach = math.ceil(max(map(abs, self.support)) / bin_width) + 2
+        return np.arange(-reach - 1, reach + 2) * np.float64(bin_width)
+
+    # Moments and widths
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether there is a density without a step; a delta has none, and a bare exponential begins with a step."""
+        return self.times is not None or self.sigma > 0
 
     @property
     def support(self) -> tuple[float, float]:
@@ -186,7 +207,7 @@ class InstrumentResponse:
         )
 
     def _segment(self, t: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """Index of the piece that holds `t` and the time since its begin; outside all pieces, the nearer end."""
+        """Index of the piece that holds `t` and the time since its start; outside all pieces, the nearer end."""
         clipped = np.clip(t, self._knots[0], self._knots[-1])
         i = np.clip(np.searchsorted(self._knots, clipped, side="right") - 1, 0, self._knots.size - 2)
         return i, clipped - self._knots[i]
@@ -210,14 +231,14 @@ def instrument_response(
     """Pulse ⊗ jitter.
 
     Args:
-        pulse_fwhm, jitter_fwhm: of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
+        pulse_fwhm, jitter_fwhm: Of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
         shape: `"gaussian"`; `"exponentially_modified_gaussian"`, with `tail`; or the path of a CSV file with columns
             time_ps and value, a measured response (pulse included, so that the two widths are not used). The file's
             time 0 is the arrival of the photon; lines that start with # and one line of names are skipped.
-        tail: time constant of the exponential diffusion tail [s].
+        tail: Time constant of the exponential diffusion tail [s].
 
     Raises:
-        ValueError: naming the argument, or the file and the line.
+        ValueError: Names the argument, or the file and the line.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         if not (math.isfinite(value) and value >= 0):
@@ -228,6 +249,16 @@ def instrument_response(
     if shape == "exponentially_modified_gaussian":
         return InstrumentResponse(sigma=sigma, tail=tail)
     return _read_csv(Path(shape))
+
+
+def detector_response(detector: Detector, laser: Laser | None = None) -> InstrumentResponse:
+    """The instrument response of a scene's detector and laser pulse; without a laser, of the detector alone."""
+    return instrument_response(
+        pulse_fwhm=0.0 if laser is None else laser.pulse_fwhm_ps * 1e-12,
+        jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
+        shape=detector.irf,
+        tail=detector.irf_tail_ps * 1e-12,
+    )
 
 
 def _read_csv(path: Path) -> InstrumentResponse:
@@ -276,9 +307,10 @@ def response_matrix(
     other. With a period P the detector sees time modulo P: source time t and detector time t − mP are one, for all m.
 
     Args:
-        source_start, source_width, source_bins: the axis of the source [s].
-        edges: of the detector bins [s], ascending, `[bins + 1]`.
-        period: of the pulses [s]; None: time is not folded.
+        irf: The response.
+        source_start, source_width, source_bins: The axis of the source [s].
+        edges: Of the detector bins [s], ascending, `[bins + 1]`.
+        period: Of the pulses [s]; None: time does not wrap.
     """
     e = np.asarray(edges, np.float64)
     lower, upper = irf.support

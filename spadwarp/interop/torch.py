@@ -16,7 +16,7 @@ from spadwarp.result.result import COMPONENTS, Component, Result, Truth
 if TYPE_CHECKING:
     import torch
 
-    from spadwarp.frames.spad import Frames
+    from spadwarp.frames.frames import Frames
     from spadwarp.scene import Scene
 
 __all__ = [

@@ -16,7 +16,7 @@ from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.run.exposures import Exposure, Exposures, opened
 
 if TYPE_CHECKING:
-    from spadwarp.frames.spad import Frames
+    from spadwarp.frames.frames import Frames
     from spadwarp.scene import Scene
 
 __all__ = ["FORMATS", "export"]

@@ -21,7 +21,7 @@ from spadwarp.scene.geometry import path_from_range, pixel_directions, range_fro
 from spadwarp.units import time_from_path
 
 if TYPE_CHECKING:
-    from spadwarp.frames.spad import Frames
+    from spadwarp.frames.frames import Frames
 
 __all__ = ["Exposure", "Exposures", "opened"]
 

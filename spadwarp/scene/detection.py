@@ -56,6 +56,11 @@ class Detector(Section):
         """Photon detection efficiency: PDP × fill factor."""
         return self.pdp * self.fill_factor
 
+    @property
+    def noise_rate(self) -> float:
+        """Mean counts per second and pixel without light of the laser: dark counts and ambient light [1/s]."""
+        return self.dark_count_rate + self.ambient_rate
+
 
 class Gate(Section):
     """The time bins after the pulse leaves the laser."""

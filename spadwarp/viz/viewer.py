@@ -133,7 +133,7 @@ def holds_frames(path: Path) -> bool:
 
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
-    from spadwarp.frames.measured import scene_response
+    from spadwarp.frames.response import detector_response
 
     scene = result.scene
     per_pulse = scene.laser.photons_per_pulse * scene.detector.pde
@@ -159,7 +159,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         ],
         edges=result.bin_edges,
         unit="detections per pulse and bin",
-        response=scene_response(scene),
+        response=detector_response(scene.detector, scene.laser),
     )
 
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.frames.spad import InstrumentResponse, coates, detect, first_photon_probabilities
+from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities
 from spadwarp.scene import Detector, Laser
 
 BIN = 100e-12

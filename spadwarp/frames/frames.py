@@ -1,0 +1,118 @@
+"""Frames of a SPAD camera in memory: counts, what they were drawn from, time tags."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.arrays import is_torch
+from spadwarp.frames.arrival_time import Method, arrival_time
+from spadwarp.frames.pile_up import coates
+from spadwarp.frames.response import InstrumentResponse
+
+__all__ = ["Frames", "TimeTags"]
+
+
+class TimeTags(NamedTuple):
+    """Detections one by one, in the order of frame, pixel and time; `bin` counts from the window's start."""
+
+    frame: NDArray[np.int64]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    pulse: NDArray[np.int64]
+    bin: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frames:
+    """What the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
+
+    Attributes:
+        counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
+        pulses: Laser pulses per frame; frames: how many; first_frame: number of the first.
+        gate_start: Start of the detector's window [s]. Where time wraps, a count at time t stands for light at t plus
+            any number of periods.
+        bin_width: Nominal [s].
+        edges: `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity).
+        period: Of the pulses [s], where time wraps; else None.
+        irf: The response that was applied.
+        expected: float32 `[H, W, T]`, expected detections per pulse and bin before pile-up, from which the counts were
+            drawn: light through the response, dark counts, ambient light, crosstalk.
+        background: float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark
+            counts, ambient light and, where the source has it apart, backscatter.
+        seed: Of the random numbers.
+        tags: Every detection, where it was asked for.
+        notes: What the source could not give, in words.
+    """
+
+    counts: NDArray[np.int32]
+    pulses: int
+    frames: int
+    first_frame: int
+    gate_start: float
+    bin_width: float
+    edges: NDArray[np.float64]
+    period: float | None
+    irf: InstrumentResponse
+    expected: NDArray[np.float32]
+    background: NDArray[np.float32]
+    seed: int
+    tags: TimeTags | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def summed(self) -> bool:
+        """Whether the frames have been added up."""
+        return self.counts.ndim == 3
+
+    @property
+    def exposure(self) -> int:
+        """Pulses of each histogram of `counts`."""
+        return self.pulses * self.frames if self.summed else self.pulses
+
+    @property
+    def intensity(self) -> NDArray[np.int64]:
+        """Counts of each pixel over all bins: `[frames, H, W]` or `[H, W]`."""
+        return self.counts.sum(-1) if is_torch(self.counts) else self.counts.sum(axis=-1, dtype=np.int64)
+
+    def coates(self) -> NDArray[np.float64]:
+        """Detections per pulse and bin without pile-up; see `coates`."""
+        return coates(self.counts, pulses=self.exposure)
+
+    def arrival_time(
+        self,
+        method: Method = "centroid",
+        *,
+        irf: Any = None,
+        undo_pile_up: bool = False,
+        gate: tuple[float, float] | None = None,
+        device: Any = None,
+    ) -> NDArray[np.float64]:
+        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
+
+        All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
+
+        Args:
+            method: As in `spadwarp.arrival_time`.
+            irf: The response that the estimator assumes; default: the one that was applied.
+            undo_pile_up: Estimate from Coates' correction of the counts.
+            gate: (start, stop) [s] of the bins to use.
+            device: Warp device.
+        """
+        histogram: Any = self.counts
+        if undo_pile_up:
+            corrected: Any = self.coates()
+            histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
+        return arrival_time(
+            histogram,
+            gate_start=self.gate_start,
+            bin_width=self.bin_width,
+            method=method,
+            irf=self.irf if irf is None else irf,
+            background=self.background * float(self.exposure),
+            gate=gate,
+            device=device,
+        )
