@@ -68,6 +68,7 @@ _HOMES = {
     "SpadDataset": "dataset.read",
     "iterate_dataset": "dataset.read",
     "SpadwarpError": "errors",
+    "ArgumentError": "errors",
     "ConfigError": "errors",
     "DeviceError": "errors",
     "FileError": "errors",
@@ -88,7 +89,7 @@ if TYPE_CHECKING:
     from spadwarp.denoise.training_run import train
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
-    from spadwarp.errors import ConfigError, DeviceError, FileError, MeshError, SpadwarpError
+    from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.frames import Frames, InstrumentResponse, arrival_time, coates, crlb, detect, instrument_response
     from spadwarp.interop.torch import TorchResult, to_torch
     from spadwarp.parallel import Ray, interruptible, run_jobs

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from spadwarp.errors import ArgumentError
+
 if TYPE_CHECKING:
     import torch
     import warp as wp
@@ -77,7 +79,7 @@ def histogram_rows(
         dimensions: Allowed numbers of dimensions.
 
     Raises:
-        ValueError: No pixel or no bin, another number of dimensions, a negative or non-finite value.
+        ArgumentError: No pixel or no bin, another number of dimensions, a negative or non-finite value.
         TypeError: See `as_warp`.
     """
     from spadwarp_kernels.detection import first_invalid_row
@@ -85,11 +87,11 @@ def histogram_rows(
     cube = as_warp(array, name=name, device=device)
     sizes = tuple(int(n) for n in cube.shape)
     if cube.size == 0 or cube.ndim not in dimensions:
-        raise ValueError(f"{name} has shape {sizes}; {shape} with at least one pixel and one bin is needed")
+        raise ArgumentError(f"{name} has shape {sizes}; {shape} with at least one pixel and one bin is needed")
     rows = cube.reshape((cube.size // sizes[-1], sizes[-1]))
     if (row := first_invalid_row(rows)) is not None:
         pixel = tuple(int(i) for i in np.unravel_index(row, sizes[:-1])) if len(sizes) > 1 else ()
-        raise ValueError(f"{name} holds a negative or non-finite value in pixel {pixel}")
+        raise ArgumentError(f"{name} holds a negative or non-finite value in pixel {pixel}")
     return rows, sizes
 
 
@@ -142,7 +144,7 @@ def output_tensor(out: Any, *, name: str, shape: Sequence[int], device: wp.Devic
     """The caller's int32 tensor for an output, or a new one, inside `in_torch_order`.
 
     Raises:
-        ValueError: It is not a tensor, of another type or shape, not contiguous, or on another device.
+        ArgumentError: It is not a tensor, of another type or shape, not contiguous, or on another device.
     """
     import torch
     import warp as wp
@@ -151,9 +153,9 @@ def output_tensor(out: Any, *, name: str, shape: Sequence[int], device: wp.Devic
     if out is None:
         return torch.empty(shape, dtype=torch.int32, device=place)
     if not is_torch(out):
-        raise ValueError(f"{name} is a {type(out).__name__}; a torch tensor is needed")
+        raise ArgumentError(f"{name} is a {type(out).__name__}; a torch tensor is needed")
     if out.dtype != torch.int32 or out.shape != shape or not out.is_contiguous() or out.device != place:
-        raise ValueError(
+        raise ArgumentError(
             f"{name} is {out.dtype} {tuple(out.shape)} on {out.device}; contiguous torch.int32 {shape} on {place} is "
             "needed"
         )
@@ -164,16 +166,16 @@ def caller_tallies(tallies: Any, *, shape: Sequence[int], device: wp.Device) -> 
     """The caller's own tensor or Warp array as zeroed tallies, flat.
 
     Raises:
-        ValueError: It is of another kind, type or size, not contiguous, or on another device.
+        ArgumentError: It is of another kind, type or size, not contiguous, or on another device.
     """
     import warp as wp
 
     if not (is_torch(tallies) or isinstance(tallies, wp.array)):
-        raise ValueError(f"tallies are a {type(tallies).__name__}; a torch tensor or a Warp array is needed")
+        raise ArgumentError(f"tallies are a {type(tallies).__name__}; a torch tensor or a Warp array is needed")
     array: Any = wp.from_torch(tallies, requires_grad=False) if is_torch(tallies) else tallies
     size = int(np.prod(shape))
     if array.dtype is not wp.int64 or array.size != size or not array.is_contiguous or array.device != device:
-        raise ValueError(
+        raise ArgumentError(
             f"tallies are {array.dtype.__name__} {tuple(array.shape)} on {array.device}; contiguous int64 "
             f"{tuple(shape)} on {device} is needed"
         )

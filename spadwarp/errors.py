@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"]
+__all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"]
 
 
 class SpadwarpError(Exception):
     """Base of every error that spadwarp raises on purpose; its text is meant for the user as it is."""
+
+
+class ArgumentError(SpadwarpError, ValueError):
+    """An argument of a public function that is out of range, of the wrong shape, missing or one too many."""
 
 
 class ConfigError(SpadwarpError):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import pixel_maps, simulate_analytic
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.scene.geometry import path_from_range, pixel_directions
 
 if TYPE_CHECKING:
@@ -124,16 +124,16 @@ def budget(
 
     Raises:
         ConfigError: A water or scene that the model does not cover.
-        ValueError: Ranges or reflectance out of range.
+        ArgumentError: Ranges or reflectance out of range.
     """
     distances = np.array(sorted(RANGES if ranges is None else ranges), np.float64)
     if distances.size == 0 or not ((distances > 0) & np.isfinite(distances)).all():
-        raise ValueError(f"ranges = {distances.tolist()} are not all in (0, inf)")
+        raise ArgumentError(f"ranges = {distances.tolist()} are not all in (0, inf)")
     if reflectance is None:
         given = scene.targets[0].reflectance if scene.targets else 0.5
         reflectance = 0.5 if given == "from_file" else given
     if not 0 <= reflectance <= 1:
-        raise ValueError(f"reflectance = {reflectance} is outside [0, 1]")
+        raise ArgumentError(f"reflectance = {reflectance} is outside [0, 1]")
     if scene.analytic.backscatter == "monte_carlo":
         raise ConfigError("analytic.backscatter = 'monte_carlo' belongs to one range; a budget takes 'single_scatter'")
     rows: list[BudgetRow] = []
@@ -161,13 +161,13 @@ def sweep(
 
     Raises:
         ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
-        ValueError: `vary` or `of` not of the form above.
+        ArgumentError: `vary` or `of` not of the form above.
     """
     if of not in ("budget", "depth-error"):
-        raise ValueError(f"of = {of!r} is not one of 'budget', 'depth-error'")
+        raise ArgumentError(f"of = {of!r} is not one of 'budget', 'depth-error'")
     field, values = parse_vary(vary) if isinstance(vary, str) else (vary[0], list(vary[1]))
     if not values:
-        raise ValueError(f"vary = {vary!r} holds no value")
+        raise ArgumentError(f"vary = {vary!r} holds no value")
     rows: list[Any] = []
     for value in values:
         changed = scene.with_overrides({field: value})
@@ -176,12 +176,12 @@ def sweep(
 
 
 def parse_vary(text: str) -> tuple[str, list[Any]]:
-    """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ValueError`."""
+    """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ArgumentError`."""
     from spadwarp.scene import parse_override
 
     field, equals, spec = (part.strip() for part in text.partition("="))
     if not field or not equals or not spec:
-        raise ValueError(f"vary = {text!r} is not of the form section.field=from:to:count")
+        raise ArgumentError(f"vary = {text!r} is not of the form section.field=from:to:count")
     if ":" not in spec:
         try:
             return field, tomllib.loads(f"values = [{spec}]")["values"]
@@ -196,7 +196,7 @@ def parse_vary(text: str) -> tuple[str, list[Any]]:
         if geometric and not (low > 0 and high > 0):
             raise ValueError
     except (ValueError, IndexError):
-        raise ValueError(
+        raise ArgumentError(
             f"vary = {text!r} is not of the form section.field=from:to:count, with :log only for positive ends"
         ) from None
     return field, [float(one) for one in (np.geomspace if geometric else np.linspace)(low, high, count)]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene.geometry import depth_per_time, gate_deviation, pixel_directions
@@ -162,7 +162,7 @@ def simulate_analytic(
 
     Raises:
         ConfigError: A scene that the model does not cover, or whose gate holds no return.
-        ValueError: A truth or profile of the wrong shape, or with values that cannot be.
+        ArgumentError: A truth or profile of the wrong shape, or with values that cannot be.
 
     With `backscatter_fraction` given, that part of the pixels reports a backscatter photon (the paper's BS). Without, a
     pixel reports a background photon with the probability that a maximum-likelihood fit locks on background.
@@ -173,7 +173,7 @@ def simulate_analytic(
         truth = truth_maps(scene)
     _check_truth(truth, scene)
     if frames < 0:
-        raise ValueError(f"frames = {frames} is outside [0, inf)")
+        raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     shape = truth.depth.shape
     view = pixel_directions(scene.camera)
     maps, table = pixel_maps(
@@ -271,7 +271,7 @@ def pixel_maps(
         paths, cumulative = paths_d.numpy(), cumulative_d.numpy()
     elif chosen.backscatter == "monte_carlo":
         if backscatter_profile is None:
-            raise ValueError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
+            raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
         profile = backscatter_profile
         sums = np.concatenate([np.zeros((len(profile), 1)), np.cumsum(profile, axis=1, dtype=np.float64)], axis=1)
         total = np.broadcast_to(sums[:, -1], distances.shape).copy()
@@ -414,19 +414,19 @@ def _profile(scene: Scene, given: Result | ArrayLike | None) -> NDArray[np.float
         values = np.asarray(given, np.float64)
     shape = (camera.height, camera.width, bins)
     if values.shape not in ((bins,), shape):
-        raise ValueError(f"backscatter_profile has shape {values.shape}; ({bins},) or {shape} is needed")
+        raise ArgumentError(f"backscatter_profile has shape {values.shape}; ({bins},) or {shape} is needed")
     if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise ValueError("backscatter_profile holds a value outside [0, inf)")
+        raise ArgumentError("backscatter_profile holds a value outside [0, inf)")
     return np.ascontiguousarray(values.reshape(-1, bins), np.float32)
 
 
 def _check_truth(truth: Truth, scene: Scene) -> None:
     shape = (scene.camera.height, scene.camera.width)
     if truth.depth.shape != shape:
-        raise ValueError(f"truth.depth has shape {truth.depth.shape}; the camera's {shape} is needed")
+        raise ArgumentError(f"truth.depth has shape {truth.depth.shape}; the camera's {shape} is needed")
     hit = ~np.isnan(truth.depth)
     if not hit.any():
-        raise ValueError("truth.depth is NaN in every pixel: nothing is in view")
+        raise ArgumentError("truth.depth is NaN in every pixel: nothing is in view")
     for name, low, high in (("depth", 0.0, math.inf), ("range", 0.0, math.inf), ("reflectance", 0.0, 1.0)):
         values = getattr(truth, name)[hit]
         wrong = ~(np.isfinite(values) & (values >= low) & (values <= high))
@@ -435,11 +435,11 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
         if wrong.any():
             row, column = np.argwhere(hit)[np.argmax(wrong)]
             interval = "[0, 1]" if name == "reflectance" else "(0, inf)"
-            raise ValueError(
+            raise ArgumentError(
                 f"truth.{name} = {values[np.argmax(wrong)]} at pixel ({row}, {column}) is outside {interval}"
             )
     if not np.isfinite(truth.normal[hit]).all():
-        raise ValueError("truth.normal is not finite where truth.depth is")
+        raise ArgumentError("truth.normal is not finite where truth.depth is")
 
 
 def _check_gate(scene: Scene, signal: Map, arrival: Map, fisher: Map) -> None:

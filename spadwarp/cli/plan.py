@@ -32,6 +32,7 @@ from spadwarp.cli._options import (
     whole_number,
     write_json,
 )
+from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -125,7 +126,7 @@ def analytic(
     prepare_directory(out, overwrite=overwrite, needed=(5 * max(frames, 0) + 200) * pixels + (16 << 20))
     with arguments_checked():
         if frames < 0:
-            raise ValueError(f"frames = {frames} is outside [0, inf)")
+            raise ArgumentError(f"frames = {frames} is outside [0, inf)")
         truth: Truth | None = None
         if depth is not None:
             truth = spadwarp.load_truth_exr(
@@ -254,7 +255,7 @@ def _numbers(text: str | None) -> list[float] | None:
         return None
     _, values = parse_vary(f"range={text}")
     if not all(isinstance(value, (int, float)) for value in values):
-        raise ValueError(f"range = {text!r} is not of the form from:to:count or a,b,c")
+        raise ArgumentError(f"range = {text!r} is not of the form from:to:count or a,b,c")
     return [float(value) for value in values]
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.dataset.histograms import HistogramFile
 from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
@@ -51,7 +51,7 @@ class FrameReader:
 
     Raises:
         FileError: No dataset, or one that is not whole.
-        ValueError: An argument out of range.
+        ArgumentError: An argument out of range.
     """
 
     def __init__(
@@ -68,17 +68,17 @@ class FrameReader:
         self.path = Path(path)
         self.manifest = read_manifest(self.path)
         if split not in (*SPLITS, "all"):
-            raise ValueError(f"split = {split!r} is not one of {', '.join(map(repr, (*SPLITS, 'all')))}")
+            raise ArgumentError(f"split = {split!r} is not one of {', '.join(map(repr, (*SPLITS, 'all')))}")
         if unknown := [name for name in fields if name not in FIELDS]:
-            raise ValueError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, FIELDS))}")
+            raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, FIELDS))}")
         if repeats < 1:
-            raise ValueError(f"repeats = {repeats} is outside [1, inf)")
+            raise ArgumentError(f"repeats = {repeats} is outside [1, inf)")
         self.split, self.fields, self.repeats, self.seed = split, tuple(fields), repeats, seed
         self.augment, self.epoch = augment, 0
         self.shape: tuple[int, int] = (self.manifest["height"], self.manifest["width"])
         self.crop = (crop, crop) if isinstance(crop, int) else crop
         if self.crop is not None and not all(1 <= a <= b for a, b in zip(self.crop, self.shape, strict=True)):
-            raise ValueError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
+            raise ArgumentError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
         self.shards: list[str] = [
             name for one in (SPLITS if split == "all" else (split,)) for name in self.manifest["splits"][one]["shards"]
         ]

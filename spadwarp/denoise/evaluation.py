@@ -19,7 +19,7 @@ from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames, own_weights
 from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 
 __all__ = ["Evaluation", "Sample", "evaluate"]
 
@@ -132,17 +132,17 @@ def evaluate(
     middle of the gate.
 
     Raises:
-        ValueError: An argument out of range; weights of a network that is not among the models.
+        ArgumentError: An argument out of range; weights of a network that is not among the models.
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + (["bm3d"] if bm3d_frames > 0 else [])
     if unknown := [name for name in (*models, *wanted) if name not in METHODS]:
-        raise ValueError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
     if "histograms" in wanted:
-        raise ValueError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
+        raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
     if frames < 1:
-        raise ValueError(f"frames = {frames} is outside [1, inf)")
+        raise ArgumentError(f"frames = {frames} is outside [1, inf)")
     own = own_weights(wanted, None if weights is None else Path(weights))
     chosen, photons, about = _chosen(data, split, frames)
     reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
@@ -156,7 +156,7 @@ def evaluate(
     shape = reader[0]["noisy"].shape[-2:]
     width, height = (shape[1], shape[0]) if crop is None else crop
     if not (8 <= width <= shape[1] and 8 <= height <= shape[0]):
-        raise ValueError(f"crop = ({width}, {height}) is outside (8, 8) to ({shape[1]}, {shape[0]})")
+        raise ArgumentError(f"crop = ({width}, {height}) is outside (8, 8) to ({shape[1]}, {shape[0]})")
     top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
     part = slice(top, top + height), slice(left, left + width)
     if crop is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import POOLED, depth_frames
 from spadwarp.denoise.inference import clues_of, denoise_frames, weights_card
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.arrival_time import Method
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.measured import Histograms, read_histograms
@@ -94,11 +94,13 @@ def denoise_file(
 
     Raises:
         FileError: Cannot be read, or written.
-        ValueError: An argument out of range or missing.
+        ArgumentError: An argument out of range or missing.
     """
     folder, name = Path(out), Path(path).stem
     if folder.resolve() == Path(path).resolve().parent:
-        raise ValueError(f"out = {folder} is the folder of {path}; another is needed, so that nothing is overwritten")
+        raise ArgumentError(
+            f"out = {folder} is the folder of {path}; another is needed, so that nothing is overwritten"
+        )
     read = read_depth(path, **reading)
     notes = [read.source]
     gate = gate or read.gate
@@ -167,7 +169,7 @@ def read_depth(
 
     Raises:
         FileError: No such file, not readable, or without depth.
-        ValueError: An argument out of range, or missing for what the file holds.
+        ArgumentError: An argument out of range, or missing for what the file holds.
     """
     place = Path(path)
     if not place.is_file():
@@ -176,7 +178,7 @@ def read_depth(
     if ending not in ENDINGS:
         raise FileError(f"{place}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale = {scale} is outside (0, inf)")
+        raise ArgumentError(f"scale = {scale} is outside (0, inf)")
     stored: NDArray[Any] | None = None
     if ending == ".exr":
         stored = _exr_depth(place, channel)

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
+
 __all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "POOLED", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
 
 LOG_DENSITY_LIMIT = 4.0
@@ -101,24 +103,24 @@ def depth_frames(
     What lies farther than `MARGIN` outside the gate counts as not reported, with a warning that gives the number.
 
     Raises:
-        ValueError: Shapes, sizes or values that cannot be, or a gate without width.
+        ArgumentError: Shapes, sizes or values that cannot be, or a gate without width.
     """
     values = np.asarray(depth)
     if values.dtype.kind not in "iuf" or values.ndim not in (2, 3):
-        raise ValueError(f"depth is {values.dtype} {values.shape}; real numbers [H, W] or [N, H, W] are needed")
+        raise ArgumentError(f"depth is {values.dtype} {values.shape}; real numbers [H, W] or [N, H, W] are needed")
     values = values.astype(np.float32).reshape(-1, *values.shape[-2:])
     if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
-        raise ValueError(
+        raise ArgumentError(
             f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; one of "
             f"{SMALLEST_SIDE} x {SMALLEST_SIDE} is the least"
         )
     if clues is not None and (len(clues) != len(values) or clues.shape[2:] != values.shape[1:]):
-        raise ValueError(f"histograms are {len(clues)} frames of {clues.shape[2:]} pixels, depth is {values.shape}")
+        raise ArgumentError(f"histograms are {len(clues)} frames of {clues.shape[2:]} pixels, depth is {values.shape}")
     start, stop = map(float, gate)
     if not (math.isfinite(stop) and 0 <= start < stop):
-        raise ValueError(f"gate = ({start}, {stop}) m is not (start, stop) with 0 <= start < stop")
+        raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with 0 <= start < stop")
     if (values[np.isfinite(values)] < 0).any():
-        raise ValueError(f"depth {np.nanmin(values)} m is outside [0, inf)")
+        raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf)")
     present = np.isfinite(values) & (values > 0)
     slack = MARGIN * (stop - start)
     outside = present & ~((values >= start - slack) & (values <= stop + slack))
@@ -133,12 +135,12 @@ def depth_frames(
     if density is not None:
         given = np.asarray(density, np.float32).reshape(-1, *values.shape[1:])
         if given.shape != values.shape or (given < 0).any():
-            raise ValueError(f"density has shape {np.shape(density)}; {values.shape} is needed, of numbers >= 0")
+            raise ArgumentError(f"density has shape {np.shape(density)}; {values.shape} is needed, of numbers >= 0")
         relative = np.nan_to_num(given * np.float32(stop - start), nan=1.0)
     elif profile is not None:
         bins = np.asarray(profile, np.float64)
         if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
-            raise ValueError(
+            raise ArgumentError(
                 f"profile has shape {bins.shape}; one dimension of numbers >= 0 that are not all 0 is needed"
             )
         place = np.nan_to_num((values - start) / (stop - start)) * bins.size

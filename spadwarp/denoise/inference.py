@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import POOLED, DepthFrames, depth_frames
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.errors import DeviceError, FileError, SpadwarpError
+from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
 
 __all__ = ["METHODS", "denoise", "denoise_frames", "weights_card"]
 
@@ -63,7 +63,7 @@ def denoise(
         missed; the others have NaN where `depth` has. A frame in which nothing was reported stays empty.
 
     Raises:
-        ValueError: An argument out of range.
+        ArgumentError: An argument out of range.
         SpadwarpError: A package of the extra `denoise` is missing; a device that is not there; weights that cannot be
             read.
     """
@@ -71,7 +71,7 @@ def denoise(
     if counts is not None and model in ("pyramid", "histograms"):
         model = "histograms"
         if background is None or response is None:
-            raise ValueError("counts go with background and response, which are missing")
+            raise ArgumentError("counts go with background and response, which are missing")
         clues = clues_of(counts, background=background, response=response, device=device)
         clues[:, :POOLED] = gate[0] + (gate[1] - gate[0]) * clues[:, :POOLED]
     frames = depth_frames(depth, gate=gate, profile=profile, clues=clues)
@@ -93,15 +93,15 @@ def denoise_frames(
     Arguments and errors are those of `denoise`; `window`: of the median [pixels].
     """
     if model not in METHODS:
-        raise ValueError(f"model = {model!r} is not one of {', '.join(map(repr, METHODS))}")
+        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, METHODS))}")
     if model == "histograms" and frames.clues is None:
-        raise ValueError('model = "histograms" needs counts with their background and response; there are none')
+        raise ArgumentError('model = "histograms" needs counts with their background and response; there are none')
     reported = ~np.isnan(frames.depth)
     if model in BASELINES:
         if weights is not None:
-            raise ValueError(f"weights go with a network, not with {model!r}")
+            raise ArgumentError(f"weights go with a network, not with {model!r}")
         if window < 1 or window % 2 == 0:
-            raise ValueError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
+            raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
         found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
         return found, reported
     torch = _torch()
@@ -146,7 +146,7 @@ def clues_of(
         float32 `[N, CLUES, H, W]`; the pooled depths, which come first, as parts of the gate.
 
     Raises:
-        ValueError: Shapes or values that cannot be.
+        ArgumentError: Shapes or values that cannot be.
     """
     torch = _torch()
     from spadwarp.denoise.histogram_features import histogram_clues
@@ -154,15 +154,15 @@ def clues_of(
     cubes = np.asarray(counts)
     levels, taps = (np.array(one, np.float32) for one in (background, response))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
-        raise ValueError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
+        raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
     if levels.shape not in (cubes.shape[-1:], cubes.shape[-3:]) or not (
         np.isfinite(levels).all() and (levels >= 0).all()
     ):
-        raise ValueError(
+        raise ArgumentError(
             f"background has shape {levels.shape}; {cubes.shape[-1:]} or {cubes.shape[-3:]} is needed, of numbers >= 0"
         )
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
-        raise ValueError(f"response has shape {taps.shape}; an odd number of values about time zero is needed")
+        raise ArgumentError(f"response has shape {taps.shape}; an odd number of values about time zero is needed")
     place = _device(torch, device)
     tap = torch.from_numpy((taps / taps.sum())[None]).to(place)
     level = torch.from_numpy(levels if levels.ndim == 3 else levels[None, None])[None].to(place)
@@ -207,7 +207,7 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
 
 
 def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, Path]:
-    """`weights` by the network that the file names; empty without. Raises `ValueError` if it is none of `models`."""
+    """`weights` by the network that the file names; empty without. Raises `ArgumentError` if it is none of `models`."""
     if weights is None:
         return {}
     if not Path(weights).is_file():
@@ -216,13 +216,15 @@ def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, 
     if model not in MODELS:
         raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
     if model not in models:
-        raise ValueError(f"weights = {str(weights)!r} are of {model!r}, which is not among models: {', '.join(models)}")
+        raise ArgumentError(
+            f"weights = {str(weights)!r} are of {model!r}, which is not among models: {', '.join(models)}"
+        )
     return {model: Path(weights)}
 
 
 def _weights_path(model: str, weights: str | Path | None) -> Path:
     if model not in MODELS:
-        raise ValueError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
+        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
     path = WEIGHTS / f"{model}.safetensors" if weights is None else Path(weights)
     if not path.is_file():
         raise FileError(f"{path}: no such file")

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.errors import ArgumentError
+
 __all__ = ["LARGER_IS_BETTER", "Scores", "Steps", "score", "staircase_steps"]
 
 _EDGE = 0.05  # a jump of depth between neighbours that is an edge [m]
@@ -66,17 +68,17 @@ def score(clean: NDArray[np.float32], estimate: NDArray[np.float32], *, gate: tu
         gate: (start, stop) over which 8 bits are scaled [m].
 
     Raises:
-        ValueError: Shapes that differ, or no target in the frame within the gate.
+        ArgumentError: Shapes that differ, or no target in the frame within the gate.
     """
     from skimage.measure import shannon_entropy
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     if clean.shape != estimate.shape or clean.ndim != 2:
-        raise ValueError(f"estimate has shape {estimate.shape}; {clean.shape} is needed")
+        raise ArgumentError(f"estimate has shape {estimate.shape}; {clean.shape} is needed")
     start, stop = gate
     seen = np.isfinite(clean) & (clean >= start) & (clean < stop)
     if not seen.any():
-        raise ValueError(f"no pixel sees a target within {start:g} to {stop:g} m")
+        raise ArgumentError(f"no pixel sees a target within {start:g} to {stop:g} m")
     estimate = np.nan_to_num(estimate, nan=stop)
 
     def eight_bits(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

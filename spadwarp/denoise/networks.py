@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spadwarp.denoise.histogram_features import CLUES, WINDOWS
+from spadwarp.errors import ArgumentError
 
 __all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
 
@@ -275,7 +276,7 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
 def build_network(name: str) -> nn.Module:
     """A network with new weights; raises ValueError for a name that is not in `NETWORKS`."""
     if name not in NETWORKS:
-        raise ValueError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
+        raise ArgumentError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
     return NETWORKS[name]()
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import POOLED, DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, clues_of, denoise_frames, own_weights
-from spadwarp.errors import SpadwarpError
+from spadwarp.errors import ArgumentError, SpadwarpError
 from spadwarp.frames.arrival_time import arrival_time
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.response import detector_response
@@ -102,15 +102,15 @@ def photon_sweep(
         progress: Called with ("frames", done, total).
 
     Raises:
-        ValueError: An argument out of range; weights of a network that is not among the models.
+        ArgumentError: An argument out of range; weights of a network that is not among the models.
         FileError: Weights that cannot be read.
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
     if unknown := [name for name in models if name not in METHODS]:
-        raise ValueError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
     for name, values in (("photons", photons), ("sbr", sbr)):
         if not values or min(values) <= 0:
-            raise ValueError(f"{name} = {list(values)} needs numbers in (0, inf)")
+            raise ArgumentError(f"{name} = {list(values)} needs numbers in (0, inf)")
     own = own_weights(models, weights)
     shape = (len(sbr), len(photons))
     squares = {name: np.zeros(shape) for name in ("input", *models)}

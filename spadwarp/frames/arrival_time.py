@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
+from spadwarp.errors import ArgumentError
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
@@ -49,19 +50,19 @@ def arrival_time(
         above the background.
 
     Raises:
-        ValueError: Names the argument, its value and what is allowed.
+        ArgumentError: Names the argument, its value and what is allowed.
     """
     from spadwarp_kernels import detection as kernels
 
     if method not in METHODS:
-        raise ValueError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
+        raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
     if not (np.isfinite(bin_width) and bin_width > 0):
-        raise ValueError(f"bin_width = {bin_width} s is outside (0, inf)")
+        raise ArgumentError(f"bin_width = {bin_width} s is outside (0, inf)")
     if not np.isfinite(gate_start):
-        raise ValueError(f"gate_start = {gate_start} s is not finite")
+        raise ArgumentError(f"gate_start = {gate_start} s is not finite")
     filtered = method in ("matched", "likelihood")
     if irf is None and filtered:
-        raise ValueError(f"method = {method!r} needs an irf")
+        raise ArgumentError(f"method = {method!r} needs an irf")
 
     with in_torch_order(histogram, background):
         rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
@@ -96,7 +97,7 @@ def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float
     first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
     if first >= stop:
         end = gate_start + bins * bin_width
-        raise ValueError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
+        raise ArgumentError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
     return first, stop
 
 
@@ -109,7 +110,7 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
     bins = rows.shape[1]
     shape = tuple(background.shape) if np.ndim(background) else ()
     if shape not in ((), (bins,), *((*frame[i:], last) for i in range(len(frame)) for last in (bins, 1))):
-        raise ValueError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
+        raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
     last = shape[-1] if shape else 1
     if isinstance(background, wp.array) and background.dtype != wp.float32:
         background = background.numpy()
@@ -123,7 +124,7 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
         values = wp.array(array, dtype=wp.float32, device=rows.device)
     if not valid:
         found = values.numpy()
-        raise ValueError(f"background = {found.min()} … {found.max()} is outside [0, inf)")
+        raise ArgumentError(f"background = {found.min()} … {found.max()} is outside [0, inf)")
     return values
 
 
@@ -166,9 +167,9 @@ def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np
 def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
     weights = np.asarray(irf, np.float64)
     if weights.ndim != 1 or weights.size == 0:
-        raise ValueError(f"irf has shape {weights.shape}; one value per bin is needed")
+        raise ArgumentError(f"irf has shape {weights.shape}; one value per bin is needed")
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
-        raise ValueError("irf must be finite and not negative, and its sum larger than 0")
+        raise ArgumentError("irf must be finite and not negative, and its sum larger than 0")
     return weights / weights.sum()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
+from spadwarp.errors import ArgumentError
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def crlb_from_histogram(
         float64 `[...]` [s]; NaN where the histogram holds no information.
 
     Raises:
-        ValueError: Negative or non-finite cubes, shapes that do not fit, values out of range.
+        ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
     """
     import warp as wp
 
@@ -58,15 +59,15 @@ def crlb_from_histogram(
     background = np.asarray(background_cube, np.float32)
     bins = signal.shape[-1] if signal.ndim else 0
     if background.shape not in ((), (bins,), signal.shape) or signal.size == 0:
-        raise ValueError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
+        raise ArgumentError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
     for name, cube in (("signal_cube", signal), ("background_cube", background)):
         if not (np.isfinite(cube).all() and (cube >= 0).all()):
-            raise ValueError(f"{name} holds a value outside [0, inf)")
+            raise ArgumentError(f"{name} holds a value outside [0, inf)")
     for name, value in (("bin_width", bin_width), ("pulses", pulses)):
         if not (value > 0 and math.isfinite(value)):
-            raise ValueError(f"{name} = {value} is outside (0, inf)")
+            raise ArgumentError(f"{name} = {value} is outside (0, inf)")
     if law not in ("poisson", "first_photon"):
-        raise ValueError(f"law = {law!r} is not one of 'poisson', 'first_photon'")
+        raise ArgumentError(f"law = {law!r} is not one of 'poisson', 'first_photon'")
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
     rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
@@ -122,14 +123,14 @@ def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width
     if not isinstance(irf, InstrumentResponse) and np.ndim(irf) == 0:
         fwhm = float(irf)  # type: ignore[arg-type]
         if not (fwhm > 0 and math.isfinite(fwhm)):
-            raise ValueError(f"irf = {irf} s is outside (0, inf)")
+            raise ArgumentError(f"irf = {irf} s is outside (0, inf)")
         irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
     if isinstance(irf, InstrumentResponse):
         if not irf.is_smooth:
-            raise ValueError("irf has no width: a step has no derivative")
+            raise ArgumentError("irf has no width: a step has no derivative")
         return irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
     taps = np.asarray(irf, np.float64)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and (taps >= 0).all() and taps.sum() > 0):
-        raise ValueError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")
+        raise ArgumentError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")
     taps = taps / taps.sum()
     return taps, np.convolve(taps, stencil)

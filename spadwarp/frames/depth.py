@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.errors import ArgumentError
 from spadwarp.frames.arrival_time import Method, arrival_time
 from spadwarp.frames.measured import Histograms
 from spadwarp.scene import Camera
@@ -71,18 +72,20 @@ def depth_of(
     Measured histograms count as those of a laser in the lens, whose pulse leaves at time 0.
 
     Raises:
-        ValueError: Something that is needed is missing, given twice or out of range.
+        ArgumentError: Something that is needed is missing, given twice or out of range.
     """
     scene = histograms.scene
     if histograms.bin_width is None:
-        raise ValueError("bin width is missing (--bin-width-ps): the file does not tell it")
+        raise ArgumentError("bin width is missing (--bin-width-ps): the file does not tell it")
     if scene is None and group_index is None:
-        raise ValueError("group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
+        raise ArgumentError(
+            "group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater"
+        )
     if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
-        raise ValueError("group index and field of view are those of the file's scene")
+        raise ArgumentError("group index and field of view are those of the file's scene")
     index = scene.medium.group_index if scene is not None else float(group_index or 0)
     if not 1 <= index <= 3:
-        raise ValueError(f"group index = {index} is outside [1, 3]")
+        raise ArgumentError(f"group index = {index} is outside [1, 3]")
     values = histograms.values
     height, width = values.shape[-3:-1]
     directions, laser = None, (0.0, 0.0, 0.0)
@@ -90,7 +93,7 @@ def depth_of(
         directions, laser = pixel_directions(scene.camera), scene.beam.position
     elif horizontal_fov_deg is not None:
         if not 0 < horizontal_fov_deg < 180:
-            raise ValueError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
+            raise ArgumentError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
         camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
         directions = pixel_directions(camera)
 
@@ -106,7 +109,7 @@ def depth_of(
     filtered = method in ("matched", "likelihood")
     response = histograms.response if filtered else histograms.irf
     if filtered and response is None:
-        raise ValueError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
+        raise ArgumentError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
     time = arrival_time(
         values,
         gate_start=histograms.gate_start,

@@ -110,7 +110,7 @@ def record_frames(
         progress: Called with ("frames", done, frames).
 
     Raises:
-        ValueError: An argument out of range.
+        ArgumentError: An argument out of range.
         FileError: The file cannot be written.
     """
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
+from spadwarp.errors import ArgumentError
 
 __all__ = ["coates", "first_photon_probabilities"]
 
@@ -49,11 +50,11 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
     with in_torch_order(counts):
         rows, shape = histogram_rows(counts, name="counts", device=device)
         if rows.dtype not in (wp.int32, wp.int64):
-            raise ValueError(f"counts are {rows.dtype.__name__}; integers are needed")
+            raise ArgumentError(f"counts are {rows.dtype.__name__}; integers are needed")
         values = rows.numpy()
         most = int(values.sum(axis=1, dtype=np.int64).max())
         if most > pulses:
-            raise ValueError(
+            raise ArgumentError(
                 f"pulses = {pulses} is below the {most} counts of a histogram: it has seen more than one a pulse"
             )
         if rows.dtype != wp.int32:

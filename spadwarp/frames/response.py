@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
+
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
 
@@ -53,19 +55,19 @@ class InstrumentResponse:
         for name in ("sigma", "tail"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} = {value} s is outside [0, inf)")
+                raise ArgumentError(f"{name} = {value} s is outside [0, inf)")
         if (self.times is None) != (self.values is None):
-            raise ValueError("times and values of a measured response go together")
+            raise ArgumentError("times and values of a measured response go together")
         if self.times is None:
             return
         times, values = np.array(self.times, np.float64), np.array(self.values, np.float64)
         if times.ndim != 1 or times.size < 2 or values.shape != times.shape:
-            raise ValueError(f"times {times.shape} and values {values.shape} are not two equal lists of two or more")
+            raise ArgumentError(f"times {times.shape} and values {values.shape} are not two equal lists of two or more")
         if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-            raise ValueError("times of a measured response must be finite and ascending")
+            raise ArgumentError("times of a measured response must be finite and ascending")
         if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
             span = f"{values.min()} … {values.max()}"
-            raise ValueError(f"values of a measured response ({span}) must be finite, not negative and not all 0")
+            raise ArgumentError(f"values of a measured response ({span}) must be finite, not negative and not all 0")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values / np.trapezoid(values, times))
 
@@ -78,7 +80,7 @@ class InstrumentResponse:
             return np.interp(t, self._knots, self._heights, left=0.0, right=0.0)
         if self.tail == 0:
             if self.sigma == 0:
-                raise ValueError("a response without width has no density")
+                raise ArgumentError("a response without width has no density")
             return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
         return self._tail_density(t)
 
@@ -238,11 +240,11 @@ def instrument_response(
         tail: Time constant of the exponential diffusion tail [s].
 
     Raises:
-        ValueError: Names the argument, or the file and the line.
+        ArgumentError: Names the argument, or the file and the line.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} = {value} s is outside [0, inf)")
+            raise ArgumentError(f"{name} = {value} s is outside [0, inf)")
     sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
     if shape == "gaussian":
         return InstrumentResponse(sigma=sigma)
@@ -263,7 +265,7 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
 
 def _read_csv(path: Path) -> InstrumentResponse:
     if not path.is_file():
-        raise ValueError(f"irf = {str(path)!r} is neither a known shape nor a file")
+        raise ArgumentError(f"irf = {str(path)!r} is neither a known shape nor a file")
     rows: list[tuple[float, float]] = []
     named = False
     with path.open(newline="") as file:
@@ -274,14 +276,14 @@ def _read_csv(path: Path) -> InstrumentResponse:
                 time, value = (float(cell) for cell in row[:2])
             except ValueError:
                 if rows or named:
-                    raise ValueError(f"{path}, line {number}: {','.join(row)!r} is not time_ps,value") from None
+                    raise ArgumentError(f"{path}, line {number}: {','.join(row)!r} is not time_ps,value") from None
                 named = True
                 continue
             rows.append((time * 1e-12, value))
     try:
         return InstrumentResponse(times=[time for time, _ in rows], values=[value for _, value in rows])
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ArgumentError(f"{path}: {error}") from None
 
 
 class SparseResponse(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, output_tensor, tensor_of
+from spadwarp.errors import ArgumentError
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.response import InstrumentResponse, detector_response, response_matrix
 from spadwarp.frames.window import Window, detector_window, missing_light
@@ -73,7 +74,7 @@ def detect(
         device: Warp device; default: where the source lies, for NumPy the first GPU or else the CPU.
 
     Raises:
-        ValueError: Names the argument, its value and what is allowed.
+        ArgumentError: Names the argument, its value and what is allowed.
     """
     plan = _plan(
         source,
@@ -148,14 +149,14 @@ def _plan(source: Any, *, background: Any, detector: Detector | None, laser: Las
     _check_integers(**{name: options[name] for name in ("pulses", "frames", "first_frame", "seed", "camera_seed")})
     total = options["pulses"] * options["frames"]
     if options["summed"] and total > 2**31 - 1:
-        raise ValueError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
+        raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
     start, width = options["gate_start"], options["bin_width"]
     if start is None or width is None:
-        raise ValueError("gate_start or bin_width is missing: an array source needs both")
+        raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
     if not (math.isfinite(start) and math.isfinite(width) and width > 0):
-        raise ValueError(f"gate_start = {start} s, bin_width = {width} s: finite and a width > 0 are needed")
+        raise ArgumentError(f"gate_start = {start} s, bin_width = {width} s: finite and a width > 0 are needed")
     if laser is None and (detector.fold or detector.mode == "free_running" or options["tags"]):
-        raise ValueError("laser is missing: the detector needs its repetition rate (unless fold = false)")
+        raise ArgumentError("laser is missing: the detector needs its repetition rate (unless fold = false)")
     if options["irf"] is None:
         options["irf"] = detector_response(detector, laser)
     return _Plan(source=source, background=background, detector=detector, laser=laser, **options)
@@ -166,7 +167,7 @@ def _check_integers(**numbers: int) -> None:
     for name, value in numbers.items():
         least, most = limits.get(name, (0, 2**64 - 1))
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
-            raise ValueError(f"{name} = {value!r} is not an integer in [{least}, {most}]")
+            raise ArgumentError(f"{name} = {value!r} is not an integer in [{least}, {most}]")
 
 
 # Expected detections
@@ -236,7 +237,7 @@ def _expected(plan: _Plan, device: Any) -> _Light:
     else:
         known, known_shape = histogram_rows(plan.background, name="background", **{**form, "device": rows.device})
         if known_shape != shape:
-            raise ValueError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
+            raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
         background = with_noise(known)
     return _Light(hazard, background, window, (shape[0], shape[1]))
 

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
+
 __all__ = ["Window", "detector_window", "missing_light"]
 
 
@@ -36,22 +38,22 @@ def detector_window(
     fold: bool,
     free_running: bool,
 ) -> Window:
-    """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ValueError`."""
+    """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
     start, bins = window
     if not math.isfinite(start) or isinstance(bins, bool) or not isinstance(bins, (int, np.integer)) or bins < 1:
-        raise ValueError(f"window = {window} is not (start [s], bins >= 1)")
+        raise ArgumentError(f"window = {window} is not (start [s], bins >= 1)")
     if fold:
         # The detector knows no time beyond that from one pulse to the next.
         bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
         if bins < 1:
-            raise ValueError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
+            raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
     widths = np.full(bins, 1.0)
     if tdc_widths is not None:
         widths = np.asarray(tdc_widths, np.float64)
         if widths.shape != (bins,):
-            raise ValueError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
+            raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
         if not (np.isfinite(widths).all() and (widths > 0).all()):
-            raise ValueError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
         widths = widths / widths.mean()
     edges = np.append(0.0, np.cumsum(widths)) * bin_width
     if not fold:

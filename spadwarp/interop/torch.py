@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 from spadwarp.arrays import is_torch
+from spadwarp.errors import ArgumentError
 from spadwarp.result.result import COMPONENTS, Component, Result, Truth
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class TorchResult:
     def component(self, name: Component) -> torch.Tensor:
         """One part of the histogram, float64 `[H, W, T]`; see `Result.component`."""
         if name not in COMPONENTS:
-            raise ValueError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
+            raise ArgumentError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
         return self._fraction(self.tallies[COMPONENTS.index(name)])
 
     @property
@@ -95,7 +96,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         `TorchResult`, or `Frames` whose arrays are tensors.
 
     Raises:
-        ValueError: The tensor is not int64 or has not as many elements as the result.
+        ArgumentError: The tensor is not int64 or has not as many elements as the result.
     """
     import torch
 
@@ -107,7 +108,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         tallies = _shared(source.tallies)
     shape = source.tallies.shape
     if tallies.dtype != torch.int64 or tallies.numel() != source.tallies.size:
-        raise ValueError(f"tallies are {tallies.dtype} {tuple(tallies.shape)}; torch.int64 {shape} is needed")
+        raise ArgumentError(f"tallies are {tallies.dtype} {tuple(tallies.shape)}; torch.int64 {shape} is needed")
     maps = {name: _shared(getattr(source.truth, name)).to(tallies.device) for name in Truth.__dataclass_fields__}
     return TorchResult(
         scene=source.scene,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
 
 _STRUCTURE = (
@@ -36,7 +36,7 @@ def write_exr(
         metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
 
     Raises:
-        ValueError: No channels, another type or shape, or a metadata name that EXR uses itself.
+        ArgumentError: No channels, another type or shape, or a metadata name that EXR uses itself.
         FileError: The file cannot be written.
     """
     import OpenEXR
@@ -44,11 +44,11 @@ def write_exr(
     pixels = {name: _exr_pixels(name, array) for name, array in channels.items()}
     shapes = {name: array.shape for name, array in pixels.items()}
     if len(set(shapes.values())) != 1:
-        raise ValueError(f"channels have shapes {shapes}; one shape for all, and at least one channel, is needed")
+        raise ArgumentError(f"channels have shapes {shapes}; one shape for all, and at least one channel, is needed")
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for name, value in (metadata or {}).items():
         if name in _STRUCTURE:
-            raise ValueError(f"metadata name {name!r} is one that EXR uses itself")
+            raise ArgumentError(f"metadata name {name!r} is one that EXR uses itself")
         header[name] = str(value)
     with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
         file.write(str(temporary))
@@ -59,11 +59,11 @@ def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
     """Pixels as OpenEXR takes them; it writes wrong ones for arrays that are not contiguous."""
     pixels = np.asarray(array)
     if pixels.ndim != 2 or pixels.size == 0:
-        raise ValueError(f"channel {name!r} has shape {pixels.shape}; [height, width] is needed")
+        raise ArgumentError(f"channel {name!r} has shape {pixels.shape}; [height, width] is needed")
     if pixels.dtype == np.float64:
         pixels = pixels.astype(np.float32)
     if pixels.dtype not in (np.float16, np.float32, np.uint32):
-        raise ValueError(f"channel {name!r} is {pixels.dtype}; float16, float32, float64 or uint32 is needed")
+        raise ArgumentError(f"channel {name!r} is {pixels.dtype}; float16, float32, float64 or uint32 is needed")
     return np.ascontiguousarray(pixels)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
 from spadwarp.io.atomic import atomic_path
 
 __all__ = ["point_cloud", "write_ply"]
@@ -28,7 +29,7 @@ def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.
     along = np.asarray(distance, np.float64)
     view = np.asarray(directions, np.float64)
     if along.ndim != 2 or view.shape != (*along.shape, 3):
-        raise ValueError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
+        raise ArgumentError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
     there = np.isfinite(along)
     return (along[there][:, None] * view[there]).astype(np.float32), there
 
@@ -45,19 +46,19 @@ def write_ply(
         comment: One line for the header.
 
     Raises:
-        ValueError: Points or properties of another shape, or a name that PLY cannot have.
+        ArgumentError: Points or properties of another shape, or a name that PLY cannot have.
         FileError: The file cannot be written.
     """
     xyz = np.asarray(points, np.float32)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ValueError(f"points have shape {xyz.shape}; [P, 3] is needed")
+        raise ArgumentError(f"points have shape {xyz.shape}; [P, 3] is needed")
     columns = {name: xyz[:, axis] for axis, name in enumerate("xyz")}
     for name, given in (properties or {}).items():
         values = np.asarray(given)
         if values.shape != (len(xyz),):
-            raise ValueError(f"property {name!r} has shape {values.shape}; ({len(xyz)},) is needed")
+            raise ArgumentError(f"property {name!r} has shape {values.shape}; ({len(xyz)},) is needed")
         if not name.isidentifier() or name in columns:
-            raise ValueError(f"property name {name!r} is not a new single word")
+            raise ArgumentError(f"property name {name!r} is not a new single word")
         known = values.dtype.kind + str(values.dtype.itemsize) in _KINDS
         columns[name] = values if known else values.astype(np.float32)
     kinds = {name: values.dtype.kind + str(values.dtype.itemsize) for name, values in columns.items()}

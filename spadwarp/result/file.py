@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 
@@ -59,7 +59,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         FileError: The file cannot be written.
     """
     if not 1 <= compression <= 9:
-        raise ValueError(f"compression = {compression} is outside [1, 9]")
+        raise ArgumentError(f"compression = {compression} is outside [1, 9]")
     _, height, width, bins = result.tallies.shape
     columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
     rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.result.result import Truth
 from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_depth
 
@@ -96,14 +96,14 @@ def load_truth_exr(
     Raises:
         FileError: A file that cannot be read, without the channel (the message names those it has), of another size
             than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view.
-        ValueError: An argument out of range.
+        ArgumentError: An argument out of range.
     """
     if preset not in EXR_PRESETS:
-        raise ValueError(f"preset = {preset!r} is not one of {', '.join(map(repr, EXR_PRESETS))}")
+        raise ArgumentError(f"preset = {preset!r} is not one of {', '.join(map(repr, EXR_PRESETS))}")
     how = EXR_PRESETS[preset]
     scale = how.depth_scale if depth_scale is None else depth_scale
     if not (scale > 0 and np.isfinite(scale)):
-        raise ValueError(f"depth_scale = {depth_scale} is outside (0, inf)")
+        raise ArgumentError(f"depth_scale = {depth_scale} is outside (0, inf)")
     shape = (camera.height, camera.width)
     view = pixel_directions(camera)
 
@@ -127,7 +127,7 @@ def load_truth_exr(
     elif 0 <= albedo <= 1:
         reflectance = np.full(shape, float(albedo))
     else:
-        raise ValueError(f"albedo = {albedo} is outside [0, 1]")
+        raise ArgumentError(f"albedo = {albedo} is outside [0, 1]")
 
     normals = -view if normal is None else _normals(normal, how, axes, view, hit)
     return Truth(
@@ -144,7 +144,7 @@ def _normals(
     """Unit normals in the camera frame, on the camera's side."""
     rows = np.asarray(how.axes if axes is None else axes, np.float64)
     if rows.shape != (3, 3) or not np.allclose(rows @ rows.T, np.eye(3), atol=1e-4):
-        raise ValueError(f"axes = {rows.tolist()} are not three orthogonal unit vectors")
+        raise ArgumentError(f"axes = {rows.tolist()} are not three orthogonal unit vectors")
     components = [_channel(path, names, hit.shape) for names in zip(*how.normal_channels, strict=True)]
     world = np.stack(components, axis=-1).astype(np.float64)
     normals = world @ rows.T

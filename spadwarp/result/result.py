@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.scene.geometry import depth_from_range, path_from_range, pixel_directions, range_from_path
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Truth:
         for name, expected in {"depth": shape, "range": shape, "normal": (*shape, 3), "reflectance": shape}.items():
             array = getattr(self, name)
             if len(shape) != 2 or array.shape != expected or array.dtype != np.float32:
-                raise ValueError(f"truth.{name} is {array.dtype} {array.shape}; float32 {expected} is needed")
+                raise ArgumentError(f"truth.{name} is {array.dtype} {array.shape}; float32 {expected} is needed")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,22 +100,26 @@ class Result:
         camera, gate = self.scene.camera, self.scene.gate
         shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
         if self.tallies.dtype != np.int64 or self.tallies.shape != shape:
-            raise ValueError(f"tallies are {self.tallies.dtype} {self.tallies.shape}; int64 {shape} is needed")
+            raise ArgumentError(f"tallies are {self.tallies.dtype} {self.tallies.shape}; int64 {shape} is needed")
         if self.truth.depth.shape != shape[1:3]:
-            raise ValueError(f"truth.depth has shape {self.truth.depth.shape}; {shape[1:3]} is needed")
+            raise ArgumentError(f"truth.depth has shape {self.truth.depth.shape}; {shape[1:3]} is needed")
         counted = sum(stop - start for start, stop in self.photon_ranges)
         if self.photons <= 0 or counted != self.photons:
-            raise ValueError(f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed")
+            raise ArgumentError(
+                f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed"
+            )
         if self.squares is not None:
             expected = (2, *shape[1:])
             if self.squares.dtype != np.uint64 or self.squares.shape != expected:
-                raise ValueError(f"squares are {self.squares.dtype} {self.squares.shape}; uint64 {expected} is needed")
+                raise ArgumentError(
+                    f"squares are {self.squares.dtype} {self.squares.shape}; uint64 {expected} is needed"
+                )
             if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
-                raise ValueError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
+                raise ArgumentError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
         for name in ("unit", "ledger_unit"):
             value = getattr(self, name)
             if not (value > 0 and math.frexp(value)[0] == 0.5):
-                raise ValueError(f"{name} = {value} is not a power of two")
+                raise ArgumentError(f"{name} = {value} is not a power of two")
 
     # Histograms
 
@@ -133,7 +137,7 @@ class Result:
         `"backscatter"`: water alone. Their sum is the histogram (eq 2).
         """
         if name not in COMPONENTS:
-            raise ValueError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
+            raise ArgumentError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
         return self._fraction(self.tallies[COMPONENTS.index(name)])
 
     @property
@@ -223,7 +227,7 @@ class Result:
         from spadwarp.frames.arrival_time import arrival_time
 
         if quantity not in ("depth", "range"):
-            raise ValueError(f"quantity = {quantity!r} is not 'depth' or 'range'")
+            raise ArgumentError(f"quantity = {quantity!r} is not 'depth' or 'range'")
         gate = self.scene.gate
         time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
         directions = pixel_directions(self.scene.camera)

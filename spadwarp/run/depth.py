@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.depth import Reduction
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
@@ -23,13 +23,13 @@ def write_depth(
     Without a field of view the names begin with `range`. `ply`: the points of the first frame, with their intensity.
 
     Raises:
-        ValueError: A point cloud was asked for and the field of view is not known.
+        ArgumentError: A point cloud was asked for and the field of view is not known.
         FileError: A file cannot be written.
     """
     from spadwarp.viz.frames import draw_depth
 
     if ply is not None and reduction.directions is None:
-        raise ValueError("a point cloud needs the horizontal field of view")
+        raise ArgumentError("a point cloud needs the horizontal field of view")
     folder, name = Path(directory), reduction.quantity
     array = reduction.values.astype(np.float32)
     with atomic_path(folder / f"{name}.npy") as temporary, temporary.open("wb") as file:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.result.result import COMPONENTS, Result
@@ -62,7 +62,7 @@ def export(
         The files that were written.
 
     Raises:
-        ValueError: No such frame, or what the format holds is not in the source.
+        ArgumentError: No such frame, or what the format holds is not in the source.
         FileError: A file cannot be read or written, or the package for its format is not installed.
     """
     path = Path(path)
@@ -89,13 +89,13 @@ def _chosen(exposures: Exposures, frames: int | slice | None) -> range:
     every = range(exposures.count)
     if isinstance(frames, int):
         if frames not in every:
-            raise ValueError(f"frames = {frames} is outside [0, {exposures.count - 1}]")
+            raise ArgumentError(f"frames = {frames} is outside [0, {exposures.count - 1}]")
         return every[frames : frames + 1]
     chosen = every if frames is None else every[frames]
     if not chosen:
         ends = (None, None) if frames is None else (frames.start, frames.stop)
         asked = ":".join("" if end is None else str(end) for end in ends)
-        raise ValueError(f"{exposures.place} holds {exposures.count} frames, none of them in {asked}")
+        raise ArgumentError(f"{exposures.place} holds {exposures.count} frames, none of them in {asked}")
     return chosen
 
 
@@ -108,7 +108,7 @@ def _numbered(path: Path, chosen: range) -> list[Path]:
 def _counts_of(exposures: Exposures, number: int, ending: str) -> tuple[Exposure, NDArray[Any]]:
     frame = exposures.frame(number)
     if frame.counts is None:
-        raise ValueError(f"{exposures.place}: frame {number} is depth without counts, which {ending} is for")
+        raise ArgumentError(f"{exposures.place}: frame {number} is depth without counts, which {ending} is for")
     return frame, frame.counts
 
 
@@ -117,7 +117,7 @@ def _counts_of(exposures: Exposures, number: int, ending: str) -> tuple[Exposure
 
 def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
     if frames is not None:
-        raise ValueError(f"frames = {frames}: a result holds expected histograms, not frames")
+        raise ArgumentError(f"frames = {frames}: a result holds expected histograms, not frames")
     if ending == ".npy":
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.save(file, result.histogram)
@@ -131,7 +131,7 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         channels |= {"truth.Z": truth.depth, "truth.range": truth.range, "truth.reflectance": truth.reflectance}
         channels |= {f"truth.N.{axis}": truth.normal[..., index] for index, axis in enumerate("XYZ")}
         return write_exr(path, channels, _notes(result.scene, "expected depth (centroid), fractions of the light"))
-    raise ValueError(
+    raise ArgumentError(
         f"a result holds expected histograms, and {ending} is for counts: draw frames first (`spadwarp detect`)"
     )
 
@@ -159,9 +159,9 @@ def _write_mat(exposures: Exposures, path: Path, number: int) -> Path:
     frame, counts = _counts_of(exposures, number, ".mat")
     height, width, bins = counts.shape
     if frame.scene is None or frame.depth is None:
-        raise ValueError("result is missing: .mat holds the truth of the scene that the counts were drawn from")
+        raise ArgumentError("result is missing: .mat holds the truth of the scene that the counts were drawn from")
     if frame.expected is None or frame.background is None:
-        raise ValueError(f"{exposures.place} does not tell what its counts were drawn from: draw them anew")
+        raise ArgumentError(f"{exposures.place} does not tell what its counts were drawn from: draw them anew")
     if 4 * counts.size > _LARGEST_VARIABLE:
         raise FileError(f"{path}: {height} x {width} x {bins} values are more than a MATLAB 5 file can hold")
     total = frame.expected.sum(axis=-1, dtype=np.float64)
@@ -220,7 +220,7 @@ def _write_ptu(exposures: Exposures, path: Path, chosen: range) -> Path:
         for number in chosen:
             one, counts = _counts_of(exposures, number, ".ptu")
             if (one.gate_start, one.bin_width) != (frame.gate_start, frame.bin_width):
-                raise ValueError(f"frames {chosen[0]} and {number} have different gates: a .ptu file has one")
+                raise ArgumentError(f"frames {chosen[0]} and {number} have different gates: a .ptu file has one")
             file.write(np.ascontiguousarray(counts, np.uint32))
     return path
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import on_host
-from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.errors import ArgumentError, FileError, SpadwarpError
 from spadwarp.result.file import load_result
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
@@ -87,7 +87,7 @@ class Exposures:
 
 @contextmanager
 def opened(source: Any, *, result: Result | None = None, split: str = "all") -> Iterator[Result | Exposures]:
-    """A result or frames: in memory, in a file, or a dataset's folder. Raises `FileError`, `ValueError`."""
+    """A result or frames: in memory, in a file, or a dataset's folder. Raises `FileError`, `ArgumentError`."""
     if isinstance(source, Result):
         yield source
     elif isinstance(source, (str, Path)):
@@ -96,7 +96,7 @@ def opened(source: Any, *, result: Result | None = None, split: str = "all") -> 
     elif hasattr(source, "counts"):
         yield _of_detection(source, result)
     else:
-        raise ValueError(f"source is a {type(source).__name__}; a Result, Frames or a file of one is needed")
+        raise ArgumentError(f"source is a {type(source).__name__}; a Result, Frames or a file of one is needed")
 
 
 @contextmanager

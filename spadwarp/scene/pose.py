@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
+
 if TYPE_CHECKING:
     from spadwarp.scene import Camera
 
@@ -57,7 +59,7 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
         Fields of the scene's `camera` section.
 
     Raises:
-        ValueError: Another number of values, or a matrix that is no rotation.
+        ArgumentError: Another number of values, or a matrix that is no rotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -65,13 +67,13 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     if turn.shape != (3, 3):
         turn = turn.ravel()
     if turn.shape not in ((3,), (3, 3)) or shift.shape != (3,):
-        raise ValueError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
+        raise ArgumentError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
     if turn.shape == (3,):
         matrix = Rotation.from_rotvec(turn).as_matrix()
     else:
         matrix = turn
         if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
-            raise ValueError(f"rvec = {matrix.tolist()} is not a rotation matrix")
+            raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")
     return {"position": _vector(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
 
 
@@ -87,7 +89,7 @@ def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.
         Fields of the scene's `camera` section.
 
     Raises:
-        ValueError: Two of the points coincide, or the camera looks along `down`.
+        ArgumentError: Two of the points coincide, or the camera looks along `down`.
     """
     place = np.asarray(position, np.float64)
     end = np.asarray(point, np.float64)
@@ -95,7 +97,7 @@ def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.
     right = np.cross(np.asarray(down, np.float64), forward)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
         level = np.asarray(down).tolist()
-        raise ValueError(f"a camera at {place.tolist()} that looks at {end.tolist()} has no horizon: down = {level}")
+        raise ArgumentError(f"a camera at {place.tolist()} that looks at {end.tolist()} has no horizon: down = {level}")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     axes = np.column_stack([right, np.cross(forward, right), forward])
     return {"position": _vector(place), "rotation_deg": rotation_angles(axes)}

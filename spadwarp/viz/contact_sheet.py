@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from spadwarp.dataset.read import FrameReader
+from spadwarp.errors import ArgumentError
 from spadwarp.io.atomic import atomic_path
 
 __all__ = ["draw_dataset"]
@@ -30,17 +31,17 @@ def draw_dataset(
 
     Raises:
         FileError: No dataset, or the picture cannot be written.
-        ValueError: An argument out of range.
+        ArgumentError: An argument out of range.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     if frames < 1:
-        raise ValueError(f"frames = {frames} is outside [1, inf)")
+        raise ArgumentError(f"frames = {frames} is outside [1, inf)")
     reader = FrameReader(folder, split, fields=("clean", "noisy", "intensity"))
     if not len(reader):
-        raise ValueError(f"split = {split!r} holds no frames")
+        raise ArgumentError(f"split = {split!r} holds no frames")
     number = min(frames, len(reader))
     chosen = ((np.arange(number) + 0.5) * len(reader) / number).astype(int)
     items = [reader[int(index)] for index in chosen]

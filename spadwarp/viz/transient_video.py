@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.result.file import load_result
 from spadwarp.result.result import Result
@@ -47,14 +47,14 @@ def video(
         frame: Of frames, which one, from 0.
 
     Raises:
-        ValueError: An argument out of range, or another ending.
+        ArgumentError: An argument out of range, or another ending.
         FileError: A file cannot be read or written, or ffmpeg is missing.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
+        raise ArgumentError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
     if pictures < 1 or not 0 < fps <= 50:
-        raise ValueError(f"pictures = {pictures} and fps = {fps:g} are not in [1, inf) and (0, 50]")
+        raise ArgumentError(f"pictures = {pictures} and fps = {fps:g} are not in [1, inf) and (0, 50]")
     cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
     cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
@@ -83,7 +83,7 @@ def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64]
             with h5py.File(place, "r") as file:
                 count = file["counts"].shape[0]
                 if not 0 <= frame < count:
-                    raise ValueError(f"frame = {frame} is outside [0, {count}), the frames of {place}")
+                    raise ArgumentError(f"frame = {frame} is outside [0, {count}), the frames of {place}")
                 edges = 1e9 * (float(file.attrs["gate_start"]) + file["edges"][...])
                 speed = frames_scene(file).medium.pulse_speed
                 return file["counts"][frame].astype(np.float64), edges, "counts per pixel", 1e-9 * speed
@@ -97,7 +97,9 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
         first, last = (int(np.searchsorted(edges, time, side="right")) - 1 for time in window_ns)
         first, last = max(first, 0), min(max(last, 0), len(edges) - 2)
         if not window_ns[0] < window_ns[1] or window_ns[0] >= edges[-1] or window_ns[1] <= edges[0]:
-            raise ValueError(f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns")
+            raise ArgumentError(
+                f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns"
+            )
         return slice(first, last + 1)
     lit = np.flatnonzero(cube.any(axis=(0, 1)))
     return slice(int(lit[0]), int(lit[-1]) + 1) if len(lit) else slice(0, cube.shape[2])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import file_within
 from spadwarp.result.file import load_result
 from spadwarp.result.result import COMPONENTS, Result
@@ -93,7 +93,7 @@ def view(
 
     Raises:
         FileError: plotly is not installed, or a file cannot be read or written.
-        ValueError: No such frame or method.
+        ArgumentError: No such frame or method.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -169,9 +169,9 @@ def _of_frames(file: Any, path: Path, method: str | None, frame: int) -> _Page:
     about, methods = file.attrs, list(file["depth"])
     frames = file["counts"].shape[0]
     if not 0 <= frame < frames:
-        raise ValueError(f"frame = {frame} is outside [0, {frames}), the frames of {path}")
+        raise ArgumentError(f"frame = {frame} is outside [0, {frames}), the frames of {path}")
     if method is not None and method not in methods:
-        raise ValueError(f"method = {method!r} is not one of {', '.join(methods)}, which {path} holds")
+        raise ArgumentError(f"method = {method!r} is not one of {', '.join(methods)}, which {path} holds")
     chosen = method or next(name for name in ("likelihood", "matched", "centroid", "peak") if name in methods)
     scene, pulses = frames_scene(file), int(about["pulses"])
     counts, expected = file["counts"][frame], file["expected"][...]

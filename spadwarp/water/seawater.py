@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.errors import ArgumentError
+
 __all__ = [
     "WaterOptics",
     "group_index",
@@ -86,7 +88,7 @@ def water_optics(
         salinity: 0 to 40 [g/kg]; 35 is the ocean.
 
     Raises:
-        ValueError: A value outside its range.
+        ArgumentError: A value outside its range.
     """
     _check(wavelength_nm=wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
     water = {"temperature": temperature, "salinity": salinity}
@@ -107,7 +109,7 @@ def refractive_index(wavelength_nm: ArrayLike, *, temperature: ArrayLike = 20.0,
     """Phase index of fresh or sea water at normal pressure, after Quan & Fry, Appl. Opt. 34, 3477 (1995).
 
     Wavelength in vacuum 400 to 700 [nm], temperature 0 to 30 [°C], salinity 0 to 40 [g/kg] (the fit: to 35); arrays
-    broadcast. Raises `ValueError` for a value outside its range.
+    broadcast. Raises `ArgumentError` for a value outside its range.
     """
     _check(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
     constant, first, second, third = _quan_fry(temperature, salinity)
@@ -127,7 +129,7 @@ def pure_water_absorption(wavelength_nm: ArrayLike) -> Value:
     """Absorption coefficient of pure water [1/m] at 22 °C, interpolated linearly between the rows (2.5 nm apart) of
     Pope & Fry, Appl. Opt. 36, 8710 (1997).
 
-    Wavelength in vacuum 400 to 700 [nm]. Raises `ValueError` for one outside.
+    Wavelength in vacuum 400 to 700 [nm]. Raises `ArgumentError` for one outside.
     """
     _check(wavelength_nm=wavelength_nm)
     wavelength, absorption = _table("pure_water_absorption")
@@ -221,7 +223,7 @@ def _check(**values: ArrayLike) -> None:
         low, high = _RANGES[name]
         array = np.asarray(value, float)
         if not ((array >= low) & (array <= high)).all():
-            raise ValueError(f"{name} = {value!r} is outside [{low:g}, {high:g}]")
+            raise ArgumentError(f"{name} = {value!r} is outside [{low:g}, {high:g}]")
 
 
 def _value(array: Any) -> Value:

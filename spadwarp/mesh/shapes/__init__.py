@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import cache, wraps
 from typing import TYPE_CHECKING
 
+from spadwarp.errors import ArgumentError
 from spadwarp.mesh.shapes import gear, home, life, sea
 from spadwarp.mesh.shapes.solids import to_trimesh
 
@@ -63,7 +64,7 @@ def make_shape(name: str) -> trimesh.Trimesh:
     Raises ValueError for a name that is not in `SHAPES`.
     """
     if name not in SHAPES:
-        raise ValueError(f"target shape = {name!r} is not one of {', '.join(SHAPES)}")
+        raise ArgumentError(f"target shape = {name!r} is not one of {', '.join(SHAPES)}")
     return _built(name).copy()
 
 
