@@ -27,7 +27,9 @@ NEEDED = (
 )  # fmt: skip
 
 # Package → extra that brings it.
-OPTIONAL = {"torch": "torch", "ray": "ray", "ptufile": "formats", "plotly": "view"}
+OPTIONAL = {
+    "torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view", "imageio-ffmpeg": "video",
+}  # fmt: skip
 
 _OLDEST_CUDA = 13000  # of the driver: what Warp's build asks for, R580
 _LARGEST_Z = 4.5  # a right simulator fails once in 150 000 times

@@ -39,7 +39,7 @@ def video(
 
     Args:
         source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
-        path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install imageio-ffmpeg`.
+        path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install 'spadwarp[video]'`.
         window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
         pictures: At most; bins are merged so that there are no more.
         fps: Pictures per second.
@@ -162,7 +162,7 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
-            raise FileError("an MP4 needs ffmpeg: pip install imageio-ffmpeg, or write a .gif") from error
+            raise FileError("an MP4 needs ffmpeg: pip install 'spadwarp[video]', or write a .gif") from error
         program = get_ffmpeg_exe()
     first = next(pictures)
     size = f"{first.shape[1]}x{first.shape[0]}"

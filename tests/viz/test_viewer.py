@@ -214,10 +214,10 @@ def test_an_mp4_is_one_or_says_what_is_missing(result, tmp_path, monkeypatch):
         path = spadwarp.video(result, tmp_path / "light.mp4", pictures=8)
         assert path.read_bytes()[4:8] == b"ftyp"
     except FileError as error:
-        assert "imageio-ffmpeg" in str(error)
+        assert "pip install 'spadwarp[video]'" in str(error)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(FileError, match=r"an MP4 needs ffmpeg: pip install imageio-ffmpeg, or write a \.gif"):
+    with pytest.raises(FileError, match=r"an MP4 needs ffmpeg: pip install 'spadwarp\[video\]', or write a \.gif"):
         spadwarp.video(result, tmp_path / "none.mp4", pictures=2)
     assert not (tmp_path / "none.mp4").exists()
 
