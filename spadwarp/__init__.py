@@ -56,8 +56,8 @@ _HOMES = {
     "export": "run.export",
     "view": "viz.viewer",
     "video": "viz.transient_video",
-    "to_torch": "interop.torch",
-    "TorchResult": "interop.torch",
+    "to_torch": "result.tensors",
+    "TorchResult": "result.tensors",
     "evaluate": "denoise.evaluation",
     "train": "denoise.training_run",
     "load_recipe": "dataset.recipe",
@@ -91,12 +91,12 @@ if TYPE_CHECKING:
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.frames import Frames, InstrumentResponse, arrival_time, coates, crlb, detect, instrument_response
-    from spadwarp.interop.torch import TorchResult, to_torch
     from spadwarp.parallel import Ray, interruptible, run_jobs
     from spadwarp.result.file import load_result
     from spadwarp.result.merge import merge
     from spadwarp.result.rendered_truth import load_truth_exr
     from spadwarp.result.result import Result, Truth
+    from spadwarp.result.tensors import TorchResult, to_torch
     from spadwarp.run.export import export
     from spadwarp.scene import Scene, load_scene
     from spadwarp.scene.phase_function import PhaseFunction, phase_function

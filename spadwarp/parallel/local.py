@@ -12,8 +12,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
+from spadwarp.device import core_count
 from spadwarp.errors import DeviceError
-from spadwarp.parallel import Worker
+from spadwarp.parallel.worker import Worker
 
 Job = TypeVar("Job")
 Value = TypeVar("Value")
@@ -37,16 +38,14 @@ def run_in_processes(
     work: Callable[[Job, Worker], Value], jobs: Iterable[Job], devices: Sequence[str], stopped: threading.Event
 ) -> Iterator[tuple[Job, Value]]:
     """A process for each device: Warp loads kernels in one thread, and jobs hold Python's lock between launches."""
-    from spadwarp.device import core_count
-
     context = multiprocessing.get_context("spawn")
-    places = context.SimpleQueue()
+    slots = context.SimpleQueue()
     for device in devices:
-        places.put((device, max(1, core_count() // len(devices)) if device == "cpu" else None))
+        slots.put((device, max(1, core_count() // len(devices)) if device == "cpu" else None))
     ended = context.Event()
     queue = iter(jobs)
     running: dict[Future[Value], Job] = {}
-    pool = ProcessPoolExecutor(len(devices), mp_context=context, initializer=_begin, initargs=(places, ended))
+    pool = ProcessPoolExecutor(len(devices), mp_context=context, initializer=_begin, initargs=(slots, ended))
     try:
         while True:
             if stopped.is_set():
@@ -59,11 +58,13 @@ def run_in_processes(
                 running[pool.submit(_run, work, job)] = job
             if not running:
                 return
-            # Woken now and then: a signal that arrives while a lock is awaited is heard only afterwards.
+            # With a timeout: Python handles a signal only when the wait for a lock ends.
             for future in wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done:
                 yield running.pop(future), future.result()
     except BrokenProcessPool as error:
-        raise DeviceError(f"a process on one of {', '.join(devices)} was killed, perhaps for want of memory") from error
+        raise DeviceError(
+            f"a process on one of {', '.join(devices)} was killed, perhaps because memory ran out"
+        ) from error
     finally:
         ended.set()
         pool.shutdown(cancel_futures=True)
@@ -72,13 +73,13 @@ def run_in_processes(
 _worker: Worker
 
 
-def _begin(places: Any, ended: Any) -> None:
-    """First thing in a new process. Ctrl-C and SIGTERM are for the process that hands out the jobs; without it, end."""
+def _begin(slots: Any, ended: Any) -> None:
+    """Run first in a new process, which ignores Ctrl-C and SIGTERM and ends when the process that started it does."""
     global _worker
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    device, threads = places.get()
+    device, threads = slots.get()
     _worker = Worker(device, threads, ended)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from spadwarp.device import pick_device
 from spadwarp.parallel import Ray, Worker
-from spadwarp.parallel.ray import Crew, Member
+from spadwarp.parallel.ray import RayWorker, RayWorkers
 from spadwarp.result.merge import Sums
 from spadwarp.result.photon_ids import Queue, Range, Ranges, count, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth
@@ -41,7 +41,7 @@ class ClusterTracer:
     ) -> None:
         camera, gate = plan.scene.camera, plan.scene.gate
         cubes = len(COMPONENTS) + (2 if plan.batch_size else 0)
-        self._crew = Crew(
+        self._crew = RayWorkers(
             engine,
             device,
             prepare=functools.partial(_prepare, plan),
@@ -50,7 +50,7 @@ class ClusterTracer:
         )
         self._unit = plan.batch_size or 1
         self._sums = None if base is None else Sums.of(base)
-        self._speed: dict[Member, float] = {}
+        self._speed: dict[RayWorker, float] = {}
         self._about: dict[str, dict[str, Any]] = {}
         self.timing = {"setup": 0.0, "compile": 0.0}
 
@@ -85,7 +85,7 @@ class ClusterTracer:
     def about(self) -> dict[str, Any]:
         """The workers, for a result's provenance."""
         names = sorted({about["device_name"] for about in self._about.values()})
-        count = len(self._crew.members)
+        count = len(self._crew.workers)
         return {
             "device": f"{count} Ray worker{'s' * (count != 1)}",
             "device_name": ", ".join(names),
@@ -104,9 +104,9 @@ class ClusterTracer:
         """As `Tracer.trace`. When `due` turns true, workers hand over one by one while the others go on."""
         crew, waiting = self._crew, Queue(ranges)
         done: list[Range] = []  # and in the sums
-        held: dict[Member, list[Range]] = {}  # done, in the worker's own sums
-        running: dict[Member, Range | None] = {}  # None: the worker hands its sums over
-        handing_over: set[Member] | None = None  # from `due` to `keep`
+        held: dict[RayWorker, list[Range]] = {}  # done, in the worker's own sums
+        running: dict[RayWorker, Range | None] = {}  # None: the worker hands its sums over
+        handing_over: set[RayWorker] | None = None  # from `due` to `keep`
         told = False
         while True:
             if stopped.is_set() and not told:
@@ -114,7 +114,7 @@ class ClusterTracer:
                 told = True
             over = stopped.is_set() or not (waiting.left or any(running.values()))
             if handing_over is None and not over and due():
-                handing_over = {member for member in crew.members if held.get(member) or running.get(member)}
+                handing_over = {member for member in crew.workers if held.get(member) or running.get(member)}
             for member in crew.idle:
                 if held.get(member) and (over or member in (handing_over or ())):
                     running[member] = None
@@ -145,9 +145,9 @@ class ClusterTracer:
                 if done and not stopped.is_set():
                     keep(joined(done))
 
-    def _size(self, member: Member, left: int) -> int:
+    def _size(self, member: RayWorker, left: int) -> int:
         """Photons of the next block: some seconds, smaller towards the end so that all end together."""
-        workers = len(self._crew.members)
+        workers = len(self._crew.workers)
         fair = left // (2 * workers) if workers > 1 else left
         size = max(self._first, min(int(self._speed.get(member, 0.0) * _BLOCK_SECONDS), fair))
         return max(1, size // self._unit) * self._unit
@@ -158,13 +158,13 @@ class ClusterTracer:
         else:
             self._sums.add(value)
 
-    def _wait(self) -> list[tuple[str, Member, Any]]:
+    def _wait(self) -> list[tuple[str, RayWorker, Any]]:
         events = self._crew.wait(0.2)
         for event in events:
             if event.kind == "joined":
-                assert event.member.about is not None
-                self._about[f"{event.member.about['host']} {event.member.about['pid']}"] = event.member.about
-        return [(event.kind, event.member, event.value) for event in events]
+                assert event.worker.metadata is not None
+                self._about[f"{event.worker.metadata['host']} {event.worker.metadata['pid']}"] = event.worker.metadata
+        return [(event.kind, event.worker, event.value) for event in events]
 
 
 # What a worker does

@@ -63,7 +63,7 @@ def test_a_job_whose_worker_was_killed_runs_again(cluster, tmp_path):
 
 
 def test_a_job_that_kills_every_worker_is_given_up(cluster):
-    with pytest.raises(spadwarp.DeviceError, match="took 4 workers with it"):
+    with pytest.raises(spadwarp.DeviceError, match="4 workers were lost"):
         list(run_jobs(parallel_jobs.always_dies, [0], engine=Ray(workers=1)))
     with pytest.raises(spadwarp.DeviceError, match="killed"):
         list(run_jobs(parallel_jobs.always_dies, [0], device="cpu,cpu"))

@@ -22,7 +22,7 @@ LEVELS = (
     ("mesh", "result"),
     ("scene",),
     ("water",),
-    ("parallel", "interop", "arrays"),
+    ("parallel", "arrays"),
     ("io", "device"),
     ("units", "errors"),
 )

@@ -1,14 +1,10 @@
-"""torch: results and frames as tensors that share their memory, and tensors of the caller's to write into.
-
-The rule of the interface: who hands in torch tensors is given torch tensors, on their device, in the order of the torch
-stream that is current (`spadwarp.arrays`).
-"""
+"""Results and frames as torch tensors that share their memory; see `spadwarp.arrays` for streams and devices."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
 from spadwarp.arrays import is_torch
 from spadwarp.errors import ArgumentError
@@ -17,14 +13,11 @@ from spadwarp.result.result import COMPONENTS, Component, Result, Truth
 if TYPE_CHECKING:
     import torch
 
-    from spadwarp.frames.frames import Frames
     from spadwarp.scene import Scene
 
-__all__ = [
-    "TorchResult",
-    "TorchTruth",
-    "to_torch",
-]
+__all__ = ["TorchResult", "TorchTruth", "to_torch"]
+
+Frames = TypeVar("Frames")
 
 
 class TorchTruth(NamedTuple):
@@ -90,7 +83,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         source: A `Result`: its tallies become a tensor on the CPU that shares their memory. `Frames`: the same
             with `counts`, `expected` and `background` as tensors.
         tallies: The caller's tensor that `spadwarp.simulate(…, tallies=…)` has filled, on any device; the result's
-            tallies are then not looked at.
+            tallies are then not read.
 
     Returns:
         `TorchResult`, or `Frames` whose arrays are tensors.

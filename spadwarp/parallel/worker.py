@@ -1,0 +1,79 @@
+"""Who runs the jobs, and the signals that interrupt them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = ["Ray", "Worker", "interruptible"]
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Workers of Ray, each a process with one GPU or, on machines without GPUs, with a share of the cores.
+
+    Attributes:
+        address: Of a running cluster, "auto" or "host:port"; None takes the cluster that RAY_ADDRESS names or that this
+            process is connected to, else starts Ray on this machine alone.
+        workers: How many; by default one for each GPU of the cluster, else one for each of its machines.
+    """
+
+    address: str | None = None
+    workers: int | None = None
+
+
+@dataclass(eq=False)
+class Worker:
+    """The process and device that run a job.
+
+    Attributes:
+        device: "cpu" or "cuda:0", ...; what `device=` takes.
+        threads: CPU threads that it may use; None: as many as there are cores.
+        stopped: Set when the run was interrupted. A job that has begun is waited for; a long one may end early.
+        state: Kept from one job to the next on this worker.
+    """
+
+    device: str
+    threads: int | None = None
+    stopped: threading.Event = field(default_factory=threading.Event)
+    state: dict[str, Any] = field(default_factory=dict)
+
+
+_handled = threading.Lock()
+
+
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C, or SIGTERM as job schedulers send it, sets; a second signal raises KeyboardInterrupt.
+
+    Within another `interruptible`, and outside the main thread, which alone receives signals, nothing sets the event:
+    the outer block decides.
+    """
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread() or not _handled.acquire(blocking=False):
+        yield interrupted
+        return
+
+    first = 0.0
+
+    def handle(number: int, frame: object) -> None:
+        nonlocal first
+        # Some programs send one interrupt twice, to a process and to its group: a second one counts a second later.
+        if interrupted.is_set() and time.monotonic() > first + 1.0:
+            raise KeyboardInterrupt
+        if not interrupted.is_set():
+            first = time.monotonic()
+        interrupted.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _handled.release()
