@@ -37,10 +37,12 @@ _HOMES = {
     "devices": "device",
     "Diagnosis": "doctor.diagnosis",
     "SelfTest": "doctor.diagnosis",
-    "Result": "result.result",
-    "merge": "result.merge",
-    "Truth": "result.result",
-    "load_result": "result.file",
+    "Result": "result",
+    "merge": "result",
+    "Truth": "result",
+    "load_result": "result",
+    "save_result": "result",
+    "depth_frame": "frames.depth",
     "detect": "frames",
     "Frames": "frames",
     "coates": "frames",
@@ -50,14 +52,14 @@ _HOMES = {
     "crlb": "frames",
     "simulate_analytic": "analytic.model",
     "AnalyticResult": "analytic.model",
-    "load_truth_exr": "result.rendered_truth",
+    "load_truth_exr": "result",
     "budget": "analytic.budget",
     "sweep": "analytic.budget",
     "export": "run.export",
     "view": "viz.viewer",
     "video": "viz.transient_video",
-    "to_torch": "result.tensors",
-    "TorchResult": "result.tensors",
+    "to_torch": "result",
+    "TorchResult": "result",
     "evaluate": "denoise.evaluation",
     "train": "denoise.training_run",
     "load_recipe": "dataset.recipe",
@@ -90,13 +92,12 @@ if TYPE_CHECKING:
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.frames import Frames, InstrumentResponse, arrival_time, coates, crlb, detect, instrument_response
+    from spadwarp.frames import Frames, InstrumentResponse, coates, crlb, detect, instrument_response
+    from spadwarp.frames.arrival_time import arrival_time
+    from spadwarp.frames.depth import depth_frame
     from spadwarp.parallel import Ray, interruptible, run_jobs
-    from spadwarp.result.file import load_result
+    from spadwarp.result import Result, TorchResult, Truth, load_result, load_truth_exr, save_result, to_torch
     from spadwarp.result.merge import merge
-    from spadwarp.result.rendered_truth import load_truth_exr
-    from spadwarp.result.result import Result, Truth
-    from spadwarp.result.tensors import TorchResult, to_torch
     from spadwarp.run.export import export
     from spadwarp.scene import Scene, load_scene
     from spadwarp.scene.phase_function import PhaseFunction, phase_function

@@ -248,7 +248,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _has_errors(result: Result) -> bool:
-    return result.squares is not None and result.photons >= 2 * result.batch_size
+    return result.second_moment is not None and result.photons >= 2 * result.batch_size
 
 
 def bytes_needed(scene: Scene, *, records: bool, batches: bool, checkpoint: bool = False) -> int:
@@ -261,7 +261,7 @@ def bytes_needed(scene: Scene, *, records: bool, batches: bool, checkpoint: bool
 
 def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
     """Files of a result as its `[output]` asks for, the one that nothing can replace first, and the depth frame."""
-    from spadwarp.result.file import save_depth_exr, save_truth_exr
+    from spadwarp.result.file import save_depth_exr, save_truth_maps
     from spadwarp.viz.result import write_previews
 
     scene, output = result.scene, result.scene.output
@@ -281,7 +281,7 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
         options["irf"] = detector_response(scene.detector, scene.laser)
     frame = result.depth(method=output.depth_method, device=device, **options)
     if output.exr:
-        written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_exr(result, out / "truth.exr")]
+        written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_maps(result, out / "truth.exr")]
     if output.png or output.pdf:
         formats = [ending for ending in ("png", "pdf") if getattr(output, ending)]
         written += write_previews(result, out, depth=frame, method=output.depth_method, formats=formats)

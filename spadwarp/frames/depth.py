@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,30 @@ from spadwarp.scene import Camera
 from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_path
 from spadwarp.units import path_from_time
 
-__all__ = ["Reduction", "depth_of"]
+if TYPE_CHECKING:
+    from spadwarp.result import Result
+
+__all__ = ["Reduction", "depth_frame", "depth_of"]
+
+
+def depth_frame(
+    result: Result, *, method: Method = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
+) -> NDArray[np.float64]:
+    """Depth frame of a simulation's histograms [m], float64 `[H, W]`; NaN where nothing returned.
+
+    Args:
+        result: From `spadwarp.simulate`.
+        method: `"peak"`, `"centroid"`, `"matched"` or `"likelihood"`; see `spadwarp.arrival_time`, which also takes
+            `options` (`irf`, `background`, `gate`, `device`).
+        quantity: `"depth"` is planar, z; `"range"` runs along the line of sight.
+    """
+    if quantity not in ("depth", "range"):
+        raise ArgumentError(f"quantity = {quantity!r} is not 'depth' or 'range'")
+    scene, gate = result.scene, result.scene.gate
+    time = arrival_time(result.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
+    directions = pixel_directions(scene.camera)
+    distance = range_from_path(time * result.pulse_speed, directions, scene.beam.position)
+    return depth_from_range(distance, directions) if quantity == "depth" else distance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

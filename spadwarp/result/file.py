@@ -5,26 +5,26 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-
-if TYPE_CHECKING:
-    from spadwarp.result.result import Result, Truth
+from spadwarp.result.result import COMPONENTS, Result, Truth
+from spadwarp.scene import Scene
+from spadwarp.scene.intrinsics import camera_attributes
 
 __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
     "load_result",
-    "load_truth_exr",
+    "load_truth_maps",
     "save_depth_exr",
     "save_result",
-    "save_truth_exr",
+    "save_truth_maps",
 ]
 
 FORMAT = "spadwarp result"
@@ -33,13 +33,15 @@ FORMAT_VERSION = 1
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
 _TRUTH = ("depth", "range", "normal", "reflectance")
+_OLDER_NAMES = {"second_moment": "squares"}  # of datasets in files of today's format version 1
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
     "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
-    "squares, if there: low and high 64 bits of the sum over photons / batch_size batches of the squared tally. "
+    "second_moment, in runs with errors: low and high 64 bits of the sum over photons / batch_size batches of the "
+    "squared tally. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
     "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
     "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
@@ -70,8 +72,9 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )
         file.create_dataset("tallies", data=result.tallies, chunks=(1, rows, columns, bins), **packed)
-        if result.squares is not None:
-            file.create_dataset("squares", data=result.squares, chunks=(1, rows, columns, bins), **packed)
+        if result.second_moment is not None:
+            shape = (1, rows, columns, bins)
+            file.create_dataset("second_moment", data=result.second_moment, chunks=shape, **packed)
         file.create_dataset("bin_edges", data=result.bin_edges)
         if result.scene.scan_positions > 1:
             file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)
@@ -91,9 +94,6 @@ def load_result(path: str | Path) -> Result:
     Raises:
         FileError: No such file, not a spadwarp result, of a newer format version, or damaged; says which.
     """
-    from spadwarp.result.result import Result, Truth
-    from spadwarp.scene import Scene
-
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         return Result(
             scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs.get("source")),
@@ -104,12 +104,17 @@ def load_result(path: str | Path) -> Result:
             ledger_unit=float(file.attrs["ledger_unit"]),
             partial=bool(file.attrs["partial"]),
             batch_size=int(file.attrs.get("batch_size", 0)),
-            squares=file["squares"][...] if "squares" in file else None,
+            second_moment=_second_moment(file),
             photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
             requested=_requested(file),
             truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
             **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
         )
+
+
+def _second_moment(file: Any) -> NDArray[np.uint64] | None:
+    names = [name for name in ("second_moment", _OLDER_NAMES["second_moment"]) if name in file]
+    return file[names[0]][...] if names else None
 
 
 def _requested(file: Any) -> tuple[int, int]:
@@ -121,10 +126,7 @@ def _requested(file: Any) -> tuple[int, int]:
 
 
 def _attributes(result: Result) -> dict[str, Any]:
-    """What a reader without spadwarp needs, in SI units."""
-    from spadwarp.result.result import COMPONENTS
-    from spadwarp.scene.intrinsics import camera_attributes
-
+    """What readers of the file alone need, in SI units."""
     scene = result.scene
     medium, laser, camera, detector, gate = scene.medium, scene.laser, scene.camera, scene.detector, scene.gate
     values = {
@@ -164,7 +166,7 @@ def _attributes(result: Result) -> dict[str, Any]:
     return values if scene.source is None else {**values, "source": str(scene.source)}
 
 
-def save_truth_exr(result: Result, path: str | Path) -> Path:
+def save_truth_maps(result: Result, path: str | Path) -> Path:
     """Truth maps as EXR: Z (planar depth [m]), range [m], N.X, N.Y, N.Z (camera frame), and reflectance in R, G and B.
 
     NaN where nothing is hit. Raises `FileError`.
@@ -176,10 +178,8 @@ def save_truth_exr(result: Result, path: str | Path) -> Path:
     return write_exr(path, channels, {"content": "truth", "R G B": "reflectance", **_exr_notes(result)})
 
 
-def load_truth_exr(path: str | Path) -> Truth:
-    """Reads what `save_truth_exr` wrote. Raises `FileError`, also for an EXR without its channels."""
-    from spadwarp.result.result import Truth
-
+def load_truth_maps(path: str | Path) -> Truth:
+    """Reads what `save_truth_maps` wrote. Raises `FileError`, also for an EXR without its channels."""
     channels, _ = read_exr(path)
     needed = ("Z", "range", "N.X", "N.Y", "N.Z", "R")
     if missing := [name for name in needed if name not in channels]:

@@ -1,4 +1,4 @@
-"""Photons added up: sums of integers, which depend neither on the order nor on who did which photons."""
+"""Results added up: tallies are integers, so that the order and the devices make no difference."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from spadwarp.result.photon_ids import joined
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
 
-__all__ = ["Sums", "merge"]
+__all__ = ["Tallies", "merge"]
 
 
 @dataclass
-class Sums:
-    """What photons have left in tallies, ledger and counters; the arrays as in `Result`."""
+class Tallies:
+    """Tallies, ledger and counters of photons; the arrays as in `Result`."""
 
     tallies: NDArray[np.int64]
     ledger: dict[str, int]
     counters: dict[str, int]
-    squares: NDArray[np.uint64] | None = None
+    second_moment: NDArray[np.uint64] | None = None
 
     @classmethod
-    def of(cls, result: Sums | Result) -> Sums:
-        """A copy, or the sums of a result, in arrays of their own."""
-        squares = None if result.squares is None else result.squares.copy()
-        return cls(result.tallies.copy(), dict(result.ledger), dict(result.counters), squares)
+    def of(cls, result: Tallies | Result) -> Tallies:
+        """A copy, with arrays of its own."""
+        second_moment = None if result.second_moment is None else result.second_moment.copy()
+        return cls(result.tallies.copy(), dict(result.ledger), dict(result.counters), second_moment)
 
-    def add(self, other: Sums | Result) -> None:
-        """Adds the sums of other photons."""
+    def add(self, other: Tallies | Result) -> None:
+        """Adds the tallies of other photons."""
         self.tallies += other.tallies
         self.ledger = {name: value + other.ledger[name] for name, value in self.ledger.items()}
         self.counters = {name: value + other.counters[name] for name, value in self.counters.items()}
-        if self.squares is not None:
-            assert other.squares is not None
-            low, high = self.squares
-            low += other.squares[0]
-            high += other.squares[1]
-            high += low < other.squares[0]  # the carry
+        if self.second_moment is not None:
+            assert other.second_moment is not None
+            low, high = self.second_moment
+            low += other.second_moment[0]
+            high += other.second_moment[1]
+            high += low < other.second_moment[0]  # the carry
 
 
 def merge(results: Iterable[Result]) -> Result:
@@ -68,7 +68,7 @@ def merge(results: Iterable[Result]) -> Result:
             if a != b:
                 detail = f" ({a} and {b})"
                 if name == "scene":
-                    sections = [one for one in type(first.scene).model_fields if getattr(a, one) != getattr(b, one)]
+                    sections = [key for key in type(first.scene).model_fields if getattr(a, key) != getattr(b, key)]
                     detail = f" in {', '.join(sections)}: only photons and output may differ"
                 raise ConfigError(f"merge: the {name} of the results differs{detail}")
     try:
@@ -78,7 +78,7 @@ def merge(results: Iterable[Result]) -> Result:
     for other in parts[1:]:
         check_targets(first.truth, other.truth, "merge")
     check_capacity(np.sum([part.tallies.sum(axis=0, dtype=np.float64) for part in parts], axis=0))
-    total = Sums.of(first)
+    total = Tallies.of(first)
     for other in parts[1:]:
         total.add(other)
     return replace(

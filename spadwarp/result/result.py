@@ -1,4 +1,4 @@
-"""What a simulation leaves: photon histograms, the energy ledger and the truth of the scene."""
+"""The result of a simulation: photon histograms, the energy ledger and the truth maps of the scene."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.scene.geometry import depth_from_range, path_from_range, pixel_directions, range_from_path
+from spadwarp.scene.geometry import path_from_range, pixel_directions
 
 if TYPE_CHECKING:
-    from spadwarp.frames.arrival_time import Method
     from spadwarp.scene import Scene
 
 __all__ = ["COMPONENTS", "Component", "Result", "Truth"]
@@ -51,7 +50,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
-    """Expected photon histograms of one scene, exact in fixed point, with what is needed to read them alone.
+    """Expected photon histograms of one scene in fixed point, and all that is needed to interpret them.
 
     Attributes:
         scene: The scene that was simulated.
@@ -60,19 +59,19 @@ class Result:
         photons: Emitted photons, > 0.
         seed: 64-bit seed of the run.
         ledger: Where the emitted weight went, in units of `ledger_unit` photons. Entries are differences of fixed-point
-            weights (before − after; a gain is negative), so that their sum is the emitted weight exactly.
+            weights (before − after; a gain is negative), so that their sum is exactly the emitted weight.
         ledger_unit: Photons per ledger unit, a power of two.
         counters: Numbers of events and of contributions that were clipped; light before and after the gate in tally
             units (`guided` aims inside the gate and counts there what its surfaces score alone).
         truth: Depth, range, normal and reflectance at pixel centres.
         timing: Seconds of each stage.
         provenance: Versions, device and date.
-        partial: Whether the run was stopped early; `photons` then counts what was done.
+        partial: Whether the run was interrupted; `photons` then counts what was done.
         photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
-        requested: The ids [start, stop) that were asked for, which a run that was stopped early has only in part.
+        requested: The ids [start, stop) that were asked for; an interrupted run has only a part of them.
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
-        squares: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally, summed
-            over components; None without batches.
+        second_moment: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of
+            all components; None without batches.
     """
 
     scene: Scene
@@ -89,7 +88,7 @@ class Result:
     partial: bool = False
     photon_ranges: Sequence[tuple[int, int]] = ()
     batch_size: int = 0
-    squares: NDArray[np.uint64] | None = None
+    second_moment: NDArray[np.uint64] | None = None
     requested: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
@@ -108,12 +107,10 @@ class Result:
             raise ArgumentError(
                 f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed"
             )
-        if self.squares is not None:
-            expected = (2, *shape[1:])
-            if self.squares.dtype != np.uint64 or self.squares.shape != expected:
-                raise ArgumentError(
-                    f"squares are {self.squares.dtype} {self.squares.shape}; uint64 {expected} is needed"
-                )
+        if self.second_moment is not None:
+            found, expected = self.second_moment, (2, *shape[1:])
+            if found.dtype != np.uint64 or found.shape != expected:
+                raise ArgumentError(f"second_moment is {found.dtype} {found.shape}; uint64 {expected} is needed")
             if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
                 raise ArgumentError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
         for name in ("unit", "ledger_unit"):
@@ -170,12 +167,12 @@ class Result:
         Raises:
             ConfigError: The run kept no batches, or only one.
         """
-        if self.squares is None or self.photons < 2 * self.batch_size:
+        if self.second_moment is None or self.photons < 2 * self.batch_size:
             raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
         count = self.photons // self.batch_size
         total = self.tallies.sum(axis=0).astype(np.float64)
-        squares = self.squares[1] * 2.0**64 + self.squares[0]
-        variance = np.maximum(squares - total**2 / count, 0.0) / (count - 1)
+        second_moment = self.second_moment[1] * 2.0**64 + self.second_moment[0]
+        variance = np.maximum(second_moment - total**2 / count, 0.0) / (count - 1)
         return np.sqrt(count * variance) * self.tally_value[..., None]
 
     @property
@@ -215,24 +212,12 @@ class Result:
     # Depth
 
     def depth(
-        self, *, method: Method = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
+        self, *, method: Any = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
     ) -> NDArray[np.float64]:
-        """Depth frame [m], float64 `[H, W]`; NaN where nothing returned.
+        """Depth frame [m], float64 `[H, W]`, NaN where nothing returned: see `spadwarp.depth_frame`."""
+        import spadwarp
 
-        Args:
-            method: `"peak"`, `"centroid"`, `"matched"` or `"likelihood"`; see `spadwarp.arrival_time`, which also
-                takes `options` (`irf`, `background`, `gate`, `device`).
-            quantity: `"depth"` is planar, z; `"range"` runs along the line of sight.
-        """
-        from spadwarp.frames.arrival_time import arrival_time
-
-        if quantity not in ("depth", "range"):
-            raise ArgumentError(f"quantity = {quantity!r} is not 'depth' or 'range'")
-        gate = self.scene.gate
-        time = arrival_time(self.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
-        directions = pixel_directions(self.scene.camera)
-        distance = range_from_path(time * self.pulse_speed, directions, self.scene.beam.position)
-        return depth_from_range(distance, directions) if quantity == "depth" else distance
+        return spadwarp.depth_frame(self, method=method, quantity=quantity, **options)
 
     def true_path(self) -> NDArray[np.float64]:
         """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
@@ -242,7 +227,7 @@ class Result:
     # Accounts
 
     def ledger_report(self) -> dict[str, Any]:
-        """The energy ledger as fractions of the emitted weight, and whether it closes.
+        """The energy ledger as fractions of the emitted weight, and whether the energy balance is exact.
 
         Returns:
             `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum of
@@ -258,7 +243,7 @@ class Result:
         }
 
     def summary(self) -> dict[str, Any]:
-        """What is in the result and how it was made, in plain numbers and text that JSON can hold."""
+        """The result and its origin in numbers and text that JSON can hold."""
         scene, truth = self.scene, self.truth.depth
         seen = np.isfinite(truth)
         # In floating point: the unit keeps each bin below 2^62, not their sum.
@@ -300,9 +285,9 @@ class Result:
 
     def save(self, path: str | Path) -> Path:
         """Writes everything to one HDF5 file that `spadwarp.load_result` reads back bit for bit; returns its path."""
-        from spadwarp.result.file import save_result
+        import spadwarp
 
-        return save_result(self, path)
+        return spadwarp.save_result(self, path)
 
 
 def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:

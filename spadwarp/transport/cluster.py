@@ -11,7 +11,7 @@ from typing import Any
 from spadwarp.device import pick_device
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorker, RayWorkers
-from spadwarp.result.merge import Sums
+from spadwarp.result.merge import Tallies
 from spadwarp.result.photon_ids import Queue, Range, Ranges, count, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth
 from spadwarp.transport.passes import Plan, Tracer
@@ -49,7 +49,7 @@ class ClusterTracer:
             note=note,
         )
         self._unit = plan.batch_size or 1
-        self._sums = None if base is None else Sums.of(base)
+        self._sums = None if base is None else Tallies.of(base)
         self._speed: dict[RayWorker, float] = {}
         self._about: dict[str, dict[str, Any]] = {}
         self.timing = {"setup": 0.0, "compile": 0.0}
@@ -78,7 +78,7 @@ class ClusterTracer:
                 if kind == "lost":
                     return self.truth()
 
-    def sums(self) -> Sums:
+    def sums(self) -> Tallies:
         assert self._sums is not None
         return self._sums
 
@@ -152,9 +152,9 @@ class ClusterTracer:
         size = max(self._first, min(int(self._speed.get(member, 0.0) * _BLOCK_SECONDS), fair))
         return max(1, size // self._unit) * self._unit
 
-    def _add(self, value: Sums) -> None:
+    def _add(self, value: Tallies) -> None:
         if self._sums is None:
-            self._sums = Sums.of(value)  # Ray's own arrays are read-only
+            self._sums = Tallies.of(value)  # Ray's own arrays are read-only
         else:
             self._sums.add(value)
 
@@ -185,8 +185,8 @@ def _trace(block: Range, worker: Worker) -> tuple[Ranges, float]:
     return done, time.perf_counter() - began
 
 
-def _hand_over(worker: Worker) -> Sums:
+def _hand_over(worker: Worker) -> Tallies:
     tracer = worker.state["tracer"]
-    sums = Sums.of(tracer.sums()) if worker.device == "cpu" else tracer.sums()
+    sums = Tallies.of(tracer.sums()) if worker.device == "cpu" else tracer.sums()
     tracer.clear()
     return sums

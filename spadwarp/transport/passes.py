@@ -15,7 +15,7 @@ import numpy as np
 from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.result.merge import Sums
+from spadwarp.result.merge import Tallies
 from spadwarp.result.photon_ids import Queue, Range, Ranges, count, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth
 from spadwarp.scene import Scene
@@ -105,7 +105,7 @@ class Lane:
             self.data.ledger.zero_()
             self.batch = None
 
-    def sums(self) -> Sums:
+    def sums(self) -> Tallies:
         """What this lane's photons have left, open batches aside; on the CPU in the lane's own memory."""
         import spadwarp_kernels as sk
 
@@ -113,14 +113,14 @@ class Lane:
         shape = (camera.height, camera.width, gate.bins)
         with device_errors(self.model.device):
             if self.batches is None:
-                tallies, squares, accounts = self.data.tally, None, [sk.read_ledger(self.data)]
+                tallies, second_moment, accounts = self.data.tally, None, [sk.read_ledger(self.data)]
             else:
                 tallies, accounts = self.batches.total, self.accounts or [sk.read_ledger(self.data)]
-                squares = np.stack([half.numpy().reshape(shape) for half in self.batches.second_moment])
+                second_moment = np.stack([half.numpy().reshape(shape) for half in self.batches.second_moment])
             ledger, counters = (
                 {name: sum(one[i][name] for one in accounts) for name in accounts[0][i]} for i in (0, 1)
             )
-            return Sums(tallies.numpy().reshape(len(COMPONENTS), *shape), ledger, counters, squares)
+            return Tallies(tallies.numpy().reshape(len(COMPONENTS), *shape), ledger, counters, second_moment)
 
     def clear(self) -> None:
         """Begins the sums anew."""
@@ -193,14 +193,14 @@ class Tracer:
 
         return trace_truth(self.plan.scene, self.lanes[0].model)
 
-    def sums(self) -> Sums:
+    def sums(self) -> Tallies:
         """What all photons traced so far have left, the lanes and the base added up.
 
         With one lane on the CPU and no base it is the lane's own memory.
         """
         total = self.lanes[0].sums()
         if self.devices[0].is_cpu and (len(self.lanes) > 1 or self._base is not None):
-            total = Sums.of(total)
+            total = Tallies.of(total)
         for lane in self.lanes[1:]:
             total.add(lane.sums())
         if self._base is not None:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.io.exr import read_exr
-from spadwarp.result.file import load_truth_exr
+from spadwarp.result.file import load_truth_maps
 from spadwarp.transport.records import load_records
 
 ROOT = Path(__file__).parents[2]
@@ -102,7 +102,7 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     assert result.scene == twin.scene == spadwarp.load_scene(out / "scene.toml")
     assert {path.name for path in out.iterdir()} == FILES
     assert np.array_equal(read_exr(out / "depth.exr")[0]["Z"], twin.depth().astype(np.float32), equal_nan=True)
-    assert np.array_equal(load_truth_exr(out / "truth.exr").depth, twin.truth.depth, equal_nan=True)
+    assert np.array_equal(load_truth_maps(out / "truth.exr").depth, twin.truth.depth, equal_nan=True)
 
     plain = json.loads(summary.read_text())
     assert plain["collected_fraction"] == twin.summary()["collected_fraction"]
@@ -173,7 +173,7 @@ def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):
     run("simulate", scene, "--out", out, "--mesh", mesh, *scale, "--quiet", "--device", "cpu")
     (target,) = spadwarp.load_result(out / "result.h5").scene.targets
     assert (target.mesh, target.builtin, target.translation[2]) == (str(mesh), None, 2.0)
-    depth = load_truth_exr(out / "truth.exr").depth
+    depth = load_truth_maps(out / "truth.exr").depth
     assert np.allclose(depth[2:4, 2:6], 2.0) and np.isnan(depth[0, 0])  # 40 cm of the 70 that are seen
 
 
@@ -391,7 +391,7 @@ def test_shards_are_merged(scene, tmp_path):
     told = run("merge", *parts, "--out", tmp_path / "all", "--device", "cpu")
     merged = spadwarp.load_result(tmp_path / "all" / "result.h5")
     whole = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu", uncertainty=True)
-    assert np.array_equal(merged.tallies, whole.tallies) and np.array_equal(merged.squares, whole.squares)
+    assert np.array_equal(merged.tallies, whole.tallies) and np.array_equal(merged.second_moment, whole.second_moment)
     assert f"photon ids  0 to {whole.photons - 1:,}".replace(",", " ") in told.stdout
 
 

@@ -12,7 +12,7 @@ import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.cli import app
 from spadwarp.io.exr import read_exr
-from spadwarp.result.file import save_truth_exr
+from spadwarp.result.file import save_truth_maps
 
 DEVICE = ("--device", "cpu")
 # A laser in the lens, a gate that begins at 2 m of path and a response of some bins.
@@ -219,7 +219,7 @@ def test_analytic_frames_are_those_of_python(scene, tmp_path):
 
 def test_analytic_takes_truth_and_profile_from_files(scene, done, tmp_path):
     result = spadwarp.load_result(done / "result.h5")
-    exported = save_truth_exr(result, tmp_path / "truth.exr")
+    exported = save_truth_maps(result, tmp_path / "truth.exr")
     rendered = ("--depth", exported, "--depth-channel", "Z", "--depth-scale", 1, "--albedo", 0.7)
     run("analytic", scene, "--out", tmp_path / "a", *rendered, "--frames", 0, *DEVICE)
     run("analytic", scene, "--out", tmp_path / "b", "--frames", 0, "--quiet", *DEVICE)

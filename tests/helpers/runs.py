@@ -10,6 +10,6 @@ def same(a, b):
     assert a.tallies.tobytes() == b.tallies.tobytes()
     assert a.ledger == b.ledger and a.counters == b.counters
     assert tuple(a.photon_ranges) == tuple(b.photon_ranges) and a.requested == b.requested and a.partial == b.partial
-    assert (a.squares is None) == (b.squares is None)
-    if a.squares is not None:
-        np.testing.assert_array_equal(a.squares, b.squares)
+    assert (a.second_moment is None) == (b.second_moment is None)
+    if a.second_moment is not None:
+        np.testing.assert_array_equal(a.second_moment, b.second_moment)

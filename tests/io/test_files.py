@@ -19,7 +19,7 @@ from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import write_hdf5
-from spadwarp.result.file import load_result, load_truth_exr, save_depth_exr, save_result, save_truth_exr
+from spadwarp.result.file import load_result, load_truth_maps, save_depth_exr, save_result, save_truth_maps
 from spadwarp.result.result import Result
 
 
@@ -288,8 +288,8 @@ def test_exr_files_that_are_not_whole_are_refused(tmp_path: Path) -> None:
 
 
 def test_truth_survives_exr(result: Result, tmp_path: Path) -> None:
-    path = save_truth_exr(result, tmp_path / "truth.exr")
-    again = load_truth_exr(path)
+    path = save_truth_maps(result, tmp_path / "truth.exr")
+    again = load_truth_maps(path)
     for name in ("depth", "range", "normal", "reflectance"):
         np.testing.assert_array_equal(getattr(again, name), getattr(result.truth, name), strict=True)
     # The names that other programs look for, in 32-bit floats.
@@ -306,7 +306,7 @@ def test_depth_survives_exr(result: Result, tmp_path: Path) -> None:
     np.testing.assert_array_equal(channels["Z"], depth.astype(np.float32), strict=True)
     assert metadata["content"] == "measured depth"
     with pytest.raises(FileError, match=r"not truth maps: no channel range, N\.X"):
-        load_truth_exr(tmp_path / "depth.exr")
+        load_truth_maps(tmp_path / "depth.exr")
 
 
 @pytest.mark.skipif("SPADWARP_EXTRA_DATA" not in os.environ, reason="SPADWARP_EXTRA_DATA names no folder with ue_exr")

@@ -15,9 +15,9 @@ def _same(a, b):
     assert a.tallies.tobytes() == b.tallies.tobytes()
     assert a.ledger == b.ledger and a.counters == b.counters
     assert a.photons == b.photons and a.photon_ranges == b.photon_ranges
-    assert (a.squares is None) == (b.squares is None)
-    if a.squares is not None:
-        np.testing.assert_array_equal(a.squares, b.squares)
+    assert (a.second_moment is None) == (b.second_moment is None)
+    if a.second_moment is not None:
+        np.testing.assert_array_equal(a.second_moment, b.second_moment)
 
 
 @pytest.mark.parametrize("device", DEVICES)
