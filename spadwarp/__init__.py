@@ -14,16 +14,16 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "scene",
     "Scene": "scene",
-    "presets": "scene.presets",
-    "water_optics": "water.seawater",
-    "WaterOptics": "water.seawater",
-    "refractive_index": "water.seawater",
-    "group_index": "water.seawater",
-    "pure_water_absorption": "water.seawater",
-    "pure_water_scattering": "water.seawater",
-    "phase_function": "scene.phase_function",
-    "PhaseFunction": "scene.phase_function",
-    "check": "checks.checks",
+    "presets": "scene",
+    "water_optics": "water",
+    "WaterOptics": "water",
+    "refractive_index": "water",
+    "group_index": "water",
+    "pure_water_absorption": "water",
+    "pure_water_scattering": "water",
+    "phase_function": "scene",
+    "PhaseFunction": "scene",
+    "check": "checks",
     "bench": "benchmark.cases",
     "simulate": "transport.simulate",
     "Ray": "parallel",
@@ -31,8 +31,8 @@ _HOMES = {
     "interruptible": "parallel",
     "trace": "transport.records",
     "PhotonRecords": "transport.records",
-    "look_at": "scene.pose",
-    "opencv_pose": "scene.pose",
+    "look_at": "scene",
+    "opencv_pose": "scene",
     "truth_maps": "transport.model",
     "devices": "device",
     "Diagnosis": "doctor.diagnosis",
@@ -83,7 +83,7 @@ if TYPE_CHECKING:
     from spadwarp.analytic.budget import budget, sweep
     from spadwarp.analytic.model import AnalyticResult, simulate_analytic
     from spadwarp.benchmark.cases import bench
-    from spadwarp.checks.checks import check
+    from spadwarp.checks import check
     from spadwarp.dataset.make import make_dataset, verify_dataset
     from spadwarp.dataset.read import FrameReader, SpadDataset, iterate_dataset
     from spadwarp.dataset.recipe import Recipe, load_recipe
@@ -99,16 +99,13 @@ if TYPE_CHECKING:
     from spadwarp.result import Result, TorchResult, Truth, load_result, load_truth_exr, save_result, to_torch
     from spadwarp.result.merge import merge
     from spadwarp.run.export import export
-    from spadwarp.scene import Scene, load_scene
-    from spadwarp.scene.phase_function import PhaseFunction, phase_function
-    from spadwarp.scene.pose import look_at, opencv_pose
-    from spadwarp.scene.presets import presets
+    from spadwarp.scene import PhaseFunction, Scene, load_scene, look_at, opencv_pose, phase_function, presets
     from spadwarp.transport.model import truth_maps
     from spadwarp.transport.records import PhotonRecords, trace
     from spadwarp.transport.simulate import simulate
     from spadwarp.viz.transient_video import video
     from spadwarp.viz.viewer import view
-    from spadwarp.water.seawater import (
+    from spadwarp.water import (
         WaterOptics,
         group_index,
         pure_water_absorption,

@@ -30,7 +30,7 @@ def staircase(folder: str) -> str:
     import trimesh
 
     from spadwarp.benchmark.cases import CASES
-    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.mesh import build_mesh
     from spadwarp.scene import Scene
 
     mesh = build_mesh(Scene.from_dict(CASES["staircase_5m"].scene))

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result.result import Result, Truth
+from spadwarp.scene import phase_function
 from spadwarp.scene.geometry import depth_per_time, gate_deviation, pixel_directions
-from spadwarp.scene.phase_function import phase_function
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

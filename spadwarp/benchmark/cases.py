@@ -324,7 +324,7 @@ class TransportRun:
 
     def __init__(self, case: Case, device: wp.Device) -> None:
         import spadwarp_kernels as sk
-        from spadwarp.mesh.targets import build_mesh
+        from spadwarp.mesh import build_mesh
         from spadwarp.transport.model import build_model, transport_spec
 
         scene = Scene.from_dict(case.scene)

@@ -1,1 +1,5 @@
-"""What may be wrong with a scene that is valid, in numbers."""
+"""What may be wrong with a scene that is valid, in numbers, before a photon is traced."""
+
+from spadwarp.checks.checks import CheckMessage, check, summary
+
+__all__ = ["CheckMessage", "check", "summary"]

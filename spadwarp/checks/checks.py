@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.scene import Laser, Layer, Medium, Scene
+from spadwarp.scene import Laser, Layer, Medium, Scene, phase_function
 from spadwarp.scene.beam_profile import profile_extent
 from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
 from spadwarp.scene.intrinsics import image_points
-from spadwarp.scene.phase_function import phase_function
 from spadwarp.scene.pose import to_world
-from spadwarp.scene.presets import WATER_INDICES
+from spadwarp.scene.preset import WATER_INDICES
 from spadwarp.units import path_from_time, range_from_time, time_from_path
-from spadwarp.water.seawater import group_index, molecular_density, pure_water_absorption, water_optics
+from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 if TYPE_CHECKING:
-    from spadwarp.mesh.targets import TriangleMesh
+    from spadwarp.mesh import TriangleMesh
 
 __all__ = ["CheckMessage", "check", "summary"]
 
@@ -105,7 +104,7 @@ class _Shape:
 
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
-            from spadwarp.mesh.targets import build_mesh
+            from spadwarp.mesh import build_mesh
 
             mesh = build_mesh(scene)
         self.scene = scene

@@ -43,8 +43,8 @@ def check(
     Example:
       spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
     """
-    from spadwarp.checks.checks import summary
-    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.checks import summary
+    from spadwarp.mesh import build_mesh
 
     scene = read_scene(scene_path, mesh=mesh, overrides=overrides)
     triangles = build_mesh(scene)

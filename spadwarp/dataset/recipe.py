@@ -27,8 +27,8 @@ from pydantic import (
 )
 
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import Scene
-from spadwarp.scene.load import parse_override, toml_text
+from spadwarp.scene import Scene, parse_override
+from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole, listed
 

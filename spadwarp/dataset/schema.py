@@ -8,7 +8,7 @@ import numpy as np
 
 from spadwarp.dataset.render_analytic import PROFILE_BINS, RenderedScene
 from spadwarp.dataset.sampling import Plan
-from spadwarp.scene.phase_function import phase_function
+from spadwarp.scene import phase_function
 from spadwarp.units import range_from_time
 
 __all__ = ["FORMAT_VERSION", "FRAME_COLUMNS", "scene_columns", "scene_row"]

@@ -67,7 +67,7 @@ class Origin:
 
 def find_targets(recipe: Recipe) -> tuple[Origin, ...]:
     """The targets of a recipe in order. Raises `ConfigError`, `MeshError` or `FileError` for what is not there."""
-    from spadwarp.mesh.targets import BUILTINS, builtin_names
+    from spadwarp.mesh import BUILTINS, builtin_names
 
     known, chosen = builtin_names(), recipe.targets
     objects = [name for name in known if name not in BUILTINS or name == "staircase"]
@@ -119,7 +119,7 @@ def _files(place: Path, wanted: Any) -> list[Path]:
 
 @cache
 def _bounds(origin: Origin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    from spadwarp.mesh.targets import load_target
+    from spadwarp.mesh import load_target
 
     mesh = load_target(Target(builtin=origin.name) if origin.mesh is None else Target(mesh=str(origin.mesh)))
     lower, upper = np.asarray(mesh.bounds, np.float64)

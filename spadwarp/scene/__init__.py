@@ -4,13 +4,23 @@
 `preset`; the file's own fields lie over it and overrides over both. SI units, except where a name carries its unit.
 """
 
-from spadwarp.scene.detection import Detector, Gate
+from spadwarp.scene.analytic import Analytic
+from spadwarp.scene.camera import Camera
+from spadwarp.scene.detector import Detector
+from spadwarp.scene.domain import Domain
+from spadwarp.scene.gate import Gate
+from spadwarp.scene.laser import Laser
+from spadwarp.scene.layers import Layer
 from spadwarp.scene.load import parse_override
-from spadwarp.scene.medium import Layer, Medium
-from spadwarp.scene.methods import Analytic, Output, Transport
-from spadwarp.scene.optics import Camera, Laser, Scan
+from spadwarp.scene.medium import Medium
+from spadwarp.scene.output import Output
+from spadwarp.scene.phase import PhaseFunction, phase_function
+from spadwarp.scene.pose import look_at, opencv_pose
+from spadwarp.scene.preset import Preset, presets
+from spadwarp.scene.scan import Scan
 from spadwarp.scene.scene import Scene, load_scene
-from spadwarp.scene.surroundings import Domain, Target
+from spadwarp.scene.targets import Target
+from spadwarp.scene.transport import Transport
 
 __all__ = [
     "Analytic",
@@ -22,10 +32,16 @@ __all__ = [
     "Layer",
     "Medium",
     "Output",
+    "PhaseFunction",
+    "Preset",
     "Scan",
     "Scene",
     "Target",
     "Transport",
     "load_scene",
+    "look_at",
+    "opencv_pose",
     "parse_override",
+    "phase_function",
+    "presets",
 ]

@@ -12,12 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from spadwarp.errors import ConfigError
-from spadwarp.scene.presets import PRESETS
+from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
+from spadwarp.scene.preset import PRESETS
 
 Table = dict[str, Any]
 Key = tuple[str | int, ...]
-
-COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 
 # Overriding one coefficient of a complete medium keeps this other one.
 _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
@@ -43,41 +42,6 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
 }
-
-
-def complete_medium(pair: Mapping[str, Any]) -> Table:
-    """All four coefficients from exactly two of them, the given ones as they are.
-
-    With `albedo = "paper"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
-    Raises `ValueError` whose text names field, value and range, without the section.
-    """
-    if len(pair) != 2:
-        given = ", ".join(pair) or "none"
-        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
-    a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
-    if albedo == "paper":
-        if c is None:
-            raise ValueError("albedo = 'paper' goes with extinction only")
-        return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
-    if albedo is not None:
-        if c is None:
-            rest = albedo if a is None else 1.0 - albedo
-            if rest <= 0.0:
-                raise ValueError(f"albedo = {albedo} leaves the extinction undetermined; give extinction and albedo")
-            c = (b if a is None else a) / rest
-        a = c * (1.0 - albedo) if a is None else a
-        b = c * albedo if b is None else b
-    elif c is None:
-        c = a + b
-    else:
-        part, value = ("scattering", b) if a is None else ("absorption", a)
-        if value > c:
-            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
-        a = c - b if a is None else a
-        b = c - a if b is None else b
-    if not c > 0.0:
-        raise ValueError(f"extinction = {c} is outside (0, inf)")
-    return {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c if albedo is None else albedo}
 
 
 def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any]) -> Table:
@@ -116,7 +80,7 @@ def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:
         if len(old) < 2 or (old.get("albedo") == "paper" and kept not in old and new[0] not in old):
             return
         try:
-            keep[kept] = old[kept] if kept in old else complete_medium(old)[kept]
+            keep[kept] = old[kept] if kept in old else complete_coefficients(old)[kept]
         except (TypeError, ValueError):
             return
     if new:

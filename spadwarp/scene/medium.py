@@ -1,89 +1,28 @@
-"""The sections `medium` and `medium.layers`."""
+"""The section `medium`."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
-from spadwarp.scene import load as _layers
-from spadwarp.scene.optics import Laser
-from spadwarp.scene.presets import PHASE_TABLES, PRESETS, WATER_INDICES
-from spadwarp.scene.sections import Section, Vector, listed
+from spadwarp.scene.coefficients import COEFFICIENTS
+from spadwarp.scene.laser import Laser
+from spadwarp.scene.layers import Layer, Water
+from spadwarp.scene.preset import PHASE_TABLES, PRESETS, WATER_INDICES
+from spadwarp.scene.sections import Vector, listed
 from spadwarp.units import pulse_speed
-
-
-class _Water(Section):
-    """What water does to light: two of four coefficients, or chlorophyll, from which they follow."""
-
-    section: ClassVar[str] = "medium"
-    preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
-    absorption: float = Field(0.0, ge=0, description="absorption coefficient a [1/m]")
-    scattering: float = Field(0.0, ge=0, description="scattering coefficient b [1/m]")
-    extinction: float = Field(0.0, gt=0, description="extinction (beam attenuation) coefficient c = a + b [1/m]")
-    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["paper"] = Field(
-        0.0,
-        description='single-scattering albedo b/c, or "paper": uniform in (0, 0.97) at each collision',
-    )
-    chlorophyll: float | None = Field(
-        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
-    )
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        # What was given stays in model_fields_set, from where to_dict() knows it.
-        if self.chlorophyll is None:
-            self.__dict__.update(_layers.complete_medium({name: getattr(self, name) for name in self.given}))
-        elif self.given or self.preset is not None:
-            raise ValueError(f"chlorophyll = {self.chlorophyll} goes without {', '.join(self.given or ['preset'])}")
-        return self
-
-    @property
-    def given(self) -> tuple[str, ...]:
-        """Names of the two coefficients that define the water, none with chlorophyll; the others follow."""
-        return tuple(name for name in _layers.COEFFICIENTS if name in self.model_fields_set)
-
-    @property
-    def attenuation_length(self) -> float:
-        """1/c [m]."""
-        return 1.0 / self.extinction
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields that make an equal section again: of the coefficients the given ones."""
-        hidden = set(_layers.COEFFICIENTS) - set(self.given)
-        return {name: value for name, value in super().to_dict().items() if name not in hidden}
-
-
-class Layer(_Water):
-    """Water from a plane on, up to the next layer; given as a medium is."""
-
-    start: float = Field(..., description="where it begins along `layer_axis`, the world's z if not given [m]")
-    anisotropy: float | None = Field(
-        None,
-        gt=-1,
-        lt=1,
-        description="henyey_greenstein: mean cosine of the scattering angle; default: the medium's",
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _expand_preset(cls, fields: Any) -> Any:
-        if not isinstance(fields, Mapping):
-            return fields
-        whole = _layers.merge_section(cls.section, {}, fields)
-        # A preset has indices, but one pair of them holds for all layers: the medium's.
-        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
-
+from spadwarp.water import water_optics
 
 # Fields that a phase function needs and no other takes.
 _PHASE_FIELDS = {"two_term_henyey_greenstein": ("g1", "g2", "alpha"), "tabulated": ("phase_table",)}
 
 
-class Medium(_Water):
+class Medium(Water):
     """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
 
     What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene). With
@@ -181,14 +120,12 @@ class Medium(_Water):
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
-        from spadwarp.water.seawater import water_optics
-
         temperature = 20.0 if self.temperature is None else self.temperature
         salinity = 35.0 if self.salinity is None else self.salinity
 
         self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
         for water in self.waters:
-            names = [] if water.chlorophyll is None else [*_layers.COEFFICIENTS]
+            names = [] if water.chlorophyll is None else [*COEFFICIENTS]
             if water is self and self.follows_wavelength:
                 names += [name for name in ("phase_index", "group_index") if name not in self.model_fields_set]
             if not names:

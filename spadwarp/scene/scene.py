@@ -11,14 +11,21 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import load as _layers
-from spadwarp.scene.detection import Detector, Gate
+from spadwarp.scene import load
+from spadwarp.scene.analytic import Analytic
+from spadwarp.scene.camera import Camera
+from spadwarp.scene.detector import Detector
+from spadwarp.scene.domain import Domain
+from spadwarp.scene.gate import Gate
+from spadwarp.scene.laser import Laser
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
-from spadwarp.scene.methods import Analytic, Output, Transport
-from spadwarp.scene.optics import Camera, Laser, Scan
+from spadwarp.scene.output import Output
+from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
+from spadwarp.scene.scan import Scan
 from spadwarp.scene.sections import listed
-from spadwarp.scene.surroundings import Domain, Target
+from spadwarp.scene.targets import Target
+from spadwarp.scene.transport import Transport
 from spadwarp.units import path_from_time
 
 Overrides = Mapping[str, Any] | Sequence[str]
@@ -74,8 +81,6 @@ class Scene(BaseModel):
         laser, camera = self.laser, self.camera
         if laser.frame == "camera" or not any((*camera.position, *camera.rotation_deg)):
             return laser
-        from spadwarp.scene.pose import rotation_matrix, to_camera
-
         place, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
         moved = {"position": tuple(map(float, place)), "direction": tuple(map(float, axis)), "frame": "camera"}
         return laser.model_copy(update=moved)
@@ -83,8 +88,6 @@ class Scene(BaseModel):
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds on the straight way between two points of the camera frame [m]."""
         if self.medium.layers and any((*self.camera.position, *self.camera.rotation_deg)):
-            from spadwarp.scene.pose import to_world
-
             begin, end = to_world(self.camera, [begin, end]).tolist()
         return self.medium.optical_depth(begin, end)
 
@@ -105,7 +108,7 @@ class Scene(BaseModel):
 
     def to_toml(self) -> str:
         """The full text that `load_scene` reads back to an equal scene."""
-        return _layers.toml_text(self.to_dict())
+        return load.toml_text(self.to_dict())
 
     def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
         """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
@@ -158,8 +161,8 @@ def _build(
         if source is not None and resolve:
             tables = _with_paths(tables, Path(source).absolute().parent)
         if overrides:
-            layer = _layers.override_layer(overrides)
-            tables = _layers.merge_scene(tables, _with_paths(layer, Path.cwd()))
+            layer = load.override_layer(overrides)
+            tables = load.merge_scene(tables, _with_paths(layer, Path.cwd()))
         scene = Scene.model_validate(tables)
     except ConfigError as error:
         raise ConfigError(error.problems, source=name) from None

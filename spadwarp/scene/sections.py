@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
-from spadwarp.scene import load as _layers
-from spadwarp.scene.presets import PRESETS
+from spadwarp.scene.load import merge_section
+from spadwarp.scene.preset import PRESETS
 
 
 def _whole(value: Any) -> Any:
@@ -54,7 +54,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _expand_preset(cls, fields: Any) -> Any:
-        return _layers.merge_section(cls.section, {}, fields) if isinstance(fields, Mapping) else fields
+        return merge_section(cls.section, {}, fields) if isinstance(fields, Mapping) else fields
 
     @field_validator("preset", check_fields=False)
     @classmethod

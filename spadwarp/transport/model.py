@@ -11,18 +11,17 @@ import numpy as np
 from spadwarp.device import physical_memory, pick_device
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.result.result import COMPONENTS, Truth
-from spadwarp.scene import Scene
+from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.geometry import pixel_directions, scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
-from spadwarp.scene.phase_function import phase_function
 from spadwarp.scene.pose import rotation_matrix, to_world
 from spadwarp.transport.tally_scale import tally_scale
 
 if TYPE_CHECKING:
     import warp as wp
 
-    from spadwarp.mesh.targets import TriangleMesh
+    from spadwarp.mesh import TriangleMesh
     from spadwarp_kernels import Model
 
 # The paper's albedo is uniform in (0, 0.97).
@@ -187,7 +186,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
 
 def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
     """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
-    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.mesh import build_mesh
 
     mesh = build_mesh(scene)
     return trace_truth(scene, build_model(scene, pick_device(device), mesh, camera=False))

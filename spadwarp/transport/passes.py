@@ -23,7 +23,7 @@ from spadwarp.scene import Scene
 if TYPE_CHECKING:
     import warp as wp
 
-    from spadwarp.mesh.targets import TriangleMesh
+    from spadwarp.mesh import TriangleMesh
     from spadwarp_kernels import Data, Model
 
 # Photons in one launch: large enough to fill the device, small enough that progress is seen and Ctrl-C heard.

@@ -80,7 +80,7 @@ def trace(
     Args and raises: as `simulate`.
     """
     import spadwarp_kernels as sk
-    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.mesh import build_mesh
 
     photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed

@@ -96,7 +96,7 @@ def simulate(
         DeviceError: A device failed on the way; the text names the checkpoint, if there is one.
         KeyboardInterrupt: Ctrl-C before the first pass was done, or a second Ctrl-C.
     """
-    from spadwarp.mesh.targets import build_mesh
+    from spadwarp.mesh import build_mesh
 
     if resume is not None:
         _check_resumed(resume, scene, seed, first_photon, shard, uncertainty or relative_error is not None)

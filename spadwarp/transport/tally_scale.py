@@ -13,7 +13,7 @@ from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.frustum import view_planes
 
 if TYPE_CHECKING:
-    from spadwarp.mesh.targets import TriangleMesh
+    from spadwarp.mesh import TriangleMesh
 
 __all__ = ["PHOTON_CAPACITY", "tally_scale"]
 

@@ -176,7 +176,7 @@ def _mean_path(run: Run) -> list[Quantity]:
 
 def _four_volumes_per_area(target: dict[str, Any]) -> float:
     """4V/S [m] of a closed convex target about the origin."""
-    from spadwarp.mesh.targets import load_target
+    from spadwarp.mesh import load_target
     from spadwarp.scene import Target
 
     mesh = load_target(Target(**target))

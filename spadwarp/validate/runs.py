@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.scene import Scene
-from spadwarp.scene.phase_function import phase_function
+from spadwarp.scene import Scene, phase_function
 from spadwarp.units import time_from_path
 from spadwarp.validate.statistics import Quantity
 

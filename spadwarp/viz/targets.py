@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.atomic import atomic_path
-from spadwarp.mesh.targets import SIZED_BUILTINS, builtin_names, load_target
+from spadwarp.mesh import SIZED_BUILTINS, builtin_names, load_target
 from spadwarp.scene import Scene
 
 __all__ = ["DISTANCE", "describe_targets", "draw_targets", "target_scene"]

@@ -14,7 +14,7 @@ import spadwarp
 from spadwarp.benchmark.cases import CASES, GROUPS, load_report, ratios, report
 from spadwarp.cli import app
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.mesh.targets import build_mesh
+from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 
 PEERS = Path(__file__).parents[2] / "bench" / "peers"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spadwarp.checks.checks import CheckMessage, check, summary
-from spadwarp.mesh.targets import TriangleMesh
+from spadwarp.checks import CheckMessage, check, summary
+from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene, load_scene
 from spadwarp.units import SPEED_OF_LIGHT
 

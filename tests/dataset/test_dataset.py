@@ -24,7 +24,7 @@ from spadwarp.dataset.read import FIELDS
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.sampling import Plan
 from spadwarp.io.exr import write_exr
-from spadwarp.mesh.targets import build_mesh
+from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT
 
 

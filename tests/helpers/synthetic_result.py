@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.mesh.targets import TriangleMesh, build_mesh
+from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import pixel_directions

@@ -10,7 +10,7 @@ import trimesh
 
 from helpers.synthetic_result import cast_truth, make_scene
 from spadwarp.errors import MeshError
-from spadwarp.mesh.targets import BUILTINS, build_mesh, builtin_names, load_target
+from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, load_target
 from spadwarp.scene import Scene, Target
 
 FORMATS = ("stl", "obj", "ply", "off", "glb")

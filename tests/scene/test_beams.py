@@ -12,7 +12,7 @@ from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.exr import write_exr
-from spadwarp.mesh.targets import build_mesh
+from spadwarp.mesh import build_mesh
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport.tally_scale import PHOTON_CAPACITY, tally_scale
 from spadwarp_kernels import profile_tables

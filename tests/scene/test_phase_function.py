@@ -11,8 +11,8 @@ from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene import Medium
-from spadwarp.scene.phase_function import read_phase_table
-from spadwarp.scene.presets import PHASE_TABLES
+from spadwarp.scene.phase import read_phase_table
+from spadwarp.scene.preset import PHASE_TABLES
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 PETZOLD = Medium(**WATER, phase_function="tabulated", phase_table="petzold-average-particle")

@@ -2,9 +2,9 @@
 
 import pytest
 
-from spadwarp.scene import Camera, Medium, Scene
-from spadwarp.scene.presets import PRESETS, presets
-from spadwarp.water.seawater import pure_water_absorption
+from spadwarp.scene import Camera, Medium, Scene, presets
+from spadwarp.scene.preset import PRESETS
+from spadwarp.water import pure_water_absorption
 
 MEDIA = presets("medium")
 

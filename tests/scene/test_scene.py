@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from spadwarp.errors import ConfigError, FileError, SpadwarpError
-from spadwarp.scene import Camera, Domain, Laser, Medium, Scene, load_scene, parse_override
-from spadwarp.scene.presets import presets
+from spadwarp.scene import Camera, Domain, Laser, Medium, Scene, load_scene, parse_override, presets
 from spadwarp.units import SPEED_OF_LIGHT
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))

@@ -10,10 +10,10 @@ from helpers.scenes import WATER, scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from reference.adding_doubling import stack
 from reference.single_scatter import Lidar, single_scatter_total
-from spadwarp.checks.checks import summary
+from spadwarp.checks import summary
 from spadwarp.scene import Scene
 from spadwarp.units import SPEED_OF_LIGHT
-from spadwarp.water.seawater import water_optics
+from spadwarp.water import water_optics
 
 MURKY = {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5}
 CLEAR = {"start": 1.7, "extinction": 0.2, "albedo": 0.9}

@@ -10,7 +10,7 @@ import spadwarp
 import spadwarp_kernels as sk
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
-from spadwarp.mesh.targets import build_mesh
+from spadwarp.mesh import build_mesh
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import scan_axes
 from spadwarp.transport.model import build_model, pick_device, transport_spec

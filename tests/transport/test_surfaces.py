@@ -16,8 +16,8 @@ import spadwarp
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp.errors import ConfigError, MeshError
+from spadwarp.mesh import build_mesh
 from spadwarp.mesh.colours import srgb_to_linear
-from spadwarp.mesh.targets import build_mesh
 from spadwarp.scene import Target
 
 CORNERS = np.array([(-1.5, -1.5, 0.0), (1.5, -1.5, 0.0), (1.5, 1.5, 0.0), (-1.5, 1.5, 0.0)])

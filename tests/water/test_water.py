@@ -9,7 +9,7 @@ import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 from spadwarp.scene import Medium, Scene
-from spadwarp.scene.presets import WATER_INDICES
+from spadwarp.scene.preset import WATER_INDICES
 
 TABLES = {
     "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01},

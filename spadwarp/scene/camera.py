@@ -1,73 +1,16 @@
-"""The sections `laser`, `camera` and `scan`."""
+"""The section `camera`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
+from spadwarp.scene import intrinsics
+from spadwarp.scene.calibration import load_calibration
 from spadwarp.scene.sections import Brown, Section, Vector, Whole
-from spadwarp.units import PLANCK, SPEED_OF_LIGHT
-
-
-class Laser(Section):
-    """The pulsed source. Photons leave it at the middle of the pulse, time 0."""
-
-    section: ClassVar[str] = "laser"
-    preset: str | None = Field(None, description="a named laser, see `spadwarp presets laser`")
-    position: Vector = Field((0.0, 0.0, 0.0), description="place [m]")
-    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0; a scan aims it itself")
-    frame: Literal["camera", "world"] = Field(
-        "camera", description="frame of position and direction: a laser moves with the camera, or stands in the world"
-    )
-    profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = Field(
-        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"
-    )
-    profile_image: str | None = Field(
-        None, description="irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"
-    )
-    half_angle_deg: float = Field(
-        15.0,
-        gt=0,
-        le=180,
-        description="half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]",
-    )
-    beam_radius: float = Field(0.0, ge=0, description="radius of the collimated beam [m]; 0 is a pencil beam")
-    wavelength_nm: float = Field(532.0, gt=0, description="vacuum wavelength [nm]")
-    pulse_energy: float = Field(37.5e-9, gt=0, description="energy of one pulse [J]")
-    repetition_rate: float = Field(20e6, gt=0, description="pulses per second [Hz]")
-    pulse_fwhm_ps: float = Field(85.0, ge=0, description="pulse duration, full width at half maximum [ps]")
-
-    @model_validator(mode="after")
-    def _has_a_beam(self) -> Self:
-        if not any(self.direction):
-            raise ValueError(f"direction = {list(self.direction)} has no length")
-        if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
-            raise ValueError(
-                f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a {self.profile} profile"
-            )
-        if (self.profile == "measured") != (self.profile_image is not None):
-            raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
-        return self
-
-    @property
-    def half_angle(self) -> float:
-        """θ [rad]."""
-        return math.radians(self.half_angle_deg)
-
-    @property
-    def axis(self) -> tuple[float, float, float]:
-        """`direction` as a unit vector."""
-        x, y, z = self.direction
-        length = math.hypot(x, y, z)
-        return (x / length, y / length, z / length)
-
-    @property
-    def photons_per_pulse(self) -> float:
-        """E0·λ/(hc)."""
-        return self.pulse_energy * self.wavelength_nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
 
 
 class Camera(Section):
@@ -116,8 +59,6 @@ class Camera(Section):
     def _read_calibration(cls, fields: Any) -> Any:
         if not isinstance(fields, Mapping) or not isinstance(fields.get("calibration"), str):
             return fields
-        from spadwarp.scene.calibration import load_calibration
-
         read = load_calibration(fields["calibration"])
         for name in ("width", "height"):
             if fields.get(name, read.get(name)) != read.get(name, fields.get(name)):
@@ -145,14 +86,11 @@ class Camera(Section):
             raise ValueError(
                 f"focus_distance = {self.focus_distance} is outside ({self.focal_length}, inf], beyond the focal length"
             )
-        if any(self.distortion):
-            from spadwarp.scene.intrinsics import is_invertible
-
-            if not is_invertible(self):
-                raise ValueError(
-                    f"distortion = {list(self.distortion)} folds the image: some of its {self.width} x {self.height} "
-                    "pixels show no direction, or two"
-                )
+        if not intrinsics.is_invertible(self):
+            raise ValueError(
+                f"distortion = {list(self.distortion)} folds the image: some of its {self.width} x {self.height} "
+                "pixels show no direction, or two"
+            )
         return self
 
     @property
@@ -200,9 +138,7 @@ class Camera(Section):
     def view_box(self) -> tuple[float, float, float, float]:
         """Least and largest tangents (left, top, right, bottom) of what the image shows."""
         if any(self.distortion):
-            from spadwarp.scene.intrinsics import view_box
-
-            return view_box(self)
+            return intrinsics.view_box(self)
         (fx, fy), (cx, cy) = self.focal_pixels, self.principal_point
         return -cx / fx, -cy / fy, (self.width - cx) / fx, (self.height - cy) / fy
 
@@ -230,19 +166,3 @@ class Camera(Section):
     def aperture_area(self) -> float:
         """Area of the entrance aperture [m²]."""
         return math.pi * self.aperture_radius**2
-
-
-class Scan(Section):
-    """How the beam moves over the scene."""
-
-    section: ClassVar[str] = "scan"
-    mode: Literal["none", "confocal"] = Field(
-        "none", description="confocal: the beam visits the pixels in turn and each sees its own light alone"
-    )
-    distance: float = Field(
-        math.inf,
-        gt=0,
-        le=math.inf,
-        allow_inf_nan=True,
-        description="range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel",
-    )

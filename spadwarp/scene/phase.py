@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import Medium
-from spadwarp.scene.presets import PHASE_TABLES
-from spadwarp.water.seawater import molecular_density
+from spadwarp.scene.medium import Medium
+from spadwarp.scene.preset import PHASE_TABLES
+from spadwarp.water import molecular_density
 
 __all__ = ["PhaseFunction", "phase_function", "read_phase_table"]
 

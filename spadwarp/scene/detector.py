@@ -1,4 +1,4 @@
-"""The sections `detector` and `gate`."""
+"""The section `detector`."""
 
 from __future__ import annotations
 
@@ -60,28 +60,3 @@ class Detector(Section):
     def noise_rate(self) -> float:
         """Mean counts per second and pixel without light of the laser: dark counts and ambient light [1/s]."""
         return self.dark_count_rate + self.ambient_rate
-
-
-class Gate(Section):
-    """The time bins after the pulse leaves the laser."""
-
-    section: ClassVar[str] = "gate"
-    preset: str | None = Field(None, description="named electronics, see `spadwarp presets gate`")
-    start_ns: float = Field(0.0, ge=0, description="begin of the first bin [ns]")
-    bin_width_ps: float = Field(..., gt=0, description="width of a bin [ps]")
-    bins: Whole = Field(..., ge=1, le=1_000_000, description="number of bins")
-
-    @property
-    def start(self) -> float:
-        """Begin of the first bin [s]."""
-        return self.start_ns * 1e-9
-
-    @property
-    def bin_width(self) -> float:
-        """[s]."""
-        return self.bin_width_ps * 1e-12
-
-    @property
-    def stop(self) -> float:
-        """End of the last bin [s]."""
-        return self.start + self.bins * self.bin_width

@@ -1,0 +1,26 @@
+"""The section `scan`."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from spadwarp.scene.sections import Section
+
+
+class Scan(Section):
+    """How the beam moves over the scene."""
+
+    section: ClassVar[str] = "scan"
+    mode: Literal["none", "confocal"] = Field(
+        "none", description="confocal: the beam visits the pixels in turn and each sees its own light alone"
+    )
+    distance: float = Field(
+        math.inf,
+        gt=0,
+        le=math.inf,
+        allow_inf_nan=True,
+        description="range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel",
+    )
