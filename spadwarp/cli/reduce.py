@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from spadwarp import Result
-    from spadwarp.frames.file import Recording
-    from spadwarp.frames.measured import Histograms
+    from spadwarp.frames import Histograms, Recording
 
 # What a detector sees of a scene; the rest has decided which photons came.
 _DETECTOR_FIELDS = ("detector", "laser.pulse_energy", "laser.repetition_rate", "laser.pulse_fwhm_ps")
@@ -87,7 +86,7 @@ def detect(
       spadwarp detect run1/result.h5 --pulses 20000 --frames 100 --seed 3 --out frames/
       spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
     """
-    from spadwarp.frames.file import record_frames
+    from spadwarp.frames import record_frames
     from spadwarp.viz.frames import draw_recording
 
     result = _with_detector(load_run(run), overrides)
@@ -226,8 +225,8 @@ def depth(
       spadwarp depth counts.npy --bin-width-ps 55 --group-index 1.3566 --horizontal-fov-deg 15 \\
           --irf-fwhm-ps 200 --method likelihood --out depth/
     """
+    from spadwarp.frames import read_histograms
     from spadwarp.frames.depth import depth_of
-    from spadwarp.frames.measured import read_histograms
     from spadwarp.io.atomic import file_within
     from spadwarp.run.depth import write_depth
 

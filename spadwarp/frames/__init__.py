@@ -2,24 +2,37 @@
 
 from spadwarp.frames.arrival_time import METHODS, Method, arrival_time
 from spadwarp.frames.cramer_rao import crlb, crlb_from_histogram
+from spadwarp.frames.depth import Reduction, depth_of
+from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.frames import Frames, TimeTags
+from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.frames.pile_up import coates, first_photon_probabilities
+from spadwarp.frames.record import FrameErrors, Recording, record_frames
 from spadwarp.frames.response import InstrumentResponse, detector_response, instrument_response, response_matrix
 from spadwarp.frames.spad import detect
 
 __all__ = [
     "METHODS",
+    "FrameErrors",
     "Frames",
+    "FramesFile",
+    "Histograms",
     "InstrumentResponse",
     "Method",
+    "Recording",
+    "Reduction",
     "TimeTags",
     "arrival_time",
     "coates",
     "crlb",
     "crlb_from_histogram",
+    "depth_of",
     "detect",
     "detector_response",
     "first_photon_probabilities",
     "instrument_response",
+    "is_frames_file",
+    "read_histograms",
+    "record_frames",
     "response_matrix",
 ]

@@ -84,12 +84,12 @@ def depth_of(
     """Depth of histograms from a file.
 
     Args:
-        histograms: From `spadwarp.frames.measured.read_histograms`.
+        histograms: From `spadwarp.frames.read_histograms`.
         method: See `spadwarp.arrival_time`; `"matched"` and `"likelihood"` need a response.
-        group_index: Vacuum speed of light over that of the pulse, ≥ 1; a simulation knows its own.
+        group_index: Vacuum speed of light over that of the pulse, ≥ 1; a simulation has its own.
         horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
         background: Expected background per bin in the unit of the values, ≥ 0; `"median"`: the median bin of each
-            pixel. Default: what the file knows; else none, with `"likelihood"` the median.
+            pixel. Default: that of the file; else none, with `"likelihood"` the median.
         device: Warp device.
 
     Measured histograms count as those of a laser in the lens, whose pulse leaves at time 0.
@@ -97,42 +97,18 @@ def depth_of(
     Raises:
         ArgumentError: Something that is needed is missing, given twice or out of range.
     """
-    scene = histograms.scene
     if histograms.bin_width is None:
-        raise ArgumentError("bin width is missing (--bin-width-ps): the file does not tell it")
-    if scene is None and group_index is None:
-        raise ArgumentError(
-            "group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater"
-        )
-    if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
-        raise ArgumentError("group index and field of view are those of the file's scene")
-    index = scene.medium.group_index if scene is not None else float(group_index or 0)
-    if not 1 <= index <= 3:
-        raise ArgumentError(f"group index = {index} is outside [1, 3]")
+        raise ArgumentError("bin width is missing (--bin-width-ps): the file does not hold it")
+    index, directions, laser = _geometry(histograms, group_index, horizontal_fov_deg)
     values = histograms.values
     height, width = values.shape[-3:-1]
-    directions, laser = None, (0.0, 0.0, 0.0)
-    if scene is not None:
-        directions, laser = pixel_directions(scene.camera), scene.beam.position
-    elif horizontal_fov_deg is not None:
-        if not 0 < horizontal_fov_deg < 180:
-            raise ArgumentError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
-        camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
-        directions = pixel_directions(camera)
-
-    known: Any = background
-    if background is None:
-        known = histograms.background
-        if known is None and method == "likelihood":
-            background = "median"
-    if background == "median":
-        frames = values.reshape(-1, *values.shape[-3:])
-        # Of all frames together: the median of sparse counts would be 0.
-        known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
     filtered = method in ("matched", "likelihood")
     response = histograms.response if filtered else histograms.irf
     if filtered and response is None:
         raise ArgumentError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
+    known: Any = histograms.background if background is None else background
+    if background == "median" or (known is None and method == "likelihood"):
+        known = _median_background(values)
     time = arrival_time(
         values,
         gate_start=histograms.gate_start,
@@ -144,12 +120,42 @@ def depth_of(
     ).reshape(-1, height, width)
     view = np.array([0.0, 0.0, 1.0]) if directions is None else directions
     distance = range_from_path(path_from_time(time, index), view, laser)
-    planar = directions is not None
     return Reduction(
-        quantity="depth" if planar else "range",
-        values=depth_from_range(distance, view) if planar else distance,
+        quantity="range" if directions is None else "depth",
+        values=distance if directions is None else depth_from_range(distance, view),
         range=distance,
         intensity=values.sum(axis=-1).reshape(-1, height, width),
         directions=directions,
         method=method,
     )
+
+
+def _geometry(
+    histograms: Histograms, group_index: float | None, horizontal_fov_deg: float | None
+) -> tuple[float, NDArray[np.float64] | None, tuple[float, float, float]]:
+    """Group index, lines of sight `[H, W, 3]` where they are known, and the laser's position [m]."""
+    scene = histograms.scene
+    if scene is None and group_index is None:
+        raise ArgumentError(
+            "group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater"
+        )
+    if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
+        raise ArgumentError("group index and field of view are those of the file's scene")
+    index = scene.medium.group_index if scene is not None else float(group_index or 0)
+    if not 1 <= index <= 3:
+        raise ArgumentError(f"group index = {index} is outside [1, 3]")
+    if scene is not None:
+        return index, pixel_directions(scene.camera), scene.beam.position
+    if horizontal_fov_deg is None:
+        return index, None, (0.0, 0.0, 0.0)
+    if not 0 < horizontal_fov_deg < 180:
+        raise ArgumentError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
+    height, width = histograms.values.shape[-3:-1]
+    camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
+    return index, pixel_directions(camera), (0.0, 0.0, 0.0)
+
+
+def _median_background(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Median bin of each pixel, of all frames together: that of sparse counts would be 0."""
+    frames = values.reshape(-1, *values.shape[-3:])
+    return (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)

@@ -1,243 +1,219 @@
-"""Frames of a camera on disk: counts, depth by every estimator and the bound that none of them can beat."""
+"""Frames of a camera on disk: the one place that knows how they lie in an HDF5 file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.arrival_time import METHODS, Method
 from spadwarp.frames.frames import Frames
-from spadwarp.frames.spad import detect
-from spadwarp.io.hdf5 import write_hdf5
+from spadwarp.frames.response import InstrumentResponse
+from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
 from spadwarp.result.result import Result
-from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
+from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
 
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["FORMAT", "FORMAT_VERSION", "FrameErrors", "Recording", "depth_from_time", "record_frames"]
+__all__ = ["FORMAT", "FORMAT_VERSION", "FramesFile", "FramesWriter", "is_frames_file"]
 
 FORMAT = "spadwarp frames"
 FORMAT_VERSION = 1
 
-_PART_BYTES = 1 << 28  # of counts that are held at a time
 _CHUNK_BYTES = 1 << 20
 _TAG_CHUNK = 1 << 16
+_TAGS = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
+_PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _READ_ME = (
     "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
     "seconds of flight. depth/NAME: [frame, height, width], planar depth in metres by that estimator, NaN where "
     "nothing was detected. intensity: counts over all bins. bound/time and bound/depth: Cramér–Rao standard deviation "
     "of one frame [s], [m], NaN where there is no information. expected, background: expected detections per pulse and "
     "bin of all light and noise, and of what is not target. "
-    "tags, if there: detections one by one. Camera frame: +x right, +y down, +z forward."
+    "tags, if present: detections one by one. Camera frame: +x right, +y down, +z forward."
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameErrors:
-    """How far the depth frames of one estimator are from the truth, over all pixels and frames that have both.
-
-    Attributes:
-        estimate_fraction: Estimates over pixels that see a target.
-        median: Median absolute error [m].
-        p90: What 90 % of the absolute errors stay below [m].
-    """
-
-    estimate_fraction: float
-    median: float
-    p90: float
+def is_frames_file(path: str | Path) -> bool:
+    """Whether a file holds frames of a camera. Raises `FileError` if it is not an HDF5 file."""
+    return hdf5_format(path) == FORMAT
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recording:
-    """What `record_frames` wrote, in short.
+class FramesFile:
+    """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory.
 
     Attributes:
         path: The file.
-        first: The first frame, its counts `[1, H, W, T]`.
-        depth: First frame by each estimator, float64 `[H, W]` [m].
-        errors: By estimator; of at most the first 256 MiB of counts.
-        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m].
-        detections: Counted in all frames.
-        notes: What the simulation could not give, in words.
+        frames: Their number.
+        pulses: Per frame.
+        seed: Of the random numbers.
+        gate_start, bin_width, edges, period, irf, expected, background: As in `Frames`; expected and background are
+            None in a file that does not hold them.
+        scene: Of the result that the counts were drawn from.
+        truth_depth: float32 `[H, W]` [m].
+        methods: Estimators whose depth frames the file holds.
     """
 
     path: Path
-    first: Frames
-    depth: dict[Method, NDArray[np.float64]]
-    errors: dict[Method, FrameErrors]
-    bound_time: NDArray[np.float64]
-    bound_depth: NDArray[np.float64]
-    detections: int
-    notes: tuple[str, ...]
+    frames: int
+    pulses: int
+    seed: int
+    gate_start: float
+    bin_width: float
+    edges: NDArray[np.float64]
+    period: float | None
+    irf: InstrumentResponse
+    expected: NDArray[np.float32] | None
+    background: NDArray[np.float32] | None
+    scene: Scene
+    truth_depth: NDArray[np.float32]
+    methods: tuple[Method, ...]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Opens a file that `record_frames` wrote. Raises `FileError`."""
+        with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+            if "sample" in file:
+                raise FileError(f"{path}: a shard of a dataset; name the dataset's folder")
+            metadata, period = file.attrs, float(file.attrs["period"])
+            source = metadata.get("source")
+            if "irf" in file:
+                irf = InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
+            else:
+                irf = InstrumentResponse(sigma=float(metadata["irf_sigma"]), tail=float(metadata["irf_tail"]))
+            cubes = {name: file[name][...] if name in file else None for name in ("expected", "background")}
+            return cls(
+                path=Path(path),
+                frames=file["counts"].shape[0],
+                pulses=int(metadata["pulses"]),
+                seed=int(metadata["seed"]),
+                gate_start=float(metadata["gate_start"]),
+                bin_width=float(metadata["bin_width"]),
+                edges=file["edges"][...],
+                period=period if np.isfinite(period) else None,
+                irf=irf,
+                scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=source or None),
+                truth_depth=file["truth/depth"][...],
+                methods=tuple(file["depth"]),
+                **cubes,
+            )
+
+    @property
+    def best_method(self) -> Method | None:
+        """The estimator that comes last in `METHODS`, which uses most of what is known; None without depth."""
+        return max(self.methods, key=METHODS.index, default=None)
+
+    def counts(self, frame: int | None = None) -> NDArray[np.int32]:
+        """Counts of one frame `[H, W, T]`, or of all `[frames, H, W, T]`."""
+        return self._read("counts", frame)
+
+    def intensity(self, frame: int | None = None) -> NDArray[np.int64]:
+        """Counts over all bins, `[H, W]` or `[frames, H, W]`."""
+        return self._read("intensity", frame)
+
+    def depth(self, method: Method, frame: int | None = None) -> NDArray[np.float32]:
+        """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
+        return self._read(f"depth/{method}", frame)
+
+    def _read(self, name: str, frame: int | None) -> NDArray[Any]:
+        if frame is not None and not 0 <= frame < self.frames:
+            raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
+        with read_hdf5(self.path, FORMAT) as file:
+            return file[name][... if frame is None else frame]
+
+    @staticmethod
+    @contextmanager
+    def create(path: str | Path) -> Iterator[FramesWriter]:
+        """A file to write frames to, part by part; at `path` it appears whole or not at all. Raises `FileError`."""
+        with write_hdf5(path) as file:
+            yield FramesWriter(file)
 
 
-def record_frames(
-    result: Result,
-    path: str | Path,
-    *,
-    pulses: int | None = None,
-    frames: int = 1,
-    seed: int,
-    methods: Sequence[Method] = METHODS,
-    undo_pile_up: bool = False,
-    tags: bool = False,
-    window: tuple[float, int] | None = None,
-    device: Any = None,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> Recording:
-    """Writes frames of counts that the camera would record, and their depth, to one HDF5 file, whole or not at all.
+class FramesWriter:
+    """Writes frames to an open file: `begin` once, then `add` for each part."""
 
-    Frames are drawn in parts, as `spadwarp.detect` draws them all: memory does not grow with their number.
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._written = 0
 
-    Args:
-        result: Of `spadwarp.simulate`; its scene says what camera it is.
-        path: The file.
-        pulses: Per frame; default: the detector's.
-        frames: ≥ 1.
-        seed: 64 bits.
-        methods: Estimators of depth, see `spadwarp.arrival_time`. Background and response are known to them.
-        undo_pile_up: Estimate from Coates' correction of the counts.
-        tags: Also keep every detection.
-        window: (start [s], bins) of the detector; default: the result's gate.
-        device: Warp device.
-        progress: Called with ("frames", done, frames).
+    def begin(
+        self, result: Result, part: Frames, *, frames: int, methods: Sequence[Method], **bound: NDArray[np.float64]
+    ) -> None:
+        """Writes everything but the frames, and reserves space for these.
 
-    Raises:
-        ArgumentError: An argument out of range.
-        FileError: The file cannot be written.
-    """
+        Args:
+            result: From which the counts were drawn.
+            part: The first frames; tags are kept if they have any.
+            frames: Number of all frames.
+            methods: Estimators of depth.
+            bound: `time` [s] and `depth` [m], Cramér–Rao bounds `[H, W]`.
+        """
+        file, scene = self._file, result.scene
+        file.attrs.update(_metadata(result, part, frames))
+        file.create_dataset("config", data=scene.to_toml())
+        file.create_dataset("edges", data=part.edges)
+        if part.irf.times is not None:
+            file.create_dataset("irf", data=np.array([part.irf.times, part.irf.values], np.float64))
+        for name, values in {"expected": part.expected, "background": part.background}.items():
+            file.create_dataset(name, data=values, **_PACKED)
+        file.create_dataset("truth/depth", data=result.truth.depth, **_PACKED)
+        for name, sigma in bound.items():
+            file.create_dataset(f"bound/{name}", data=sigma)
+        height, width, bins = part.expected.shape
+        columns = max(1, min(width, _CHUNK_BYTES // (4 * bins)))
+        lines = max(1, min(height, _CHUNK_BYTES // (4 * bins * columns)))
+        chunks = (1, lines, columns, bins)
+        file.create_dataset("counts", (frames, height, width, bins), np.int32, chunks=chunks, **_PACKED)
+        image: dict[str, Any] = {"shape": (frames, height, width), "chunks": (1, height, width), **_PACKED}
+        file.create_dataset("intensity", dtype=np.int64, **image)
+        for method in methods:
+            file.create_dataset(f"depth/{method}", dtype=np.float32, **image).attrs["unit"] = "m"
+        if part.tags is not None:
+            for name, kind in _TAGS.items():
+                file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(_TAG_CHUNK,), **_PACKED)
 
-    from spadwarp.frames.cramer_rao import crlb
+    def add(self, part: Frames, depth: dict[Method, NDArray[np.float64]]) -> None:
+        """Writes the next frames, and their depth by each estimator `[frames, H, W]` [m]."""
+        file, rows = self._file, slice(self._written, self._written + part.frames)
+        file["counts"][rows] = part.counts
+        file["intensity"][rows] = part.intensity
+        for method, frames in depth.items():
+            file[f"depth/{method}"][rows] = frames
+        if part.tags is not None:
+            for name, values in part.tags._asdict().items():
+                column = file[f"tags/{name}"]
+                before = column.shape[0]
+                column.resize((before + len(values),))
+                column[before:] = values
+        self._written = rows.stop
 
+
+def _metadata(result: Result, part: Frames, frames: int) -> dict[str, Any]:
     scene = result.scene
-    pulses = scene.detector.pulses if pulses is None else pulses
-    bins = scene.gate.bins if window is None else window[1]
-    part = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
-    options = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
-    bound_time = np.full(result.truth.depth.shape, np.nan)
-    if scene.laser.pulse_fwhm_ps or scene.detector.jitter_fwhm_ps or scene.detector.irf.lower().endswith(".csv"):
-        law: Any = "poisson" if scene.detector.mode == "free_running" else "first_photon"
-        bound_time = crlb(result, pulses=pulses, law=law, device=device)
-    bound_depth = bound_time * _depth_per_time(result)
-
-    first: Frames | None = None
-    depth: dict[Method, NDArray[np.float64]] = {}
-    errors: dict[Method, FrameErrors] = {}
-    detections = 0
-    with write_hdf5(path) as file:
-        for start in range(0, frames, part) if frames > 0 else (0,):
-            some = detect(result, frames=min(part, frames - start), first_frame=start, **options)
-            depths = {
-                method: depth_from_time(
-                    some.arrival_time(method, undo_pile_up=undo_pile_up, device=device), scene=scene
-                )
-                for method in methods
-            }
-            if first is None:
-                first = replace(some, counts=some.counts[:1].copy(), frames=1, tags=None)
-                depth = {method: frame[0] for method, frame in depths.items()}
-                errors = {method: _errors(frame, result) for method, frame in depths.items()}
-                _begin(file, result, some, frames, methods, tags)
-                for name, values in {"time": bound_time, "depth": bound_depth}.items():
-                    file.create_dataset(f"bound/{name}", data=values)
-            stop = start + some.frames
-            file["counts"][start:stop] = some.counts
-            file["intensity"][start:stop] = some.intensity
-            for method, frame in depths.items():
-                file[f"depth/{method}"][start:stop] = frame
-            if some.tags is not None:
-                _append(file["tags"], some.tags._asdict())
-            detections += int(some.intensity.sum())
-            if progress is not None:
-                progress("frames", stop, frames)
-    assert first is not None
-    return Recording(
-        path=Path(path),
-        first=first,
-        depth=depth,
-        errors=errors,
-        bound_time=bound_time,
-        bound_depth=bound_depth,
-        detections=detections,
-        notes=first.notes,
-    )
-
-
-def _depth_per_time(result: Result) -> NDArray[np.float64]:
-    distance = result.truth.range.astype(np.float64)
-    view = pixel_directions(result.scene.camera)
-    return depth_per_time(result.scene, view.reshape(-1, 3), distance.reshape(-1)).reshape(distance.shape)
-
-
-def _errors(depth: NDArray[np.float64], result: Result) -> FrameErrors:
-    truth = result.truth.depth
-    targets = np.isfinite(truth)
-    error = np.abs(depth - truth)[:, targets]
-    known = error[np.isfinite(error)]
-    middle, high = np.quantile(known, (0.5, 0.9)) if known.size else (np.nan, np.nan)
-    fraction = known.size / error.size if error.size else 0.0
-    return FrameErrors(estimate_fraction=fraction, median=float(middle), p90=float(high))
-
-
-# HDF5
-
-
-def _begin(file: Any, result: Result, some: Frames, frames: int, methods: Sequence[Method], tags: bool) -> None:
-    """Everything but the frames, and room for them."""
-    scene = result.scene
-    _, height, width, bins = some.counts.shape
-    file.attrs.update(
-        {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "read_me": _READ_ME,
-            "pulses": some.pulses,
-            "frames": frames,
-            "seed": str(some.seed),
-            "gate_start": some.gate_start,
-            "bin_width": some.bin_width,
-            "period": np.inf if some.period is None else some.period,
-            "group_index": scene.medium.group_index,
-            "laser_position": scene.beam.position,
-            "pixel_tangent": scene.camera.pixel_tangent,
-            **camera_attributes(scene.camera),
-            "irf_sigma": some.irf.sigma,
-            "irf_tail": some.irf.tail,
-            "notes": list(some.notes),
-            "source": str(scene.source or ""),
-            "photons": result.photons,
-        }
-    )
-    file.create_dataset("config", data=scene.to_toml())
-    file.create_dataset("edges", data=some.edges)
-    if some.irf.times is not None:
-        file.create_dataset("irf", data=np.array([some.irf.times, some.irf.values], np.float64))
-    packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    file.create_dataset("expected", data=some.expected, **packed)
-    file.create_dataset("background", data=some.background, **packed)
-    file.create_dataset("truth/depth", data=result.truth.depth, **packed)
-    columns = max(1, min(width, _CHUNK_BYTES // (4 * bins)))
-    lines = max(1, min(height, _CHUNK_BYTES // (4 * bins * columns)))
-    file.create_dataset("counts", (frames, height, width, bins), np.int32, chunks=(1, lines, columns, bins), **packed)
-    image = {"shape": (frames, height, width), "chunks": (1, height, width), **packed}
-    file.create_dataset("intensity", dtype=np.int64, **image)
-    for method in methods:
-        file.create_dataset(f"depth/{method}", dtype=np.float32, **image).attrs["unit"] = "m"
-    if tags:
-        for name, kind in {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}.items():
-            file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(_TAG_CHUNK,), **packed)
-
-
-def _append(group: Any, columns: dict[str, NDArray[Any]]) -> None:
-    for name, values in columns.items():
-        column = group[name]
-        before = column.shape[0]
-        column.resize((before + len(values),))
-        column[before:] = values
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "read_me": _READ_ME,
+        "pulses": part.pulses,
+        "frames": frames,
+        "seed": str(part.seed),
+        "gate_start": part.gate_start,
+        "bin_width": part.bin_width,
+        "period": np.inf if part.period is None else part.period,
+        "group_index": scene.medium.group_index,
+        "laser_position": scene.beam.position,
+        "pixel_tangent": scene.camera.pixel_tangent,
+        **camera_attributes(scene.camera),
+        "irf_sigma": part.irf.sigma,
+        "irf_tail": part.irf.tail,
+        "notes": list(part.notes),
+        "source": str(scene.source or ""),
+        "photons": result.photons,
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
+from spadwarp.result.file import load_result
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -24,11 +27,11 @@ ENDINGS = (".h5", ".npy", ".mat", ".ptu")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Histograms:
-    """Histograms with what the file tells about them.
+    """Histograms with what the file knows about them.
 
     Attributes:
         values: `[H, W, T]` or `[frames, H, W, T]`, not negative.
-        bin_width: [s]; None where the file does not tell.
+        bin_width: [s]; None where the file does not hold it.
         gate_start: Time of flight at the lower edge of bin 0 [s].
         background: Expected background in the unit of `values`, of a shape that `arrival_time` takes, or None.
         irf: The response that the histograms contain; None: unknown, or none.
@@ -46,7 +49,7 @@ class Histograms:
 
 
 def read_histograms(path: str | Path, *, variable: str | None = None) -> Histograms:
-    """Reads histograms, of the kind that the file's ending says.
+    """Reads histograms; the ending of the file says which kind of file it is.
 
     `.h5`: a result or frames of spadwarp. `.npy`: `[H, W, T]` or `[frames, H, W, T]`. `.mat`: such an array in a file
     of MATLAB, version 7.3 included. `.ptu`: a T3 image of PicoQuant, frames and channels added up; its bins count from
@@ -63,19 +66,27 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
     path = Path(path)
     if not path.is_file():
         raise FileError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
-    readers = {".h5": _read_own, ".npy": _read_npy, ".mat": _read_mat, ".ptu": _read_ptu}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
+    readers: dict[str, Callable[[Path], Histograms]] = {
+        ".h5": _read_own,
+        ".npy": lambda path: Histograms(values=np.load(path, allow_pickle=False)),
+        ".mat": lambda path: _read_mat(path, variable),
+        ".ptu": _read_ptu,
+    }
+    if path.suffix.lower() not in readers:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
     try:
-        read = _read_mat(path, variable) if reader is _read_mat else reader(path)
+        read = readers[path.suffix.lower()](path)
     except SpadwarpError:
         raise
     except ImportError as error:
         raise FileError(f"{path}: reading it needs {error.name}: pip install 'spadwarp[formats]'") from error
     except Exception as error:  # what a reader raises depends on the format
         raise FileError(f"{path}: damaged or not readable: {error}") from error
-    values = read.values
+    _check(read.values, path)
+    return read
+
+
+def _check(values: NDArray[Any], path: Path) -> None:
     if values.ndim not in (3, 4) or values.size == 0 or values.dtype.kind not in "biuf":
         raise FileError(
             f"{path}: {values.dtype} {values.shape}; real numbers [H, W, T] or [frames, H, W, T] are needed"
@@ -84,20 +95,20 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
         raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
-    return read
 
 
 def _read_own(path: Path) -> Histograms:
-    import h5py
-
-    from spadwarp.result.file import load_result
-
-    if not h5py.is_hdf5(path):
-        raise FileError(f"{path}: not an HDF5 file")
-    with h5py.File(path, "r") as file:
-        kind = file.attrs.get("format")
-    if kind == "spadwarp frames":
-        return _read_frames(path)
+    if is_frames_file(path):
+        file = FramesFile.load(path)
+        return Histograms(
+            values=file.counts(),
+            bin_width=file.bin_width,
+            gate_start=file.gate_start,
+            background=None if file.background is None else file.background * np.float32(file.pulses),
+            irf=file.irf,
+            response=file.irf,
+            scene=file.scene,
+        )
     result = load_result(path)
     scene = result.scene
     return Histograms(
@@ -110,49 +121,13 @@ def _read_own(path: Path) -> Histograms:
     )
 
 
-def _read_frames(path: Path) -> Histograms:
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        about, irf = file.attrs, frames_response(file)
-        return Histograms(
-            values=file["counts"][...],
-            bin_width=float(about["bin_width"]),
-            gate_start=float(about["gate_start"]),
-            background=file["background"][...] * np.float32(about["pulses"]),
-            irf=irf,
-            response=irf,
-            scene=frames_scene(file),
-        )
-
-
-def frames_scene(file: Any) -> Scene:
-    """The scene in an open file of frames."""
-    import tomllib
-
-    from spadwarp.scene import Scene
-
-    return Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs["source"] or None)
-
-
-def frames_response(file: Any) -> InstrumentResponse:
-    """The instrument response in an open file of frames."""
-    if "irf" in file:
-        return InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
-    return InstrumentResponse(sigma=float(file.attrs["irf_sigma"]), tail=float(file.attrs["irf_tail"]))
-
-
-def _read_npy(path: Path) -> Histograms:
-    return Histograms(values=np.load(path, allow_pickle=False))
-
-
-def _read_mat(path: Path, variable: str | None = None) -> Histograms:
+def _read_mat(path: Path, variable: str | None) -> Histograms:
     import h5py
 
     if h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:
             # MATLAB lays arrays out column by column: to others their dimensions are reversed.
-            shapes = {name: one.shape[::-1] for name, one in file.items() if isinstance(one, h5py.Dataset)}
+            shapes = {name: item.shape[::-1] for name, item in file.items() if isinstance(item, h5py.Dataset)}
             return Histograms(values=file[_chosen(path, shapes, variable)][...].T)
     from scipy.io import loadmat, whosmat
 

@@ -13,8 +13,8 @@ from spadwarp.viz.result import image_panels, show_image, shown_limits
 
 if TYPE_CHECKING:
     from spadwarp.analytic.model import AnalyticResult
-    from spadwarp.frames.file import Recording
     from spadwarp.frames.frames import Frames
+    from spadwarp.frames.record import Recording
     from spadwarp.result.result import Result
 
 __all__ = ["draw_analytic", "draw_depth", "draw_recording", "expected_counts"]

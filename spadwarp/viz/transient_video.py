@@ -72,21 +72,16 @@ def video(
 
 def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
-    import h5py
-
-    from spadwarp.frames.measured import frames_scene
-    from spadwarp.viz.viewer import find_run, holds_frames
+    from spadwarp.frames.file import FramesFile, is_frames_file
+    from spadwarp.viz.viewer import find_run
 
     if not isinstance(source, Result):
         place = find_run(source)
-        if holds_frames(place):
-            with h5py.File(place, "r") as file:
-                count = file["counts"].shape[0]
-                if not 0 <= frame < count:
-                    raise ArgumentError(f"frame = {frame} is outside [0, {count}), the frames of {place}")
-                edges = 1e9 * (float(file.attrs["gate_start"]) + file["edges"][...])
-                speed = frames_scene(file).medium.pulse_speed
-                return file["counts"][frame].astype(np.float64), edges, "counts per pixel", 1e-9 * speed
+        if is_frames_file(place):
+            file = FramesFile.load(place)
+            edges = 1e9 * (file.gate_start + file.edges)
+            counts = file.counts(frame).astype(np.float64)
+            return counts, edges, "counts per pixel", 1e-9 * file.scene.medium.pulse_speed
         source = load_result(place)
     return source.detections, 1e9 * source.bin_edges, "detections per pulse, pixel", 1e-9 * source.pulse_speed
 

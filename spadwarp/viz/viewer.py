@@ -19,6 +19,7 @@ from spadwarp.scene.geometry import path_from_range, pixel_directions, range_fro
 from spadwarp.viz.pages import write_page
 
 if TYPE_CHECKING:
+    from spadwarp.frames.file import FramesFile
     from spadwarp.frames.response import InstrumentResponse
     from spadwarp.scene import Scene
 
@@ -113,23 +114,12 @@ def find_run(place: str | Path) -> Path:
 
 
 def _of_file(place: str | Path, method: str | None, frame: int, device: Any) -> _Page:
-    import h5py
+    from spadwarp.frames.file import FramesFile, is_frames_file
 
     path = find_run(place)
-    if holds_frames(path):
-        with h5py.File(path, "r") as file:
-            return _of_frames(file, path, method, frame)
+    if is_frames_file(path):
+        return _of_frames(FramesFile.load(path), method, frame)
     return _of_result(load_result(path), method, device)
-
-
-def holds_frames(path: Path) -> bool:
-    """Whether a file holds frames of a camera."""
-    import h5py
-
-    if not (path.is_file() and h5py.is_hdf5(path)):
-        return False
-    with h5py.File(path, "r") as file:
-        return bool(file.attrs.get("format") == "spadwarp frames")
 
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
@@ -163,39 +153,34 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     )
 
 
-def _of_frames(file: Any, path: Path, method: str | None, frame: int) -> _Page:
-    from spadwarp.frames.measured import frames_response, frames_scene
-
-    about, methods = file.attrs, list(file["depth"])
-    frames = file["counts"].shape[0]
-    if not 0 <= frame < frames:
-        raise ArgumentError(f"frame = {frame} is outside [0, {frames}), the frames of {path}")
-    if method is not None and method not in methods:
-        raise ArgumentError(f"method = {method!r} is not one of {', '.join(methods)}, which {path} holds")
-    chosen = method or next(name for name in ("likelihood", "matched", "centroid", "peak") if name in methods)
-    scene, pulses = frames_scene(file), int(about["pulses"])
-    counts, expected = file["counts"][frame], file["expected"][...]
-    background = np.broadcast_to(file["background"][...], counts.shape)
-    said = f"{pulses:,}".replace(",", " ")
+def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
+    if method is not None and method not in file.methods:
+        raise ArgumentError(f"method = {method!r} is not one of {', '.join(file.methods)}, which {file.path} holds")
+    counts = file.counts(frame)
+    if file.expected is None or file.background is None or file.best_method is None:
+        raise FileError(f"{file.path}: without expected counts and depth there is nothing to compare")
+    chosen: Any = method or file.best_method
+    background = np.broadcast_to(file.background, counts.shape)
+    pulses = f"{file.pulses:,}".replace(",", " ")
     return _Page(
-        title=_name(scene),
-        caption=f"frame {frame} of {frames}: {said} pulses, {scene.detector.mode.replace('_', '-')}, seed"
-        f" {about['seed']}; expectations before pile-up",
-        scene=scene,
-        depth=file[f"depth/{chosen}"][frame].astype(np.float64),
+        title=_name(file.scene),
+        caption=f"frame {frame} of {file.frames}: {pulses} pulses, {file.scene.detector.mode.replace('_', '-')}, seed"
+        f" {file.seed}; expectations before pile-up",
+        scene=file.scene,
+        depth=file.depth(chosen, frame).astype(np.float64),
         method=chosen,
-        truth=file["truth/depth"][...].astype(np.float64),
+        truth=file.truth_depth.astype(np.float64),
         reflectance=None,
-        intensity=file["intensity"][frame].astype(np.float64),
+        intensity=file.intensity(frame).astype(np.float64),
         intensity_label="counts in the frame",
         layers=[
             _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
-            _Layer(label="expected", colour="#0072B2", cube=expected, factor=pulses),
-            _Layer(label="of that, background", colour="#009E73", cube=background, factor=pulses),
+            _Layer(label="expected", colour="#0072B2", cube=file.expected, factor=file.pulses),
+            _Layer(label="of that, background", colour="#009E73", cube=background, factor=file.pulses),
         ],
-        edges=float(about["gate_start"]) + file["edges"][...],
+        edges=file.gate_start + file.edges,
         unit="counts per bin",
-        response=frames_response(file),
+        response=file.irf,
     )
 
 

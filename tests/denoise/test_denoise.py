@@ -24,7 +24,7 @@ from spadwarp.denoise import baselines, inference, metrics
 from spadwarp.denoise import files as depth_files
 from spadwarp.denoise import photon_counts as photons
 from spadwarp.denoise.frames import depth_frames, fill_missing
-from spadwarp.frames.file import record_frames
+from spadwarp.frames import record_frames
 from spadwarp.io.exr import write_exr
 
 torch.set_num_threads(1)

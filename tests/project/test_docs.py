@@ -220,7 +220,7 @@ def test_ballistic_light_of_the_figure_is_the_analytic_signal():
 
 def test_formats_page_names_everything_in_the_files(tmp_path):
     """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
-    from spadwarp.frames.file import record_frames
+    from spadwarp.frames import record_frames
     from spadwarp.transport.records import save_records
 
     scene = make_scene(transport={"photons": 2000, "seed": 1})

@@ -10,7 +10,7 @@ import spadwarp
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.cli import app
 from spadwarp.errors import FileError
-from spadwarp.frames.file import record_frames
+from spadwarp.frames import record_frames
 from spadwarp.frames.measured import read_histograms
 from spadwarp.units import SPEED_OF_LIGHT
 

@@ -17,7 +17,7 @@ from helpers.headless import BROWSER, Browser
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.cli import app
 from spadwarp.errors import FileError
-from spadwarp.frames.file import record_frames
+from spadwarp.frames import record_frames
 from spadwarp.result.file import save_result
 from spadwarp.result.result import COMPONENTS
 from spadwarp.viz import viewer

@@ -1,0 +1,157 @@
+"""Frames drawn part by part into a file, with their depth and the bound that no estimator can beat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.frames.arrival_time import METHODS, Method
+from spadwarp.frames.cramer_rao import crlb
+from spadwarp.frames.file import FramesFile
+from spadwarp.frames.frames import Frames
+from spadwarp.frames.response import detector_response
+from spadwarp.frames.spad import detect
+from spadwarp.result.result import Result
+from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
+
+__all__ = ["FrameErrors", "Recording", "record_frames"]
+
+_PART_BYTES = 1 << 28  # of counts that are held at a time
+
+Map = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameErrors:
+    """How far the depth frames of one estimator are from the truth, over all pixels and frames that have both.
+
+    Attributes:
+        estimate_fraction: Estimates over pixels with a target.
+        median: Median absolute error [m].
+        p90: 90th percentile of the absolute errors [m].
+    """
+
+    estimate_fraction: float
+    median: float
+    p90: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """Summary of what `record_frames` wrote.
+
+    Attributes:
+        path: The file.
+        first: The first frame, its counts `[1, H, W, T]`.
+        depth: First frame by each estimator, float64 `[H, W]` [m].
+        errors: By estimator; of at most the first 256 MiB of counts.
+        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m].
+        detections: Counts of all frames.
+        notes: What the simulation could not give, in words.
+    """
+
+    path: Path
+    first: Frames
+    depth: dict[Method, Map]
+    errors: dict[Method, FrameErrors]
+    bound_time: Map
+    bound_depth: Map
+    detections: int
+    notes: tuple[str, ...]
+
+
+def record_frames(
+    result: Result,
+    path: str | Path,
+    *,
+    pulses: int | None = None,
+    frames: int = 1,
+    seed: int,
+    methods: Sequence[Method] = METHODS,
+    undo_pile_up: bool = False,
+    tags: bool = False,
+    window: tuple[float, int] | None = None,
+    device: Any = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Recording:
+    """Writes frames of counts that the camera would record, and their depth, to one HDF5 file, whole or not at all.
+
+    Frames are drawn in parts, the same as `spadwarp.detect` draws: memory does not grow with their number.
+
+    Args:
+        result: Of `spadwarp.simulate`; its scene has the camera.
+        path: The file.
+        pulses: Per frame; default: the detector's.
+        frames: ≥ 1.
+        seed: 64 bits.
+        methods: Estimators of depth, see `spadwarp.arrival_time`. They know background and response.
+        undo_pile_up: Estimate from Coates' correction of the counts.
+        tags: Also keep every detection.
+        window: (start [s], bins) of the detector; default: the result's gate.
+        device: Warp device.
+        progress: Called with ("frames", done, frames).
+
+    Raises:
+        ArgumentError: An argument out of range.
+        FileError: The file cannot be written.
+    """
+    scene = result.scene
+    pulses = scene.detector.pulses if pulses is None else pulses
+    bins = scene.gate.bins if window is None else window[1]
+    size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
+    options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
+    bound_time, bound_depth = _bounds(result, pulses, device)
+    recording: Recording | None = None
+    detections = 0
+    with FramesFile.create(path) as file:
+        for start in range(0, frames, size) if frames > 0 else (0,):
+            count = min(size, frames - start)
+            part = detect(result, frames=count, first_frame=start, **options)
+            depth: dict[Method, Map] = {}
+            for method in methods:
+                time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
+                depth[method] = depth_from_time(time, scene=scene)
+            if recording is None:
+                file.begin(result, part, frames=frames, methods=methods, time=bound_time, depth=bound_depth)
+                recording = Recording(
+                    path=Path(path),
+                    first=replace(part, counts=part.counts[:1].copy(), frames=1, tags=None),
+                    depth={method: found[0] for method, found in depth.items()},
+                    errors={method: _errors(found, result.truth.depth) for method, found in depth.items()},
+                    bound_time=bound_time,
+                    bound_depth=bound_depth,
+                    detections=0,
+                    notes=part.notes,
+                )
+            file.add(part, depth)
+            detections += int(part.intensity.sum())
+            if progress is not None:
+                progress("frames", start + part.frames, frames)
+    assert recording is not None
+    return replace(recording, detections=detections)
+
+
+def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map]:
+    """Cramér–Rao bounds of one frame [s], [m]; NaN for a response without a derivative."""
+    scene, distance = result.scene, result.truth.range.astype(np.float64)
+    bound = np.full(distance.shape, np.nan)
+    if detector_response(scene.detector, scene.laser).is_smooth:
+        law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
+        bound = crlb(result, pulses=pulses, law=law, device=device)
+    view = pixel_directions(scene.camera)
+    per_time = depth_per_time(scene, view.reshape(-1, 3), distance.reshape(-1)).reshape(distance.shape)
+    return bound, bound * per_time
+
+
+def _errors(depth: Map, truth: NDArray[np.float32]) -> FrameErrors:
+    targets = np.isfinite(truth)
+    error = np.abs(depth - truth)[:, targets]
+    known = error[np.isfinite(error)]
+    middle, high = np.quantile(known, (0.5, 0.9)) if known.size else (np.nan, np.nan)
+    fraction = known.size / error.size if error.size else 0.0
+    return FrameErrors(estimate_fraction=fraction, median=float(middle), p90=float(high))
