@@ -60,8 +60,6 @@ _HOMES = {
     "video": "viz.transient_video",
     "to_torch": "result",
     "TorchResult": "result",
-    "evaluate": "denoise.evaluation",
-    "train": "denoise.training_run",
     "load_recipe": "dataset.recipe",
     "Recipe": "dataset.recipe",
     "make_dataset": "dataset.make",
@@ -77,6 +75,9 @@ _HOMES = {
     "MeshError": "errors",
 }
 
+_ROOMS = {"analytic", "benchmark", "checks", "dataset", "denoise", "doctor", "frames", "mesh", "parallel"}
+_ROOMS |= {"result", "run", "scene", "transport", "validate", "viz", "water"}
+
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
@@ -87,8 +88,6 @@ if TYPE_CHECKING:
     from spadwarp.dataset.make import make_dataset, verify_dataset
     from spadwarp.dataset.read import FrameReader, SpadDataset, iterate_dataset
     from spadwarp.dataset.recipe import Recipe, load_recipe
-    from spadwarp.denoise.evaluation import evaluate
-    from spadwarp.denoise.training_run import train
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
@@ -118,6 +117,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"spadwarp.{_HOMES[name]}"), name)
+    if name in _ROOMS:
+        return import_module(f"spadwarp.{name}")
     raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
 
 

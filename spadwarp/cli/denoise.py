@@ -98,7 +98,7 @@ def denoise(
     """
     import numpy as np
 
-    from spadwarp.denoise.files import denoise_file, depth_files
+    from spadwarp.denoise import denoise_file, depth_files
 
     if path.is_dir() and (path / "result.h5").is_file():
         path = path / "result.h5"
@@ -215,8 +215,8 @@ def evaluate(
     """
     from rich.table import Table
 
-    from spadwarp.denoise.evaluation import evaluate as run
-    from spadwarp.viz.evaluation import TITLES, write_report
+    from spadwarp.denoise import TITLES, write_report
+    from spadwarp.denoise import evaluate as run
 
     chosen = ["median", "gating", "usdn", "dncnn", "pyramid"] if models == "all" else models.split(",")
     chosen = [name.strip() for name in chosen]
@@ -250,14 +250,14 @@ def evaluate(
         )
     written = write_report(found, report) if report is not None else []
     if not quiet:
-        table = Table("method", *(f"BS {level}" if "photons" not in level else level for level in found.levels), "mean")
+        table = Table("method", *found.levels, "mean")
         for method in found.ranking():
             gains = []
             for level in (*found.levels, None):
                 one, before = found.mean(method, level=level), found.mean("input", level=level)
                 gains.append(f"{one.psnr:.2f}" if method == "input" else f"{one.psnr - before.psnr:+.2f}")
             table.add_row(TITLES[method], *gains)
-        say(f"PSNR of the input, and gain over it [dB]; {found.about}")
+        say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
         show_table(table)
         if found.steps:
             steps = {
@@ -290,8 +290,7 @@ def _sweep(
     """Frames of few photons from a result."""
     from rich.table import Table
 
-    from spadwarp.denoise.photon_counts import draw_photon_sweep, photon_sweep
-    from spadwarp.viz.evaluation import TITLES
+    from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
 
     result = load_run(data)
     with arguments_checked(), progress(quiet=quiet, unit="frames") as told:
@@ -305,7 +304,7 @@ def _sweep(
         )
     written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
     if not quiet:
-        say(f"RMSE [mm]; {found.about}")
+        say(f"RMSE [mm]; {found.summary}")
         for row, ratio in enumerate(found.sbr):
             table = Table(f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons))
             for name, values in found.rmse.items():
@@ -345,8 +344,8 @@ def train(
       spadwarp dataset make configs/datasets/training.toml --out data/training/
       spadwarp train configs/training/pyramid.toml --out runs/pyramid/
     """
-    from spadwarp.denoise.recipe import load_training_recipe
-    from spadwarp.denoise.training_run import train as run
+    from spadwarp.denoise import load_training_recipe
+    from spadwarp.denoise import train as run
 
     changes: dict[str, Any] = {}
     if data is not None:

@@ -1,8 +1,7 @@
-"""What networks are compared with: median, backscatter gating, BM3D."""
+"""Baselines that networks are compared with: median, backscatter gating, BM3D."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from spadwarp.denoise.frames import DepthFrames, fill_missing
 from spadwarp.errors import SpadwarpError
 
-__all__ = ["BASELINES", "MEDIAN_WINDOWS", "bm3d_filter", "gated_filter", "median_filter"]
+__all__ = ["BASELINES", "MEDIAN_WINDOWS", "bm3d_filter", "gated_filter", "median_filter", "unfiltered"]
 
 Frames = NDArray[np.float32]
 
@@ -19,20 +18,26 @@ MEDIAN_WINDOWS = (3, 5, 7, 9, 11)
 """Sides of the median's window that are tried [pixels]."""
 
 
+def unfiltered(frames: DepthFrames) -> Frames:
+    """The frames as they are, `[N, H, W]` [m]; a pixel without a depth counts as one in the middle of the gate."""
+    return np.nan_to_num(frames.depth, nan=frames.gate_middle)
+
+
 def median_filter(frames: DepthFrames, *, window: int = 5) -> Frames:
     """Median of `window` × `window` pixels, `[N, H, W]` [m]; pixels without a depth take that of their nearest."""
     from scipy.ndimage import median_filter as filtered
 
-    middle = 0.5 * sum(frames.gate)
-    return np.stack([filtered(fill_missing(one, middle), window, mode="nearest") for one in frames.depth])
+    return np.stack(
+        [filtered(fill_missing(depth, frames.gate_middle), window, mode="nearest") for depth in frames.depth]
+    )
 
 
 def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
     """Backscatter gating: keep depths where a frame has more of them than the water explains, `[N, H, W]` [m].
 
-    The histogram of a frame's depths is compared with the backscatter's density, scaled to what arrives in the nearest
-    part of the gate that holds a tenth of it. Where 99 % of the significant excess lies is the target's gate; what lies
-    outside is replaced by the nearest pixel inside, and a small median follows.
+    The histogram of a frame's depths is compared with the backscatter's density, scaled to the depths in the nearest
+    part of the gate that holds a tenth of that density. The target's gate is where 99 % of the significant excess lies;
+    depths outside it are replaced by the nearest pixel inside, and a small median follows.
     """
     from scipy.ndimage import median_filter as filtered
 
@@ -40,11 +45,11 @@ def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
     out = np.empty_like(frames.depth)
     for index, (depth, scaled, density) in enumerate(zip(frames.depth, frames.scaled, frames.density, strict=True)):
         with np.errstate(invalid="ignore"):
-            there = (scaled >= 0) & (scaled < 1)
-        place = (scaled[there] * bins).astype(np.int64)
+            valid = (scaled >= 0) & (scaled < 1)
+        place = (scaled[valid] * bins).astype(np.int64)
         counts = np.bincount(place, minlength=bins).astype(np.float64)
         # Mean density of the depths in each bin; empty bins take that of the last one before.
-        level = np.bincount(place, density[there], minlength=bins) / np.maximum(counts, 1)
+        level = np.bincount(place, density[valid], minlength=bins) / np.maximum(counts, 1)
         filled = np.where(counts > 0, np.arange(bins), 0)
         level = np.maximum(level[np.maximum.accumulate(filled)], 1e-3)
         near = max(3, int(np.searchsorted(np.cumsum(level), 0.1 * level.sum())))
@@ -56,15 +61,15 @@ def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
             with np.errstate(invalid="ignore"):
                 outside = (scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)
             depth = np.where(outside, np.float32(np.nan), depth)
-        out[index] = filtered(fill_missing(depth, 0.5 * sum(frames.gate)), window, mode="nearest")
+        out[index] = filtered(fill_missing(depth, frames.gate_middle), window, mode="nearest")
     return out
 
 
 def bm3d_filter(frames: DepthFrames) -> Frames:
-    """BM3D of the package `bmnd` with the noise that makes its result smoothest known: of the frame's own deviation.
+    """BM3D by the package `bmnd`, with a noise deviation σ taken from each frame, `[N, H, W]` [m].
 
-    Dabov et al., IEEE TIP 16, 2080 (2007). σ is that of white noise with the power of what is replaced: the root mean
-    square of the differences from the 5 × 5 median. `[N, H, W]` [m]; seconds to a minute a frame.
+    Dabov et al., IEEE TIP 16, 2080 (2007). σ is the root mean square of the differences from the 5 × 5 median: that of
+    white noise with the power of what is to be removed. Takes seconds to a minute a frame.
 
     Raises `SpadwarpError` where `bmnd` is not installed.
     """
@@ -77,7 +82,7 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
     smooth = median_filter(frames, window=5)
     out = np.empty_like(frames.depth)
     for index, depth in enumerate(frames.depth):
-        image = (fill_missing(depth, 0.5 * (start + stop)) - start) / (stop - start)
+        image = (fill_missing(depth, frames.gate_middle) - start) / (stop - start)
         sigma = float(np.sqrt(np.mean((image - (smooth[index] - start) / (stop - start)) ** 2)))
         if sigma > 1e-4:
             image = np.asarray(bmnd(image.astype(np.float32), BM3DProfile(), sigma=sigma), np.float32)
@@ -85,13 +90,8 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
     return out
 
 
-def _input(frames: DepthFrames) -> Frames:
-    """The frames as they are; a pixel without a depth counts as one in the middle of the gate."""
-    return np.nan_to_num(frames.depth, nan=0.5 * math.fsum(frames.gate))
-
-
 BASELINES: dict[str, Callable[[DepthFrames], Frames]] = {
-    "input": _input,
+    "input": unfiltered,
     "median": median_filter,
     "gating": gated_filter,
     "bm3d": bm3d_filter,

@@ -1,4 +1,4 @@
-"""`spadwarp evaluate`: every method on the same frames of a dataset, and who wins."""
+"""Comparison of denoisers: scores of every method on the same frames of a dataset."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +23,17 @@ from spadwarp.errors import ArgumentError, FileError
 
 __all__ = ["Evaluation", "Sample", "evaluate"]
 
-_PHOTON_EDGES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)  # where a dataset has photon rates instead of shares
+_PHOTON_EDGES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)  # levels of datasets that have no backscatter fractions
 _STAIRCASE = "staircase"
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One frame and what the methods make of it, depth `[H, W]` [m] by method; and what it shows, in words."""
+class Sample(NamedTuple):
+    """One frame: true depth `[H, W]` [m], gate [m], depth by method `[H, W]` [m], and a caption."""
 
     clean: NDArray[np.float32]
     gate: tuple[float, float]
     images: dict[str, NDArray[np.float32]]
-    about: str
+    caption: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,9 +41,10 @@ class Evaluation:
     """Scores of methods on a dataset.
 
     Attributes:
-        data: The dataset's name and folder. about: Photons, water, backscatter and seed of the frames, in words.
-        methods, targets, levels: In the order of the tables; `"input"` is the first method. A level is a share of
-            backscatter pixels, or a range of photon counts.
+        data: The dataset's name and folder.
+        summary: Photons, water, backscatter and seed of the frames, as text.
+        methods, targets, levels: In the order of the tables; `"input"` is the first method. A level is a backscatter
+            fraction, the part of the pixels that report backscatter, or a range of photon counts.
         scores: Mean over frames, by (method, target, level).
         frames: Number of frames, by (target, level).
         windows: Side of the median that has the highest PSNR, by level [pixels].
@@ -53,7 +53,7 @@ class Evaluation:
     """
 
     data: str
-    about: str
+    summary: str
     methods: tuple[str, ...]
     targets: tuple[str, ...]
     levels: tuple[str, ...]
@@ -65,40 +65,39 @@ class Evaluation:
 
     def mean(self, method: str, *, level: str | None = None, target: str | None = None) -> Scores:
         """Mean over targets and levels, or over those of one level or target; each counts once."""
-        chosen = [
-            one
-            for (name, subject, at), one in self.scores.items()
-            if name == method and level in (None, at) and target in (None, subject)
-        ]
-        return Scores.mean(chosen)
+        return Scores.mean(
+            [
+                scores
+                for (name, subject, at), scores in self.scores.items()
+                if name == method and level in (None, at) and target in (None, subject)
+            ]
+        )
 
     def ranking(self) -> list[str]:
         """Methods by mean rank over all scores that can be ranked, best first."""
-        ranks = {method: 0.0 for method in self.methods}
-        for field, larger in LARGER_IS_BETTER.items():
-            values = {method: getattr(self.mean(method), field) for method in self.methods}
-            for place, method in enumerate(sorted(values, key=lambda one: values[one], reverse=larger)):
-                ranks[method] += place
-        return sorted(self.methods, key=lambda one: ranks[one])
+        ranks = dict.fromkeys(self.methods, 0)
+        for name, larger in LARGER_IS_BETTER.items():
+            values = {method: getattr(self.mean(method), name) for method in self.methods}
+            for rank, method in enumerate(sorted(values, key=lambda method: values[method], reverse=larger)):
+                ranks[method] += rank
+        return sorted(self.methods, key=lambda method: ranks[method])
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names, for JSON."""
-        rows = [
-            {"method": method, "target": target, "level": level, **dataclasses.asdict(one)}
-            for (method, target, level), one in self.scores.items()
-        ]
-        steps = [
-            {"method": method, "level": level, "total": one.total, "resolved": one.resolved}
-            for (method, level), one in self.steps.items()
-        ]
         return {
             "data": self.data,
-            "about": self.about,
+            "summary": self.summary,
             "ranking": self.ranking(),
             "median_windows": self.windows,
             "frames": [{"target": target, "level": level, "frames": n} for (target, level), n in self.frames.items()],
-            "steps": steps,
-            "scores": rows,
+            "steps": [
+                {"method": method, "level": level, **dataclasses.asdict(steps)}
+                for (method, level), steps in self.steps.items()
+            ],
+            "scores": [
+                {"method": method, "target": target, "level": level, **dataclasses.asdict(scores)}
+                for (method, target, level), scores in self.scores.items()
+            ],
         }
 
 
@@ -118,108 +117,109 @@ def evaluate(
 
     Args:
         data: The dataset's folder.
-        models: From `spadwarp.denoise.inference.METHODS`.
+        models: From `spadwarp.denoise.METHODS`.
         split: "test", "validation", "train" or "all".
         frames: Of each target and level, at most; the same for each method.
-        bm3d_frames: Of each level for BM3D, which takes up to a minute a frame; 0 leaves it out.
-        crop: (width, height) of the middle part of each frame that methods see [pixels]; all of it if not given.
-        weights: File of `spadwarp train`, in place of the package's for the network that it names.
+        bm3d_frames: Of each level for BM3D, which takes up to a minute per frame; 0 leaves it out.
+        crop: (width, height) of the middle part of each frame that is used [pixels]; default: the whole frame.
+        weights: File of `spadwarp train`, replacing the package's weights of the network that it names.
         device: torch device of the networks.
         progress: Called with ("frames", done, total).
 
-    The median gets the window that does best at each level on these very frames; PSNR, SSIM and entropy are of depth
-    scaled to 8 bits over the gate, over the pixels that see a target. A pixel without an estimate counts as one in the
-    middle of the gate.
+    The median gets the window that has the highest PSNR at each level on these very frames. PSNR, SSIM and entropy are
+    of depth scaled to 8 bits over the gate, over the pixels that see a target. A pixel without an estimate counts as
+    one in the middle of the gate.
 
     Raises:
         ArgumentError: An argument out of range; weights of a network that is not among the models.
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
+    plan = _plan(data, models, split, frames, bm3d_frames, crop, weights)
+    windows = _best_windows(plan) if "median" in plan.methods else {}
+    tables = _Tables()
+    done, total = 0, sum(map(len, plan.chosen.values()))
+    for (target, level), indices in plan.chosen.items():
+        for index in indices:
+            _score_frame(plan, tables, index, target, level, windows.get(level, 5), device)
+            done += 1
+            if progress is not None:
+                progress("frames", done, total)
+    if not tables.scores:
+        raise FileError(f"{data}: no frame of {split} sees a target")
+    return Evaluation(
+        data=f"{plan.reader.manifest['name']} ({data})",
+        summary=plan.summary,
+        methods=plan.methods,
+        targets=tuple(dict.fromkeys(target for target, _ in tables.frames)),
+        levels=tuple(sorted(dict.fromkeys(level for _, level in tables.frames), key=_level_order)),
+        scores={key: Scores.mean(values) for key, values in tables.scores.items()},
+        frames=tables.frames,
+        windows=windows,
+        steps={key: steps for key, steps in tables.steps.items() if steps.total},
+        samples=tables.samples,
+    )
+
+
+# Plan
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Plan:
+    """What is evaluated: the methods, the frames by (target, level), and which part of each frame."""
+
+    methods: tuple[str, ...]
+    weights: dict[str, Path]
+    reader: FrameReader
+    chosen: dict[tuple[str, str], list[int]]
+    photons: NDArray[np.float64]  # signal photons of every scene
+    bm3d_quota: int  # frames of each target and level
+    part: tuple[slice, slice]
+    summary: str
+
+
+def _plan(
+    data: str | os.PathLike[str],
+    models: Sequence[str],
+    split: str,
+    frames: int,
+    bm3d_frames: int,
+    crop: tuple[int, int] | None,
+    weights: str | os.PathLike[str] | None,
+) -> _Plan:
     wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + (["bm3d"] if bm3d_frames > 0 else [])
-    if unknown := [name for name in (*models, *wanted) if name not in METHODS]:
+    if unknown := [name for name in models if name not in METHODS]:
         raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
     if "histograms" in wanted:
         raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
     if frames < 1:
         raise ArgumentError(f"frames = {frames} is outside [1, inf)")
     own = own_weights(wanted, None if weights is None else Path(weights))
-    chosen, photons, about = _chosen(data, split, frames)
+    chosen, photons, summary = _choose(data, split, frames)
     reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
-    names = list(reader.manifest["targets"])
-    methods = ("input", *wanted)
-    raw: dict[tuple[str, str, str], list[Scores]] = {}
-    medians: dict[tuple[str, int], list[float]] = {}
-    steps: dict[tuple[str, str], Steps] = {}
-    samples: dict[tuple[str, str], Sample] = {}
-    counts: dict[tuple[str, str], int] = {}
-    shape = reader[0]["noisy"].shape[-2:]
-    width, height = (shape[1], shape[0]) if crop is None else crop
-    if not (8 <= width <= shape[1] and 8 <= height <= shape[0]):
-        raise ArgumentError(f"crop = ({width}, {height}) is outside (8, 8) to ({shape[1]}, {shape[0]})")
-    top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
-    part = slice(top, top + height), slice(left, left + width)
+    rows, columns = reader.shape
+    width, height = crop or (columns, rows)
+    if not (8 <= width <= columns and 8 <= height <= rows):
+        raise ArgumentError(f"crop = ({width}, {height}) is outside (8, 8) to ({columns}, {rows})")
+    top, left = (rows - height) // 2, (columns - width) // 2
     if crop is not None:
-        about += f"; the middle {width} x {height} pixels of each frame"
-    windows = _best_windows(reader, part, chosen, medians) if "median" in wanted else {}
-
-    total, done = sum(map(len, chosen.values())), 0
-    quota = math.ceil(bm3d_frames / len({target for target, _ in chosen}))
-    for (target_index, level), indices in chosen.items():
-        target = names[target_index]
-        used = 0
-        for index in indices:
-            item = reader[index]
-            noisy, clean = _frame(item, part), _truth(item, part)
-            done += 1
-            if not _has_target(clean, noisy.gate):
-                continue
-            used += 1
-            images: dict[str, NDArray[np.float32]] = {}
-            for method in methods:
-                if method == "bm3d" and used > quota:
-                    continue
-                image = _estimate(noisy, method, windows.get(level, 5), own.get(method), device)
-                images[method] = image
-                raw.setdefault((method, target, level), []).append(score(clean, image, gate=noisy.gate))
-                if target == _STAIRCASE:
-                    one, so_far = staircase_steps(clean, image), steps.get((method, level), Steps(total=0, resolved=0))
-                    steps[method, level] = Steps(
-                        total=so_far.total + one.total, resolved=so_far.resolved + one.resolved
-                    )
-            if (target, level) not in samples:
-                text = f"{target}, BS {level}" if "photons" not in level else f"{target}, {level}"
-                scene = int(item["scene"])
-                text += f"; {photons[scene]:.3g} signal photons, {float(item['attenuation_lengths']):.2g} attenuation"
-                text += f" lengths one way, sample {int(item['sample'])}"
-                samples[target, level] = Sample(clean, noisy.gate, {**images, "input": noisy.depth[0]}, text)
-            if progress is not None:
-                progress("frames", done, total)
-        if used:
-            counts[target, level] = used
-    if not raw:
-        raise FileError(f"{data}: no frame of {split} sees a target")
-    return Evaluation(
-        data=f"{reader.manifest['name']} ({data})",
-        about=about + "".join(f"; {name} with weights {path}" for name, path in own.items()),
-        methods=methods,
-        targets=tuple(dict.fromkeys(target for target, _ in counts)),
-        levels=tuple(sorted(dict.fromkeys(level for _, level in counts), key=_level_order)),
-        scores={key: Scores.mean(values) for key, values in raw.items()},
-        frames=counts,
-        windows=windows,
-        steps={key: one for key, one in steps.items() if one.total},
-        samples=samples,
+        summary += f"; the middle {width} x {height} pixels of each frame"
+    return _Plan(
+        methods=("input", *wanted),
+        weights=own,
+        reader=reader,
+        chosen=chosen,
+        photons=photons,
+        bm3d_quota=math.ceil(bm3d_frames / len({target for target, _ in chosen})),
+        part=(slice(top, top + height), slice(left, left + width)),
+        summary=summary + "".join(f"; {name} with weights {path}" for name, path in own.items()),
     )
 
 
-# Parts
-
-
-def _chosen(
+def _choose(
     data: str | os.PathLike[str], split: str, frames: int
-) -> tuple[dict[tuple[int, str], list[int]], NDArray[np.float64], str]:
-    """Indices of frames by (target, level); signal photons of every scene; what they show, in words."""
+) -> tuple[dict[tuple[str, str], list[int]], NDArray[np.float64], str]:
+    """Indices of frames by (target, level); signal photons of every scene; what the frames show, as text."""
     import h5py
 
     reader = FrameReader(data, split, fields=())
@@ -227,14 +227,12 @@ def _chosen(
         raise FileError(f"{data}: no frames in {split}")
     with h5py.File(Path(data) / "scenes.h5") as file:
         photons = file["signal"][...] * file["pulses"][...]
-    order = np.random.Generator(np.random.Philox(0)).permutation(len(reader))
     chosen: dict[tuple[int, str], list[int]] = {}
-    lengths: list[float] = []
-    scenes: list[int] = []
-    for index in order:
+    lengths, scenes = [], []
+    for index in np.random.Generator(np.random.Philox(0)).permutation(len(reader)):
         numbers = reader[int(index)]
-        share, scene = float(numbers["backscatter_fraction"]), int(numbers["scene"])
-        key = int(numbers["target"]), _photon_level(photons[scene]) if math.isnan(share) else f"{share:.3f}"
+        fraction, scene = float(numbers["backscatter_fraction"]), int(numbers["scene"])
+        key = int(numbers["target"]), _photon_level(photons[scene]) if math.isnan(fraction) else f"{fraction:.3f}"
         if len(chosen.setdefault(key, [])) < frames:
             chosen[key].append(int(index))
             lengths.append(float(numbers["attenuation_lengths"]))
@@ -242,11 +240,12 @@ def _chosen(
     seen = photons[scenes]
     manifest = read_manifest(data)
     seed = manifest["splits"][split]["seed"] if split in manifest["splits"] else manifest["seed"]
-    about = (
-        f"{seen.min():.3g} to {seen.max():.3g} signal photons a pixel (median {np.median(seen):.3g}); water of "
+    summary = (
+        f"{seen.min():.3g} to {seen.max():.3g} signal photons per pixel (median {np.median(seen):.3g}); water of "
         f"{min(lengths):.2g} to {max(lengths):.2g} attenuation lengths one way; seed {seed}"
     )
-    return dict(sorted(chosen.items(), key=lambda one: (one[0][0], _level_order(one[0][1])))), photons, about
+    names, order = list(manifest["targets"]), sorted(chosen, key=lambda key: (key[0], _level_order(key[1])))
+    return {(names[target], level): chosen[target, level] for target, level in order}, photons, summary
 
 
 def _photon_level(photons: float) -> str:
@@ -259,46 +258,69 @@ def _level_order(level: str) -> float:
     return float(level.removeprefix("over ").split()[0])
 
 
-def _frame(item: dict[str, Any], part: tuple[slice, slice]) -> DepthFrames:
-    gate = (float(item["gate"][0]), float(item["gate"][1]))
-    return depth_frames(item["noisy"][0][part], gate=gate, density=item["prior"][0][part])
+# Execute
 
 
-def _truth(item: dict[str, Any], part: tuple[slice, slice]) -> NDArray[np.float32]:
-    """True depth where its light falls into the gate, which is one in range."""
-    return np.where(np.isfinite(item["bound"][0][part]), item["clean"][0][part], np.float32(np.nan))
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """What the frames add up to, with the keys of `Evaluation`."""
+
+    scores: dict[tuple[str, str, str], list[Scores]] = field(default_factory=dict)
+    steps: dict[tuple[str, str], Steps] = field(default_factory=dict)
+    frames: dict[tuple[str, str], int] = field(default_factory=dict)
+    samples: dict[tuple[str, str], Sample] = field(default_factory=dict)
 
 
-def _has_target(clean: NDArray[np.float32], gate: tuple[float, float]) -> bool:
+def _frame(plan: _Plan, index: int) -> tuple[dict[str, Any], DepthFrames, NDArray[np.float32], NDArray[np.bool_]]:
+    """The item, its noisy frame, true depth where its light is within the gate, and which pixels see the target."""
+    item = plan.reader[index]
+    noisy, prior, bound, clean = (item[name][0][plan.part] for name in ("noisy", "prior", "bound", "clean"))
+    gate = (float(item["gate"][0]), float(item["gate"][1]))  # in range; light within it has a bound
+    clean = np.where(np.isfinite(bound), clean, np.float32(np.nan))
     seen = np.isfinite(clean) & (clean >= gate[0]) & (clean < gate[1])
+    return item, depth_frames(noisy, gate=gate, density=prior), clean, seen
+
+
+def _has_target(seen: NDArray[np.bool_]) -> bool:
     return bool(seen.mean() > 0.01)
 
 
-def _estimate(
-    frames: DepthFrames, method: str, window: int, weights: Path | None, device: str | None
-) -> NDArray[np.float32]:
-    if method == "input":
-        return np.nan_to_num(frames.depth[0], nan=0.5 * sum(frames.gate))
-    return denoise_frames(frames, model=method, window=window, weights=weights, device=device)[0][0]
-
-
-def _best_windows(
-    reader: FrameReader,
-    part: tuple[slice, slice],
-    chosen: dict[tuple[int, str], list[int]],
-    errors: dict[tuple[str, int], list[float]],
-) -> dict[str, int]:
+def _best_windows(plan: _Plan) -> dict[str, int]:
     """The window of the highest mean PSNR at each level."""
-    for (_, level), indices in chosen.items():
+    quality: dict[tuple[str, int], list[float]] = {}
+    for (_, level), indices in plan.chosen.items():
         for index in indices:
-            item = reader[index]
-            frames, clean = _frame(item, part), _truth(item, part)
-            if not _has_target(clean, frames.gate):
-                continue
-            seen = np.isfinite(clean) & (clean >= frames.gate[0]) & (clean < frames.gate[1])
-            for window in MEDIAN_WINDOWS:
+            _, frames, clean, seen = _frame(plan, index)
+            for window in MEDIAN_WINDOWS if _has_target(seen) else ():
                 found, _ = denoise_frames(frames, model="median", window=window)
                 square = float(np.mean((found[0] - clean)[seen] ** 2))
-                errors.setdefault((level, window), []).append(-math.log10(max(square, 1e-12)))
-    levels = dict.fromkeys(level for level, _ in errors)
-    return {level: max(MEDIAN_WINDOWS, key=lambda one: np.mean(errors[level, one])) for level in levels}
+                quality.setdefault((level, window), []).append(-math.log10(max(square, 1e-12)))
+    levels = dict.fromkeys(level for level, _ in quality)
+    return {level: max(MEDIAN_WINDOWS, key=lambda window: np.mean(quality[level, window])) for level in levels}
+
+
+def _score_frame(
+    plan: _Plan, tables: _Tables, index: int, target: str, level: str, window: int, device: str | None
+) -> None:
+    """Adds one frame to the tables, by every method; a frame without a target is left out."""
+    item, noisy, clean, seen = _frame(plan, index)
+    if not _has_target(seen):
+        return
+    count = tables.frames[target, level] = tables.frames.get((target, level), 0) + 1
+    images: dict[str, NDArray[np.float32]] = {}
+    for method in plan.methods:
+        if method == "bm3d" and count > plan.bm3d_quota:
+            continue
+        found, _ = denoise_frames(noisy, model=method, window=window, weights=plan.weights.get(method), device=device)
+        images[method] = found[0]
+        tables.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
+        if target == _STAIRCASE:
+            steps = tables.steps.get((method, level), Steps())
+            tables.steps[method, level] = steps + staircase_steps(clean, found[0])
+    if count == 1:
+        caption = (
+            f"{target}, {level if 'photons' in level else f'backscatter fraction {level}'}; "
+            f"{plan.photons[int(item['scene'])]:.3g} signal photons, {float(item['attenuation_lengths']):.2g} "
+            f"attenuation lengths one way, sample {int(item['sample'])}"
+        )
+        tables.samples[target, level] = Sample(clean, noisy.gate, {**images, "input": noisy.depth[0]}, caption)

@@ -1,4 +1,4 @@
-"""Files in, denoised depth out: what `spadwarp denoise` does with a path."""
+"""Denoising of files: depth or histograms in, denoised depth out."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.frames import POOLED, depth_frames
-from spadwarp.denoise.inference import clues_of, denoise_frames, weights_card
+from spadwarp.denoise.frames import depth_frames
+from spadwarp.denoise.inference import denoise_frames, features_of_histograms, weights_metadata
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.arrival_time import Method
 from spadwarp.frames.depth import depth_of
-from spadwarp.frames.measured import Histograms, read_histograms
+from spadwarp.frames.measured import Histograms, read_array, read_histograms
+from spadwarp.frames.response import instrument_response
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
+from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time
+from spadwarp.viz.evaluation import draw_denoised
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 
@@ -36,10 +39,10 @@ class DepthReading:
     Attributes:
         depth: float32 `[N, H, W]` [m]; NaN where there is none.
         frames: Whether the file held several frames.
-        gate: (start, stop) [m], as far as the file tells.
-        profile: Backscatter over the gate, `[bins]`, as far as the file tells.
-        source: How it came about, in words.
-        histograms: What the depth was estimated from, if that are counts of which the instrument response is known.
+        gate: (start, stop) [m]; None where the file does not give it.
+        profile: Backscatter over the gate, `[bins]`; None where the file does not give it.
+        source: How the depth was obtained, as text.
+        histograms: What the depth was estimated from, if these are counts whose instrument response is known.
     """
 
     depth: NDArray[np.float32]
@@ -52,7 +55,7 @@ class DepthReading:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """What `denoise_file` wrote: the depth `[N, H, W]` [m], gate [m], files and notes in words."""
+    """What `denoise_file` wrote: depth `[N, H, W]` [m], gate [m], paths of the files, and notes for the user."""
 
     depth: NDArray[np.float32]
     gate: tuple[float, float]
@@ -65,7 +68,7 @@ def depth_files(path: str | Path) -> list[Path]:
     place = Path(path)
     if not place.is_dir():
         return [place]
-    found = sorted(one for one in place.iterdir() if one.is_file() and one.suffix.lower() in ENDINGS)
+    found = sorted(file for file in place.iterdir() if file.is_file() and file.suffix.lower() in ENDINGS)
     if not found:
         raise FileError(f"{place}: no file that ends in {', '.join(ENDINGS)}")
     return found
@@ -82,18 +85,18 @@ def denoise_file(
     device: str | None = None,
     **reading: Any,
 ) -> Denoised:
-    """Denoises what a file holds; writes `NAME.npy` (all frames), `NAME.exr` and `NAME.png` (the first) to `out`.
+    """Denoises the depth in a file; writes `NAME.npy` (all frames), `NAME.exr` and `NAME.png` (the first) to `out`.
 
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
         out: The folder.
-        model, weights, device: See `denoise`.
+        model, weights, device: See `spadwarp.denoise.apply`.
         gate: (start, stop) in depth [m]; default: the file's, else from the nearest to the farthest depth in it.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
         reading: Arguments of `read_depth`.
 
     Raises:
-        FileError: Cannot be read, or written.
+        FileError: A file cannot be read or written.
         ArgumentError: An argument out of range or missing.
     """
     folder, name = Path(out), Path(path).stem
@@ -105,34 +108,36 @@ def denoise_file(
     notes = [read.source]
     gate = gate or read.gate
     if gate is None:
-        there = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
-        if there.size == 0:
+        valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
+        if valid.size == 0:
             raise FileError(f"{path}: no pixel has a depth")
-        low, high = float(there.min()), float(there.max())
+        low, high = float(valid.min()), float(valid.max())
         gate = (low, high if high > low else 1.001 * low)
         notes.append(f"gate {gate[0]:.4g} to {gate[1]:.4g} m, from the nearest to the farthest depth of the file")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        clues = None
+        features = None
         counts = read.histograms if model in ("pyramid", "histograms") else None
-        if counts is not None and (weights is None or weights_card(model, weights).get("model") == "histograms"):
+        if counts is not None and (weights is None or weights_metadata(model, weights).get("model") == "histograms"):
             model = "histograms"
             notes.append("denoised with its histograms")
-            clues = _clues(counts, group_index=reading.get("group_index"), device=device)
-        frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile, clues=clues)
+            features = _features(counts, group_index=reading.get("group_index"), device=device)
+        profile = read.profile if profile is None else profile
+        frames = depth_frames(read.depth, gate=gate, profile=profile, features=features)
         found, seen = denoise_frames(frames, model=model, weights=weights, device=device)
         depth = np.where(seen, found, np.float32(np.nan))
-    notes += [str(one.message) for one in caught]
+    notes += [str(warning.message) for warning in caught]
     empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
     if empty:
-        notes.append(f"{empty} of {len(depth)} frames stay empty: nothing was reported, or no target is seen")
+        notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     with atomic_path(folder / f"{name}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, depth if read.frames else depth[0])
-    about = {"content": "denoised depth", "method": model, "frame": "+x right, +y down, +z forward"}
+    metadata = {"content": "denoised depth", "method": model, "frame": "+x right, +y down, +z forward"}
+    title = f"{Path(path).name}: {model}"
     files = (
         folder / f"{name}.npy",
-        write_exr(folder / f"{name}.exr", {"Z": np.ascontiguousarray(depth[0])}, about),
-        _draw(read.depth[0], depth[0], folder / f"{name}.png", gate=gate, title=f"{Path(path).name}: {model}"),
+        write_exr(folder / f"{name}.exr", {"Z": np.ascontiguousarray(depth[0])}, metadata),
+        draw_denoised(read.depth[0], depth[0], folder / f"{name}.png", gate=gate, title=title),
     )
     return Denoised(depth=depth, gate=gate, files=files, notes=tuple(notes))
 
@@ -154,7 +159,8 @@ def read_depth(
     """Depth from a file.
 
     `.h5`: a result, or frames of counts. `.exr`: depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or
-    histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`: histograms. These become depth by `spadwarp.frames.depth.depth_of`.
+    histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`: histograms. Histograms become depth by
+    `spadwarp.frames.depth.depth_of`.
 
     Args:
         path: The file.
@@ -174,17 +180,11 @@ def read_depth(
     place = Path(path)
     if not place.is_file():
         raise FileError(f"{place}: {'is not a file' if place.exists() else 'no such file'}")
-    ending = place.suffix.lower()
-    if ending not in ENDINGS:
+    if place.suffix.lower() not in ENDINGS:
         raise FileError(f"{place}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ArgumentError(f"scale = {scale} is outside (0, inf)")
-    stored: NDArray[Any] | None = None
-    if ending == ".exr":
-        stored = _exr_depth(place, channel)
-    elif ending in (".npy", ".mat"):
-        array = _array(place, variable)
-        stored = array if array.ndim == 2 or (as_depth and array.ndim == 3) else None
+    stored = _stored_depth(place, channel, variable, as_depth)
     if stored is not None:
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
@@ -195,32 +195,56 @@ def read_depth(
         source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = read_histograms(place, variable=variable)
-    changes: dict[str, Any] = {}
     if histograms.scene is None:
+        changes: dict[str, Any] = {}
         if bin_width_ps is not None:
             changes["bin_width"] = 1e-12 * bin_width_ps
         if gate_start_ns is not None:
             changes["gate_start"] = 1e-9 * gate_start_ns
         if irf_fwhm_ps is not None:
-            from spadwarp.frames.response import instrument_response
-
             changes["irf"] = changes["response"] = instrument_response(pulse_fwhm=0.0, jitter_fwhm=1e-12 * irf_fwhm_ps)
         histograms = dataclasses.replace(histograms, **changes)
+    return _estimate_depth(histograms, method, group_index, device)
+
+
+def _stored_depth(path: Path, channel: str | None, variable: str | None, as_depth: bool) -> NDArray[Any] | None:
+    """Depth `[H, W]` or `[N, H, W]` as the file has it; None for histograms."""
+    ending = path.suffix.lower()
+    if ending == ".exr":
+        channels, _ = read_exr(path)
+        wanted: Sequence[str] = _EXR_CHANNELS if channel is None else (channel,)
+        found = next((channels[name] for name in wanted if name in channels), None)
+        if found is None:
+            raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
+        return found
+    if ending not in (".npy", ".mat"):
+        return None
+    try:
+        array = read_array(path, variable, dimensions=(2, 3, 4))
+    except FileError:
+        raise
+    except Exception as error:  # what a reader raises depends on the format
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    return array if array.ndim == 2 or (as_depth and array.ndim == 3) else None
+
+
+def _estimate_depth(
+    histograms: Histograms, method: Method | None, group_index: float | None, device: str | None
+) -> DepthReading:
+    bins = histograms.values.shape[-1]
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
     if counted and histograms.background is None:
         # Flat, at the median bin of all pixels and frames together: that of sparse counts would be 0.
-        bins = histograms.values.shape[-1]
         total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
         level = np.median(total) * bins / histograms.values.size
         histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32))
-    if method is None:
-        method = "likelihood" if counted else "matched"
+    method = method or ("likelihood" if counted else "matched")
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
     reduced = depth_of(histograms, method=method, group_index=group_index, device=device)
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
-    gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
+    gate_stop = histograms.gate_start + bins * float(histograms.bin_width or 0.0)
     return DepthReading(
         depth=reduced.values.astype(np.float32),
         frames=reduced.frames > 1,
@@ -231,85 +255,30 @@ def read_depth(
     )
 
 
-def _clues(histograms: Histograms, *, group_index: float | None, device: str | None) -> NDArray[np.float32]:
-    """What counts tell beyond each pixel's depth, `[N, CLUES, H, W]`, pooled depths in metres."""
-    from spadwarp.scene.geometry import depth_from_time
-
-    bins, width = histograms.values.shape[-1], float(histograms.bin_width or 0.0)
-    counts = histograms.values.reshape(-1, *histograms.values.shape[-3:])
+def _features(histograms: Histograms, *, group_index: float | None, device: str | None) -> NDArray[np.float32]:
+    """Features of counts, `[N, FEATURES, H, W]`, pooled depths in metres."""
+    values, scene = histograms.values, histograms.scene
+    width = float(histograms.bin_width or 0.0)
     known = np.asarray(histograms.background, np.float32)
-    background = np.broadcast_to(known, counts.shape[1:] if known.ndim == 3 else (bins,))
     assert histograms.response is not None
-    clues = clues_of(counts, background=background, response=histograms.response.per_bin(width), device=device)
-    scene = histograms.scene
-    for channel in range(POOLED):
-        time = histograms.gate_start + clues[:, channel].astype(np.float64) * (bins * width)
-        if scene is not None:
-            clues[:, channel] = depth_from_time(time, scene=scene)
-        else:
-            clues[:, channel] = range_from_time(time, float(group_index or 1.0))
-    return clues
+
+    def to_depth(part: NDArray[np.float32]) -> NDArray[np.float64]:
+        time = histograms.gate_start + part.astype(np.float64) * (values.shape[-1] * width)
+        return range_from_time(time, float(group_index or 1.0)) if scene is None else depth_from_time(time, scene=scene)
+
+    return features_of_histograms(
+        values,
+        background=np.broadcast_to(known, values.shape[-3:] if known.ndim == 3 else values.shape[-1:]),
+        response=histograms.response.per_bin(width),
+        device=device,
+        to_depth=to_depth,
+    )
 
 
 def _profile(histograms: Histograms) -> NDArray[np.float64] | None:
-    """Backscatter of all pixels together over the bins; None where the file does not know it."""
-    background = histograms.background
-    if background is None or np.ndim(background) == 0 or np.shape(background)[-1] != histograms.values.shape[-1]:
+    """Backscatter of all pixels together over the bins; None where the file does not give it."""
+    background, bins = histograms.background, histograms.values.shape[-1]
+    if background is None or np.ndim(background) == 0 or np.shape(background)[-1] != bins:
         return None
-    total = np.asarray(background, np.float64).reshape(-1, histograms.values.shape[-1]).sum(axis=0)
+    total = np.asarray(background, np.float64).reshape(-1, bins).sum(axis=0)
     return total if total.sum() > 0 else None
-
-
-def _exr_depth(path: Path, channel: str | None) -> NDArray[Any]:
-    channels, _ = read_exr(path)
-    wanted: Sequence[str] = _EXR_CHANNELS if channel is None else (channel,)
-    for name in wanted:
-        if name in channels:
-            return channels[name]
-    raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
-
-
-def _array(path: Path, variable: str | None) -> NDArray[Any]:
-    """The array of a `.npy`, or of a `.mat` if it is depth; shape alone tells depth and histograms apart."""
-    try:
-        if path.suffix.lower() == ".npy":
-            with path.open("rb") as file:
-                if file.read(6) != b"\x93NUMPY":
-                    raise ValueError("it does not begin as NumPy's files do")
-            return np.load(path, allow_pickle=False)
-        from scipy.io import loadmat
-
-        arrays = {
-            name: one
-            for name, one in loadmat(path, spmatrix=False).items()
-            if isinstance(one, np.ndarray) and one.ndim >= 2
-        }
-    except NotImplementedError:  # MATLAB 7.3 is HDF5
-        import h5py
-
-        with h5py.File(path, "r") as file:
-            arrays = {name: one[...].T for name, one in file.items() if isinstance(one, h5py.Dataset) and one.ndim >= 2}
-    except Exception as error:  # what a reader raises depends on the format
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
-    arrays = {name: one for name, one in arrays.items() if one.dtype.kind in "iuf" and one.size > 1}
-    if variable is not None and variable not in arrays:
-        raise FileError(f"{path}: no array {variable!r}; it holds {', '.join(arrays) or 'nothing'}")
-    if not arrays:
-        raise FileError(f"{path}: no array of numbers with two dimensions or more")
-    return arrays[variable] if variable is not None else max(arrays.values(), key=np.size)
-
-
-def _draw(
-    noisy: NDArray[np.float32], denoised: NDArray[np.float32], path: Path, *, gate: tuple[float, float], title: str
-) -> Path:
-    from spadwarp.viz.result import image_panels, show_image, shown_limits
-
-    figure, images, bars = image_panels(noisy.shape, 2)
-    low, high = shown_limits(denoised if np.isfinite(denoised).any() else noisy, beyond=1.0)
-    low, high = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
-    for image, bar, values, name in zip(images, bars, (noisy, denoised), ("Input", "Denoised"), strict=True):
-        show_image(image, bar, values, title=name, label="depth z [m]", colours="viridis_r", low=low, high=high)
-    figure.suptitle(title, fontsize=9, color="0.25")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png")
-    return path

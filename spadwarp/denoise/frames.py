@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,13 +14,13 @@ from spadwarp.errors import ArgumentError
 __all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "POOLED", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
 
 LOG_DENSITY_LIMIT = 4.0
-"""The logarithm of a backscatter density is cut at ± this."""
+"""The logarithm of a backscatter density is clipped at ± this."""
 
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
 POOLED = 3
-"""Of the clues of histograms, so many are depths: one for each window in which histograms were pooled."""
+"""Number of depths among the features of histograms: one for each window over which histograms are pooled."""
 
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
@@ -35,22 +35,19 @@ class DepthFrames:
         gate: (start, stop) in depth [m].
         density: Density of the water's backscatter at each depth, relative to a flat one over the gate, float32 of
             `depth`'s shape; 1 everywhere if it is not known.
-        clues: What the histograms behind them tell, float32 `[N, CLUES, H, W]` as
-            `spadwarp.denoise.histogram_features` has it,
-            but with pooled depths in metres; None where there are none.
+        features: Features of the histograms behind them, float32 `[N, FEATURES, H, W]` as
+            `spadwarp.denoise.histogram_features` makes them, but with pooled depths in metres; None without histograms.
     """
 
     depth: NDArray[np.float32]
     gate: tuple[float, float]
     density: NDArray[np.float32]
-    clues: NDArray[np.float32] | None = None
+    features: NDArray[np.float32] | None = None
 
-    def __len__(self) -> int:
-        return len(self.depth)
-
-    def __getitem__(self, part: slice) -> DepthFrames:
-        clues = None if self.clues is None else self.clues[part]
-        return replace(self, depth=self.depth[part], density=self.density[part], clues=clues)
+    @property
+    def gate_middle(self) -> float:
+        """Depth in the middle of the gate [m], which stands for a depth that is not known."""
+        return 0.5 * sum(self.gate)
 
     @property
     def scaled(self) -> NDArray[np.float32]:
@@ -59,28 +56,29 @@ class DepthFrames:
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
     def network_input(self, *, histograms: bool = False) -> NDArray[np.float32]:
-        """`[N, 3, H, W]`, with `histograms` and their clues, as `spadwarp.denoise.networks` describes it.
+        """Channels for a network, `[N, 3, H, W]`, and with `histograms` also their features.
 
-        Without, a pixel that reported nothing stands for its nearest that did, where pixels about it report nearly as
-        often as elsewhere: networks of depth learn from frames in which few are missing.
+        `spadwarp.denoise.networks` describes the channels. Without histograms, missing pixels are filled with the
+        nearest depth where pixels around them report nearly as often as elsewhere: networks of depth are trained on
+        frames in which few pixels are missing.
         """
         scaled, density = self.scaled, self.density
         if not histograms and np.isnan(scaled).any():
             density = density.copy()
-            for depth, likely in zip(scaled, density, strict=True):
-                places = _stand_ins(depth, likely)
-                depth[:], likely[:] = depth[places], likely[places]
+            for depth, level in zip(scaled, density, strict=True):
+                source = _fill_source(depth, level)
+                depth[:], level[:] = depth[source], level[source]
         reported = ~np.isnan(scaled)
         limit = LOG_DENSITY_LIMIT
         log_density = np.log(np.clip(density, math.exp(-limit), math.exp(limit)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
-        frame = np.stack([one.astype(np.float32) for one in channels], axis=1)
+        frame = np.stack([channel.astype(np.float32) for channel in channels], axis=1)
         if not histograms:
             return frame
-        assert self.clues is not None
+        assert self.features is not None
         start, stop = self.gate
-        pooled = (self.clues[:, :POOLED] - start) / (stop - start) - 0.5
-        return np.concatenate([frame, pooled, self.clues[:, POOLED:]], axis=1, dtype=np.float32)
+        pooled = (self.features[:, :POOLED] - start) / (stop - start) - 0.5
+        return np.concatenate([frame, pooled, self.features[:, POOLED:]], axis=1, dtype=np.float32)
 
 
 def depth_frames(
@@ -89,7 +87,7 @@ def depth_frames(
     gate: tuple[float, float],
     profile: ArrayLike | None = None,
     density: ArrayLike | None = None,
-    clues: NDArray[np.float32] | None = None,
+    features: NDArray[np.float32] | None = None,
 ) -> DepthFrames:
     """Checks depth and brings it into the form that denoisers take.
 
@@ -97,10 +95,10 @@ def depth_frames(
         depth: `[H, W]` or `[N, H, W]` [m]; NaN, 0 and infinity mean that nothing was reported.
         gate: (start, stop) in depth [m].
         profile: Backscatter over the gate in any number of equal bins, `[bins]`, ≥ 0, in any unit.
-        density: In its place, its density [1/m] at each depth, of `depth`'s shape; NaN for not known.
-        clues: Of the histograms, `[N, CLUES, H, W]`, pooled depths in metres.
+        density: Replaces `profile`: its density [1/m] at each depth, of `depth`'s shape; NaN where it is not known.
+        features: Features of the histograms, `[N, FEATURES, H, W]`, pooled depths in metres.
 
-    What lies farther than `MARGIN` outside the gate counts as not reported, with a warning that gives the number.
+    Depths farther than `MARGIN` outside the gate count as not reported, with a warning that gives their number.
 
     Raises:
         ArgumentError: Shapes, sizes or values that cannot be, or a gate without width.
@@ -111,11 +109,13 @@ def depth_frames(
     values = values.astype(np.float32).reshape(-1, *values.shape[-2:])
     if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
         raise ArgumentError(
-            f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; one of "
-            f"{SMALLEST_SIDE} x {SMALLEST_SIDE} is the least"
+            f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; at least one frame of "
+            f"{SMALLEST_SIDE} x {SMALLEST_SIDE} pixels is needed"
         )
-    if clues is not None and (len(clues) != len(values) or clues.shape[2:] != values.shape[1:]):
-        raise ArgumentError(f"histograms are {len(clues)} frames of {clues.shape[2:]} pixels, depth is {values.shape}")
+    if features is not None and (len(features) != len(values) or features.shape[2:] != values.shape[1:]):
+        raise ArgumentError(
+            f"histograms are {len(features)} frames of {features.shape[2:]} pixels, depth is {values.shape}"
+        )
     start, stop = map(float, gate)
     if not (math.isfinite(stop) and 0 <= start < stop):
         raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with 0 <= start < stop")
@@ -140,21 +140,19 @@ def depth_frames(
     elif profile is not None:
         bins = np.asarray(profile, np.float64)
         if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
-            raise ArgumentError(
-                f"profile has shape {bins.shape}; one dimension of numbers >= 0 that are not all 0 is needed"
-            )
-        place = np.nan_to_num((values - start) / (stop - start)) * bins.size
-        relative = (bins / bins.mean())[np.clip(place.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
-    return DepthFrames(depth=values, gate=(start, stop), density=relative, clues=clues)
+            raise ArgumentError(f"profile has shape {bins.shape}; [bins] of numbers >= 0 that are not all 0 is needed")
+        index = np.nan_to_num((values - start) / (stop - start)) * bins.size
+        relative = (bins / bins.mean())[np.clip(index.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
+    return DepthFrames(depth=values, gate=(start, stop), density=relative, features=features)
 
 
-def _stand_ins(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns `[H, W]` of the pixels that stand for each: itself, or the nearest that reported something.
+def _fill_source(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns `[H, W]` from which each pixel takes its value: its own, or those of the nearest that reported.
 
-    Where there is no target pixels report less often than on one, backscatter alone, and nothing should stand for them.
-    So a missing pixel stands for itself where, of the 15 × 15 pixels about it or as many as hold 64 reports, fewer than
-    half as many report as in the window that holds the most; and so do all, unless depths that follow each other agree
-    more often than backscatter would.
+    Beside a target, where backscatter alone is reported, pixels report less often than on it, and must not be filled.
+    So a missing pixel is filled only where, of the pixels in a window around it, at least half as many report as in the
+    window that holds the most. The window has 15 × 15 pixels, or as many as hold 64 reports. No pixel is filled
+    unless successive depths agree more often than backscatter would.
 
     Args:
         depth: Over the gate, NaN where nothing was reported, `[H, W]`.
@@ -163,17 +161,17 @@ def _stand_ins(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tupl
     from scipy.ndimage import distance_transform_edt, uniform_filter
 
     reported = ~np.isnan(depth)
-    places = np.indices(depth.shape)
+    source = np.indices(depth.shape)
     agreeing = np.count_nonzero(np.abs(np.diff(depth[reported])) < 0.01)
     by_chance = np.minimum(0.02 * density[reported], 1.0).sum()
     side = 2 * round(max(7.0, 4.0 / math.sqrt(max(reported.mean(), 1e-4)))) + 1
-    often = uniform_filter(reported.astype(np.float32), side, mode="constant")
-    inside = uniform_filter(np.ones_like(often), side, mode="constant")  # part of the window that lies in the image
-    missing = ~reported & (often >= 0.5 * often.max() * inside)
-    if missing.any() and agreeing > 1.3 * by_chance + 10:
+    frequency = uniform_filter(reported.astype(np.float32), side, mode="constant")
+    inside = uniform_filter(np.ones_like(frequency), side, mode="constant")  # part of the window within the image
+    filled = ~reported & (frequency >= 0.5 * frequency.max() * inside)
+    if filled.any() and agreeing > 1.3 * by_chance + 10:
         nearest = distance_transform_edt(~reported, return_distances=False, return_indices=True)
-        places = np.where(missing, nearest, places)
-    return places[0], places[1]
+        source = np.where(filled, nearest, source)
+    return source[0], source[1]
 
 
 def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:

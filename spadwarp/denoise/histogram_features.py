@@ -1,8 +1,8 @@
-"""What histograms tell beyond the depth of each pixel: depth of pooled histograms, and the shape of the return.
+"""Features of histograms beyond the depth of each pixel: depth of pooled histograms, and the shape of the return.
 
-One photon among twenty of the background says little; nine pixels, or 225, say more. Pooling gives up sharp edges for
-that, so depth is estimated over windows of several sizes, and a network chooses. The shape of the return tells how late
-the light is that water scattered forward.
+A single pixel with one photon among twenty of the background says little; nine pixels, or 225, say more. Pooling blurs
+sharp edges, so depth is estimated over windows of several sizes, and a network chooses. The shape of the return shows
+how late the light arrives that water scattered forward.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ from torch import Tensor
 
 from spadwarp.denoise.frames import POOLED
 
-__all__ = ["CLUES", "EDGES", "TAIL", "WINDOWS", "histogram_clues", "toeplitz"]
+__all__ = ["EDGES", "FEATURES", "TAIL", "WINDOWS", "extract_features", "toeplitz"]
 
 WINDOWS = (3, 7, 15)
 """Sides of the windows over which histograms are pooled [pixels]."""
 
 EDGES = (-0.12, -0.06, -0.03, -0.01, 0.01, 0.03, 0.06, 0.12, 0.25)
-"""Windows behind and before the return in which light is counted [gate widths]."""
+"""Edges of the intervals around the return in which light is counted [gate widths]."""
 
 TAIL = 0.04
-"""Mean delay of the scattered light that the largest window's template has [gate widths]."""
+"""Mean delay of the scattered light in the template of the largest window [gate widths]."""
 
 assert len(WINDOWS) == POOLED
-CLUES = len(WINDOWS) + len(EDGES) - 1 + 2
-"""Channels of `histogram_clues`."""
+FEATURES = len(WINDOWS) + len(EDGES) - 1 + 2
+"""Number of channels that `extract_features` gives."""
 
-_ANYWHERE = 0.3  # part of the signal that may come at any time: scattered photons far from the return say little
-_MOST_BINS = 384  # finer histograms are rebinned: their clues need no more
+_UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
+_MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
 
 
-def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
+def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
     """Depth of pooled histograms and the shape of the return.
 
     The score of a return in bin k is its log-likelihood ratio less what background alone gives on average,
-    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), S the mean signal of the frame, so that dim pixels are not drawn to where
-    background is high; B' is B and 0.3 S spread over the gate. Scores of pixels add. The two smaller windows have the
-    instrument response as template h; the largest has that response with an exponential tail, as light that was
-    scattered forward arrives.
+    Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
+    mean signal of the frame; B' is B plus 0.3 S spread evenly over the gate. Scores of pixels add. The template h is
+    the instrument response for the two smaller windows; for the largest it is that response with an exponential tail,
+    as light arrives that was scattered forward.
 
     Args:
         counts: Histograms over the gate, `[B, H, W, T]`.
-        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or of all alike `[B, 1, 1, T]`.
-        response: Instrument response per bin about its time zero, sum 1, `[B, 2 r + 1]`.
+        background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
+        response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
 
     Returns:
-        `[B, CLUES, H, W]`: depth over the gate for each of `WINDOWS`; the excess over the background within `EDGES`
-        about the last of these depths, as shares of 7 × 7 pixels; and how significant the excess is, in the pixel and
-        in 7 × 7.
+        `[B, FEATURES, H, W]`: depth over the gate for each of `WINDOWS`; the excess over the background between
+        `EDGES` around the last of these depths, as shares over 7 × 7 pixels; and how significant the excess is, in the
+        pixel and in 7 × 7.
     """
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
     if merged > 1:
@@ -63,13 +63,11 @@ def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Ten
     tail = torch.exp(-delays / (TAIL * bins))
     distance = delays[:, None] - delays
     late = torch.where(distance >= 0, tail[distance.clamp_min(0)], 0.0) / tail.sum()
-    floor = _ANYWHERE * signal[:, None] / bins
+    floor = _UNIFORM_SHARE * signal[:, None] / bins
     ratio = signal[:, None, None] / (background + floor)[:, :, None]
 
     score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * narrow)).view_as(counts)
-    found = []
-    for side in WINDOWS[:-1]:
-        found.append(_highest(_pooled(score, side)))
+    found = [_highest(_pooled(score, side)) for side in WINDOWS[:-1]]
     score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * (late @ narrow))).view_as(counts)
     found.append(_highest(_pooled(score, WINDOWS[-1])))
     del score
@@ -82,13 +80,13 @@ def histogram_clues(counts: Tensor, background: Tensor, response: Tensor) -> Ten
     spread = ((excess.sum(dim=-1) + 49.0 * level).clamp_min(0.0) + 1.0).sqrt()
     shares = excess / (excess.abs().sum(dim=-1) + spread)[..., None]
     pooled = excess.sum(dim=-1) / (49.0 * level + 1.0).sqrt()
-    signs = [0.5 * torch.asinh(pixel), 0.3 * torch.asinh(pooled)]
-    found = [one * (merged * bins / given) for one in found]  # the last of merged bins may reach beyond the gate
-    return torch.stack([*found, *shares.unbind(dim=-1), *signs], dim=1)
+    significance = [0.5 * torch.asinh(pixel), 0.3 * torch.asinh(pooled)]
+    found = [depth * (merged * bins / given) for depth in found]  # the last of merged bins may reach beyond the gate
+    return torch.stack([*found, *shares.unbind(dim=-1), *significance], dim=1)
 
 
 def _rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The same with `merged` bins summed into one; the last may hold fewer."""
+    """The arguments with `merged` bins summed into one; the last may hold fewer."""
 
     def summed(values: Tensor) -> Tensor:
         return F.pad(values, (0, -values.shape[-1] % merged)).unflatten(-1, (-1, merged)).sum(dim=-1)
@@ -109,9 +107,9 @@ def toeplitz(response: Tensor, bins: int) -> Tensor:
 
 
 def _pooled(cube: Tensor, side: int) -> Tensor:
-    """Mean over `side` × `side` pixels about each, of those within the frame; `[B, H, W, T]`.
+    """Mean over `side` × `side` pixels around each, of those within the frame; `[B, H, W, T]`.
 
-    By windows on a CPU, as products with banded matrices on a GPU: each is several times faster there.
+    Windows on a CPU, products with banded matrices on a GPU: each is several times faster on its device.
     """
     half = side // 2
     if cube.device.type == "cpu":

@@ -1,8 +1,9 @@
-"""How good a denoised frame is: for eyes (8 bits over the gate), and for those who measure (millimetres)."""
+"""Scores of a denoised frame: as an image (8 bits over the gate), and as a measurement (millimetres)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +28,16 @@ LARGER_IS_BETTER = {
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Of one frame, over the pixels that see a target.
+    """Scores of one frame, over the pixels that see a target.
 
     Attributes:
-        psnr: Of depth scaled to 8 bits over the gate [dB]; 100 where not a pixel differs.
+        psnr: Of depth scaled to 8 bits over the gate [dB]; 100 where no pixel differs.
         ssim: Structural similarity of the same, 11 × 11 Gaussian window of σ = 1.5 (Wang et al., IEEE TIP 13, 600,
-            2004); what sees no target is white in both images.
+            2004); pixels without a target are white in both images.
         entropy: Shannon entropy of the denoised image [bit].
         rmse_mm: Root mean square error of depth [mm].
-        within_1cm, within_5cm: Part of the pixels whose error is below.
-        edge_mm: Mean absolute error within two pixels of an edge of the truth, a jump over 5 cm [mm]; NaN without.
+        within_1cm, within_5cm: Part of the pixels whose error is below 1 cm and 5 cm.
+        edge_mm: Mean absolute error within two pixels of an edge of the truth, a jump over 5 cm [mm]; else NaN.
     """
 
     psnr: float
@@ -49,14 +50,12 @@ class Scores:
 
     @classmethod
     def mean(cls, scores: list[Scores]) -> Scores:
-        """Field by field, NaN aside."""
-        columns = {one.name: np.array([getattr(score, one.name) for score in scores]) for one in fields(cls)}
-        return cls(
-            **{
-                name: float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
-                for name, values in columns.items()
-            }
-        )
+        """Mean of each field, without NaN."""
+        means = {}
+        for field in fields(cls):
+            values = np.array([getattr(score, field.name) for score in scores])
+            means[field.name] = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+        return cls(**means)
 
 
 def score(clean: NDArray[np.float32], estimate: NDArray[np.float32], *, gate: tuple[float, float]) -> Scores:
@@ -107,55 +106,52 @@ def score(clean: NDArray[np.float32], estimate: NDArray[np.float32], *, gate: tu
 
 
 def _edges(clean: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels near a jump of the true depth, or near the rim of the target."""
+    """Pixels near a jump of the true depth, or near the border of the target."""
     from scipy.ndimage import binary_dilation
 
     filled = np.where(seen, clean, np.float32(1e3))
     jump = np.zeros(clean.shape, bool)
-    for axis in (0, 1):
-        step = np.abs(np.diff(filled, axis=axis)) > _EDGE
-        first, second = np.swapaxes(jump, 0, axis)[:-1], np.swapaxes(jump, 0, axis)[1:]
-        rows = np.swapaxes(step, 0, axis)
-        first |= rows
-        second |= rows
+    for filled_rows, rows in ((filled, jump), (filled.T, jump.T)):
+        step = np.abs(np.diff(filled_rows, axis=0)) > _EDGE
+        rows[:-1] |= step
+        rows[1:] |= step
     return binary_dilation(jump, iterations=_NEAR_EDGE - 1) & seen
 
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
-    """Steps of about 10 cm between neighbouring faces: how many there are, and how many a frame resolves to ± 3 cm."""
+    """Steps of about 10 cm between neighbouring faces: their number, and how many a frame resolves to ± 3 cm."""
 
-    total: int
-    resolved: int
+    total: int = 0
+    resolved: int = 0
+
+    def __add__(self, other: Steps) -> Steps:
+        return Steps(total=self.total + other.total, resolved=self.resolved + other.resolved)
 
 
 def staircase_steps(clean: NDArray[np.float32], estimate: NDArray[np.float32]) -> Steps:
     """Counts neighbouring faces whose medians differ by 10 ± 3 cm in the truth, and by that ± 3 cm in the estimate.
 
-    Faces are the connected parts of the true depth between jumps of more than 2.5 cm, of 100 pixels at least; two are
-    neighbours if they come within eight pixels of each other.
+    Faces are the connected parts of the true depth between jumps of more than 2.5 cm, of at least 100 pixels; two are
+    neighbours if they are within eight pixels of each other.
     """
     from scipy.ndimage import binary_dilation, label
 
     seen = np.isfinite(clean)
     filled = np.where(seen, clean, np.float32(-1e3))
     flat = seen.copy()
-    for axis in (0, 1):
-        calm = np.abs(np.diff(filled, axis=axis)) < 0.025
-        widths = [(0, 0), (0, 0)]
-        widths[axis] = (0, 1)
-        flat &= np.pad(calm, widths, constant_values=True)
+    for values, rows in ((filled, flat), (filled.T, flat.T)):
+        rows[:-1] &= np.abs(np.diff(values, axis=0)) < 0.025
     faces, count = label(flat)
-    members = [faces == number for number in range(1, count + 1)]
-    members = [one for one in members if one.sum() >= 100]
+    masks = [faces == number for number in range(1, count + 1)]
+    masks = [mask for mask in masks if mask.sum() >= 100]
+    grown = [binary_dilation(mask, iterations=4) for mask in masks]
     estimate = np.nan_to_num(estimate, nan=0.0)
-    grown = [binary_dilation(one, iterations=4) for one in members]
     total = resolved = 0
-    for i, first in enumerate(members):
-        for j in range(i + 1, len(members)):
-            true_step = float(np.median(clean[first]) - np.median(clean[members[j]]))
-            if 0.07 <= abs(true_step) <= 0.13 and (grown[i] & grown[j]).any():
-                step = float(np.median(estimate[first]) - np.median(estimate[members[j]]))
-                total += 1
-                resolved += abs(step - true_step) <= 0.03
+    for (first, near), (second, also_near) in combinations(zip(masks, grown, strict=True), 2):
+        true_step = float(np.median(clean[first]) - np.median(clean[second]))
+        if 0.07 <= abs(true_step) <= 0.13 and (near & also_near).any():
+            step = float(np.median(estimate[first]) - np.median(estimate[second]))
+            total += 1
+            resolved += abs(step - true_step) <= 0.03
     return Steps(total=total, resolved=resolved)

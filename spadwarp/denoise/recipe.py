@@ -8,16 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    model_validator,
-)
+import pydantic
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene.messages import describe
@@ -38,64 +30,59 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
     return limits
 
 
-def _positive(limits: tuple[float, float]) -> tuple[float, float]:
-    if not limits[0] > 0:
-        raise ValueError(f"{limits[0]} is outside (0, inf)")
-    return limits
-
-
-def _shares(limits: tuple[float, float]) -> tuple[float, float]:
-    if not (limits[0] >= 0 and limits[1] <= 1):
-        raise ValueError(f"{list(limits)} is outside [0, 1]")
-    return limits
-
-
 def _pair(value: Any) -> Any:
-    return tuple(float(one) for one in value) if isinstance(value, list) else value
+    return tuple(map(float, value)) if isinstance(value, list) else value
 
 
-Limits = Annotated[tuple[float, float], BeforeValidator(_pair), AfterValidator(_ordered)]
-Positive = Annotated[Limits, AfterValidator(_positive)]
-Shares = Annotated[Limits, AfterValidator(_shares)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Above0 = Annotated[float, Field(gt=0)]
+_CHECKS = BeforeValidator(_pair), AfterValidator(_ordered)
+Limits = Annotated[tuple[float, float], *_CHECKS]
+Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
+Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
 
 class Noise(_Table):
-    """What the noise of a training is drawn from: `[lowest, highest]`, or the share of the samples."""
+    """What the noise of a training is drawn from: `[lowest, highest]`, or a part of the samples."""
 
-    backscatter: Shares = Field((0.0, 0.6), description="part of the pixels that report backscatter (BS)")
-    sigma_scale: Positive = Field((0.3, 8.0), description="factor on a scene's Cramér–Rao bound, even in the logarithm")
+    backscatter: Shares = Field((0.0, 0.6), description="part of the pixels that report backscatter")
+    sigma_scale: Positive = Field(
+        (0.3, 8.0), description="factor on a scene's Cramér–Rao bound, uniform in the logarithm"
+    )
     decay: Positive = Field(
-        (0.3, 40.0), description="rate at which backscatter falls over the gate [1/gate], even in the logarithm"
+        (0.3, 40.0), description="rate at which backscatter falls over the gate [1/gate], uniform in the logarithm"
     )
     own_gate: Share = Field(0.5, description="samples with the scene's own gate")
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
-    gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], even in the logarithm")
+    gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], uniform in the logarithm")
     behind: Share = Field(0.4, description="samples with backscatter from behind the target too: multiple scattering")
     slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
     counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
-    photons: Positive = Field((0.7, 150.0), description="signal counts a pixel of these, even in the logarithm")
-    sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, even in the logarithm")
-    scattered: Share = Field(0.0, description="of these, samples with light scattered forward, late and spread")
-    delay: Positive = Field((0.004, 0.12), description="mean delay of that light [gate widths], even in the logarithm")
-    spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], even in the logarithm")
+    photons: Positive = Field((0.7, 150.0), description="signal counts per pixel of these, uniform in the logarithm")
+    sbr: Positive = Field((0.03, 8.0), description="signal counts over background counts, uniform in the logarithm")
+    scattered: Share = Field(0.0, description="of these, samples with forward-scattered light, delayed and spread")
+    delay: Positive = Field(
+        (0.004, 0.12), description="mean delay of that light [gate widths], uniform in the logarithm"
+    )
+    spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
-    dead: Share = Field(0.1, description="highest part of the pixels that report nothing for no reason")
-    unknown_water: Share = Field(0.2, description="samples whose backscatter profile the network is not told")
+    dead: Share = Field(0.1, description="highest part of the pixels that report nothing because they are defective")
+    unknown_water: Share = Field(0.2, description="samples whose backscatter profile is hidden from the network")
 
 
 class Optimiser(_Table):
-    """How it is learnt."""
+    """How the network is trained."""
 
     steps: int = Field(40_000, ge=1, description="updates of the weights")
-    batch: int = Field(64, ge=1, description="crops of an update, over all GPUs")
+    batch: int = Field(64, ge=1, description="crops per update, on all GPUs together")
     crop: int = Field(96, ge=32, description="side of a crop [pixels]")
-    learning_rate: float = Field(1e-3, gt=0, description="highest; falls along a cosine to a hundredth")
+    learning_rate: float = Field(1e-3, gt=0, description="highest; decreases along a cosine to a hundredth")
     warm_up: int = Field(500, ge=0, description="updates in which the learning rate rises")
     weight_decay: float = Field(1e-4, ge=0)
     averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
     loss: Literal["psnr", "mse"] = Field(
-        "psnr", description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much'
+        "psnr",
+        description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much as hard ones',
     )
     precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
     report_every: int = Field(500, ge=1, description="updates between two lines of the log and two checkpoints")
@@ -105,14 +92,16 @@ class TrainingRecipe(_Table):
     """Everything a training depends on, checked and frozen."""
 
     model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
-    start: Literal["pyramid"] | None = Field(None, description="network of the package with whose weights it begins")
+    start: Literal["pyramid"] | None = Field(
+        None, description="network of the package whose weights the training starts from"
+    )
     data: str = Field(..., min_length=1, description="dataset (folder), relative to the working directory")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
     optimiser: Optimiser = Optimiser()
     _source: Path | None = PrivateAttr(None)
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _is_consistent(self) -> Self:
         if self.model == "histograms" and self.noise.counting != 1:
             raise ValueError(f'noise.counting = {self.noise.counting} with model = "histograms", which needs 1')
@@ -130,7 +119,7 @@ class TrainingRecipe(_Table):
         """A recipe from tables as TOML gives them. Raises `ConfigError` with a line for each problem."""
         try:
             recipe = cls.model_validate(dict(tables))
-        except ValidationError as error:
+        except pydantic.ValidationError as error:
             name = None if source is None else str(source)
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
@@ -138,7 +127,7 @@ class TrainingRecipe(_Table):
 
 
 def load_training_recipe(path: str | os.PathLike[str], *, overrides: Mapping[str, Any] | None = None) -> TrainingRecipe:
-    """Reads a recipe; `overrides` are tables that lie over the file's.
+    """Reads a recipe; `overrides` are tables that replace the file's values.
 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """

@@ -1,4 +1,4 @@
-"""`spadwarp train`: a recipe and a dataset in, weights, log and learning curves out."""
+"""Training from files: a recipe and a dataset in, weights, log and learning curves out."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spadwarp.dataset.make import read_manifest
-from spadwarp.denoise.inference import _torch
+from spadwarp.denoise.inference import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.hdf5 import read_hdf5
+from spadwarp.viz.learning_curves import draw_learning_curves
 
 if TYPE_CHECKING:
     from spadwarp.denoise.synthetic_noise import CleanScenes
     from spadwarp.denoise.training import Trained
 
-__all__ = ["draw_learning_curves", "read_scenes", "train"]
+__all__ = ["read_scenes", "train"]
 
 
 def train(
@@ -30,22 +31,22 @@ def train(
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Trained:
-    """Trains a denoiser, or goes on with a training that was cut short.
+    """Trains a denoiser, or resumes an interrupted training.
 
     Writes `MODEL.safetensors`, `log.jsonl`, `curves.png` and `checkpoint.pt` to the folder `out`.
 
     Args:
-        recipe: From `spadwarp.denoise.recipe.load_training_recipe`, or its path.
-        out: The run's folder; new, or that of the same recipe.
+        recipe: From `spadwarp.denoise.load_training_recipe`, or the recipe's path.
+        out: The run's folder; new, or with an interrupted run of the same recipe.
         device: torch device; default: the GPU of this process (torchrun gives one each), else the CPU.
         progress: Called with ("steps", done, total).
 
     Raises:
-        ConfigError: A recipe that cannot be used, or another one's run in the folder.
-        FileError: The dataset or a file cannot be read, or not be written.
+        ConfigError: A recipe that cannot be used, or a run of another recipe in the folder.
+        FileError: The dataset cannot be read, or a file cannot be read or written.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
-    _torch()
+    require_torch()
     from spadwarp.denoise.training import fit
 
     if not isinstance(recipe, TrainingRecipe):
@@ -53,58 +54,24 @@ def train(
     training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress)
     if int(os.environ.get("RANK", 0)) == 0:
-        draw_learning_curves(trained.log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
+        log = [json.loads(line) for line in trained.log.read_text().splitlines()]
+        draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
     return trained
 
 
 def read_scenes(folder: str | os.PathLike[str], split: str) -> CleanScenes:
     """The clean scenes of a split of a dataset. Raises `FileError`."""
-    import h5py
     import torch
 
     from spadwarp.denoise.synthetic_noise import CleanScenes
 
-    parts: dict[str, list[Any]] = {name: [] for name in ("depth", "bound", "gate", "profile")}
+    parts: list[list[Any]] = []
     for name in read_manifest(folder)["splits"][split]["shards"]:
-        path = Path(folder) / "scenes" / name.replace("frames-", "scenes-")
-        try:
-            with h5py.File(path, "r") as file:
-                parts["depth"].append(file["depth"][...])
-                parts["bound"].append(file["bound"][...])
-                parts["gate"].append(np.stack([file["gate_near"][...], file["gate_far"][...]], axis=1))
-                parts["profile"].append(file["backscatter_profile"][...])
-        except (OSError, KeyError) as error:
-            raise FileError(f"{path}: damaged or not readable: {error}") from error
-    if not parts["depth"]:
+        with read_hdf5(Path(folder) / "scenes" / name.replace("frames-", "scenes-")) as file:
+            gate = np.stack([file["gate_near"][...], file["gate_far"][...]], axis=1)
+            parts.append([file["depth"][...], file["bound"][...], gate, file["backscatter_profile"][...]])
+    if not parts:
         raise FileError(f"{folder}: the dataset has no scenes for {split}")
-    depth, bound, gate, profile = (np.concatenate(one).astype(np.float32) for one in parts.values())
+    depth, bound, gate, profile = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))
     profile /= np.maximum(profile.mean(axis=1, keepdims=True), 1e-12)
     return CleanScenes(*map(torch.from_numpy, (depth, bound, gate, profile)))
-
-
-def draw_learning_curves(log: str | Path, path: str | Path, *, title: str) -> Path:
-    """Loss and validation PSNR against steps, from a log of JSON lines; returns the picture's path."""
-    from matplotlib.figure import Figure
-
-    lines = [json.loads(line) for line in Path(log).read_text().splitlines()]
-    steps = [line["step"] for line in lines]
-    size = 6.0 if len(lines) == 1 else 3.0  # a single point has no line to be seen by
-    figure = Figure(figsize=(9.6, 3.4), layout="constrained", facecolor="white")
-    loss, psnr = figure.subplots(1, 2)
-    losses = [line["loss"] for line in lines]
-    loss.plot(steps, losses, color="#0072B2", marker="o", markersize=size)
-    loss.set(yscale="log" if min(losses) > 0 else "linear", xlabel="step", ylabel="loss")  # "psnr" is a logarithm
-    for level, shade in zip(lines[-1]["psnr"], np.linspace(0.75, 0.0, len(lines[-1]["psnr"])), strict=True):
-        values = [line["psnr"][level] for line in lines]
-        name = f"BS {level}" if float(level) < 1 else f"{float(level):g} photons"
-        psnr.plot(steps, values, color=str(shade), marker="o", markersize=size, label=name)
-    psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
-    psnr.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    for axis in (loss, psnr):
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(color="0.92")
-        axis.set_axisbelow(True)
-    figure.suptitle(title, fontsize=10, color="0.25")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png")
-    return Path(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from spadwarp.result.file import load_result
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["ENDINGS", "Histograms", "read_histograms"]
+__all__ = ["ENDINGS", "Histograms", "read_array", "read_histograms"]
 
 ENDINGS = (".h5", ".npy", ".mat", ".ptu")
 
@@ -68,8 +68,8 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
         raise FileError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     readers: dict[str, Callable[[Path], Histograms]] = {
         ".h5": _read_own,
-        ".npy": lambda path: Histograms(values=np.load(path, allow_pickle=False)),
-        ".mat": lambda path: _read_mat(path, variable),
+        ".npy": lambda path: Histograms(values=read_array(path)),
+        ".mat": lambda path: Histograms(values=read_array(path, variable)),
         ".ptu": _read_ptu,
     }
     if path.suffix.lower() not in readers:
@@ -121,30 +121,37 @@ def _read_own(path: Path) -> Histograms:
     )
 
 
-def _read_mat(path: Path, variable: str | None) -> Histograms:
+def read_array(path: Path, variable: str | None = None, *, dimensions: Sequence[int] = (3, 4)) -> NDArray[Any]:
+    """The array of a `.npy` file, or one of a `.mat` file: `variable`, else the largest of so many dimensions.
+
+    Raises `FileError` for a `.mat` without such an array, and what the reader of the format raises.
+    """
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False)
     import h5py
 
-    if h5py.is_hdf5(path):
+    if h5py.is_hdf5(path):  # MATLAB 7.3
         with h5py.File(path, "r") as file:
             # MATLAB lays arrays out column by column: to others their dimensions are reversed.
             shapes = {name: item.shape[::-1] for name, item in file.items() if isinstance(item, h5py.Dataset)}
-            return Histograms(values=file[_chosen(path, shapes, variable)][...].T)
+            return file[_chosen(path, shapes, variable, dimensions)][...].T
     from scipy.io import loadmat, whosmat
 
-    name = _chosen(path, {name: shape for name, shape, _ in whosmat(path)}, variable)
-    return Histograms(values=np.asarray(loadmat(path, variable_names=[name], spmatrix=False)[name]))
+    shapes = {name: shape for name, shape, kind in whosmat(path) if kind not in ("char", "cell", "struct")}
+    name = _chosen(path, shapes, variable, dimensions)
+    return np.asarray(loadmat(path, variable_names=[name], spmatrix=False)[name])
 
 
-def _chosen(path: Path, shapes: dict[str, tuple[int, ...]], variable: str | None) -> str:
+def _chosen(path: Path, shapes: dict[str, tuple[int, ...]], variable: str | None, dimensions: Sequence[int]) -> str:
     listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
     if variable is not None:
         if variable not in shapes:
             raise FileError(f"{path}: no array {variable!r}; it holds {listed}")
         return variable
-    cubes = {name: shape for name, shape in shapes.items() if len(shape) in (3, 4)}
-    if not cubes:
-        raise FileError(f"{path}: no array of three or four dimensions; it holds {listed}")
-    return max(cubes, key=lambda name: math.prod(cubes[name]))
+    found = {name: shape for name, shape in shapes.items() if len(shape) in dimensions and math.prod(shape) > 1}
+    if not found:
+        raise FileError(f"{path}: no array of {' or '.join(map(str, dimensions))} dimensions; it holds {listed}")
+    return max(found, key=lambda name: math.prod(found[name]))
 
 
 def _read_ptu(path: Path) -> Histograms:

@@ -1,22 +1,32 @@
-"""The report of an evaluation: the paper's figures 9 to 13 and its table 4, remade, as PNG and one HTML file."""
+"""Figures of a comparison of denoisers, and RMSE against photons: plain tables in, pictures out.
+
+Scores come as `{(method, target, level): {field: value}}`, samples as tuples of true depth `[H, W]` [m], gate [m],
+depth by method and a caption. A level is a backscatter fraction, the part of the pixels that report backscatter, or a
+range of photon counts.
+"""
 
 from __future__ import annotations
 
-import base64
-import dataclasses
-import json
 import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spadwarp.denoise.evaluation import Evaluation, Sample
-from spadwarp.denoise.metrics import LARGER_IS_BETTER
 from spadwarp.io.atomic import atomic_path
-from spadwarp.viz.pages import write_page
 
-__all__ = ["COLOURS", "TITLES", "write_report"]
+__all__ = [
+    "COLOURS",
+    "SCORES",
+    "TITLES",
+    "draw_denoised",
+    "draw_photon_sweep",
+    "draw_ranking",
+    "draw_samples",
+    "draw_scores",
+]
 
 TITLES = {
     "input": "noisy input",
@@ -28,6 +38,8 @@ TITLES = {
     "pyramid": "PyramidNet",
     "histograms": "PyramidNet, histograms",
 }
+"""Names of methods in tables and figures."""
+
 COLOURS = {
     "input": "0.55",
     "median": "#E69F00",
@@ -38,7 +50,9 @@ COLOURS = {
     "pyramid": "#0072B2",
     "histograms": "black",
 }
-_FIELDS = {
+"""Colours of methods."""
+
+SCORES = {
     "psnr": ("PSNR [dB]", "{:.2f}"),
     "ssim": ("SSIM", "{:.3f}"),
     "entropy": ("entropy [bit]", "{:.2f}"),
@@ -47,53 +61,164 @@ _FIELDS = {
     "within_5cm": ("within 5 cm", "{:.1%}"),
     "edge_mm": ("edge error [mm]", "{:.1f}"),
 }
-_DPI = 130
+"""Title and format of each score."""
+
+Sample = tuple[NDArray[np.float32], tuple[float, float], Mapping[str, NDArray[np.float32]], str]
 
 
-def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
-    """Writes `report.html`, its pictures and `scores.json` to a folder; returns the paths, the report first.
+def draw_scores(
+    scores: Mapping[tuple[str, str, str], Mapping[str, float]],
+    path: str | Path,
+    *,
+    methods: Sequence[str],
+    targets: Sequence[str],
+    levels: Sequence[str],
+    note: str,
+) -> Path:
+    """Scores against the level, target by target; `note` is written below. Returns the path."""
+    fields = ("psnr", "ssim", "entropy", "rmse_mm")
+    width = max(3.1 * len(targets) + 1.0, 5.2)
+    figure = _figure(width, 2.3 * len(fields) + 0.9)
+    axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
+    counted = any("photons" in level for level in levels)
+    places = [float(k) for k in range(len(levels))] if counted else [float(level) for level in levels]
+    labels = [level.removesuffix(" photons") if counted else level.lstrip("0") for level in levels]
+    for axis, field in zip(axes[:, 0], fields, strict=True):
+        axis.set_ylabel(SCORES[field][0])
+        axis.set_yscale("log" if field == "rmse_mm" else "linear")
+    lines: dict[str, Any] = {}
+    for column, target in enumerate(targets):
+        for axis, field in zip(axes[:, column], fields, strict=True):
+            for method in methods:
+                points = [
+                    (x, scores[method, target, level][field])
+                    for x, level in zip(places, levels, strict=True)
+                    if (method, target, level) in scores
+                ]
+                if points:
+                    bold = method == "pyramid"
+                    (lines[method],) = axis.plot(*zip(*points, strict=True), **_line(method, bold), zorder=2 + bold)
+            _plain_axis(axis)
+        axes[0, column].set_title(target.replace("_", " "), fontsize=11)
+        axes[-1, column].set_xticks(places, labels, fontsize=8)
+        axes[-1, column].set_xlabel("signal photons per pixel" if counted else "backscatter fraction")
+    names = [TITLES[name] for name in lines]
+    columns = min(len(names), int(width / 1.7))  # 1.7 inches hold the longest name and its line
+    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
+    return _write(figure, path, note)
 
-    Pictures: `metrics.png` (scores against backscatter, target by target; the paper's figure 9), `samples.png`
-    (methods side by side; 10), `rescaled.png` (the same over the target's own depth; 11), `detail.png` (a part
-    enlarged; 12), `ranking.png` (13). The table is the paper's table 4. Raises `FileError`.
+
+def draw_samples(
+    samples: Sequence[Sample],
+    path: str | Path,
+    *,
+    methods: Sequence[str],
+    note: str,
+    rescaled: bool = False,
+    enlarged: bool = False,
+) -> Path:
+    """A row for each sample: truth, then the methods. Returns the path.
+
+    `rescaled`: colours over the depth of the target, not over the gate. `enlarged`: only the part with most edges.
     """
-    place = Path(folder)
-    figures = {
-        "metrics.png": ("Scores against backscatter, target by target (the paper's figure 9)", _metrics(evaluation)),
-        "samples.png": ("Samples over the whole gate (figure 10)", _samples(evaluation)),
-        "rescaled.png": (
-            "The same samples over the depth of their target (figure 11)",
-            _samples(evaluation, tight=True),
-        ),
-        "detail.png": ("A part of each, enlarged (figure 12)", _samples(evaluation, tight=True, enlarged=True)),
-        "ranking.png": ("Means over targets and levels (figure 13)", _ranking(evaluation)),
-    }
-    written = []
-    for name, (_, figure) in figures.items():
-        with atomic_path(place / name) as temporary:
-            figure.savefig(temporary, dpi=_DPI, format="png")
-        written.append(place / name)
-    with atomic_path(place / "scores.json") as temporary:
-        temporary.write_text(json.dumps(_plain(evaluation.to_dict()), indent=1) + "\n")
-    tables = [_ranking_table(evaluation), _gain_table(evaluation)]
-    if evaluation.steps:
-        tables.append(_step_table(evaluation))
-    write_page(
-        place / "report.html",
-        "evaluation.html",
-        data=evaluation.data,
-        frames=sum(evaluation.frames.values()),
-        targets=evaluation.targets,
-        about=evaluation.about,
-        tables=tables,
-        pictures=[
-            (title, base64.b64encode((place / name).read_bytes()).decode()) for name, (title, _) in figures.items()
-        ],
-    )
-    return [place / "report.html", *written, place / "scores.json"]
+    methods = [name for name in methods if any(name in images for _, _, images, _ in samples)]
+    columns = 1 + len(methods)
+    height, width = samples[0][0].shape
+    ratio = 1.0 if enlarged else height / width
+    figure = _figure(2.05 * columns + 0.7, (2.05 * ratio + 0.34) * len(samples) + 0.5)
+    axes = figure.subplots(len(samples), columns, squeeze=False)
+    for axis, title in zip(axes[0], ["truth", *(TITLES[name] for name in methods)], strict=True):
+        axis.set_title(title, fontsize=9)
+    for row, (clean, gate, images, caption) in zip(axes, samples, strict=True):
+        part = _detail(clean, gate) if enlarged else (slice(None), slice(None))
+        low, high = _limits(clean[part], gate) if rescaled else gate
+        for axis, (name, image) in zip(row, [("truth", clean), *((n, images.get(n)) for n in methods)], strict=True):
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_color("0.8")
+            if image is None:
+                axis.text(0.5, 0.5, "not run", ha="center", va="center", color="0.5", transform=axis.transAxes)
+                continue
+            visible = np.where(np.isfinite(clean) | (name == "input"), image, np.nan)[part]
+            drawn = axis.imshow(visible, cmap=_colours(), vmin=low, vmax=high, interpolation="nearest")
+        bar = figure.colorbar(drawn, ax=list(row), fraction=0.02, pad=0.01)
+        bar.set_label("depth z [m]", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+        bar.outline.set_visible(False)
+        text = row[0].text(0.0, -0.04, caption, fontsize=7.5, va="top", transform=row[0].transAxes)
+        text.set_in_layout(False)  # may extend below the other images
+    figure.get_layout_engine().set(hspace=0.1)
+    return _write(figure, path, f"grey: no target; {note}")
 
 
-# Figures
+def draw_ranking(
+    means: Mapping[str, Mapping[str, float]], path: str | Path, *, larger_is_better: Mapping[str, bool], note: str
+) -> Path:
+    """Mean scores `{method: {field: value}}` as bars, the first method on top. Returns the path."""
+    fields = ("psnr", "ssim", "rmse_mm", "edge_mm")
+    order = list(means)[::-1]
+    figure = _figure(12.0, 0.42 * len(order) + 1.5)
+    for axis, field in zip(figure.subplots(1, len(fields), sharey=True), fields, strict=True):
+        values = [means[method][field] for method in order]
+        axis.barh(range(len(order)), values, color=[COLOURS[method] for method in order], height=0.7)
+        for y, value in enumerate(values):
+            axis.text(value, y, " " + SCORES[field][1].format(value), va="center", fontsize=8)
+        axis.set_yticks(range(len(order)), [TITLES[method] for method in order])
+        axis.set_xlim(0, 1.25 * max(values))
+        axis.set_xlabel(SCORES[field][0] + (" (more is better)" if larger_is_better[field] else " (less is better)"))
+        axis.spines[["top", "right"]].set_visible(False)
+    return _write(figure, path, note)
+
+
+def draw_photon_sweep(
+    rmse: Mapping[str, NDArray[np.float64]],
+    bound: NDArray[np.float64],
+    path: str | Path,
+    *,
+    photons: Sequence[float],
+    sbr: Sequence[float],
+    note: str,
+) -> Path:
+    """RMSE [m] by method `[S, P]` against signal photons `[P]`, beside the Cramér–Rao bound `[S, P]` [m].
+
+    One panel for each signal-to-background ratio (SBR), `[S]`. Returns the path.
+    """
+    columns = len(sbr)
+    figure = _figure(3.3 * columns + 0.4, 3.9)
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=True)):
+        for name, values in rmse.items():
+            label = "likelihood of each pixel" if name == "input" else TITLES[name]
+            axis.plot(photons, 1e3 * values[row], label=label, **_line(name, name == "histograms"))
+        axis.plot(photons, 1e3 * bound[row], color="black", linestyle=":", label="Cramér–Rao bound of a pixel")
+        axis.set(xscale="log", yscale="log", xlabel="signal photons per pixel", title=f"SBR {ratio:g}")
+        _plain_axis(axis, grid="both")
+    axes[0].set_ylabel("RMSE of depth [mm]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5)
+    return _write(figure, path, note, dpi=150)
+
+
+def draw_denoised(
+    noisy: NDArray[np.float32],
+    denoised: NDArray[np.float32],
+    path: str | Path,
+    *,
+    gate: tuple[float, float],
+    title: str,
+) -> Path:
+    """A frame before and after, depth `[H, W]` [m] each; returns the path."""
+    from spadwarp.viz.result import image_panels, show_image, shown_limits
+
+    figure, images, bars = image_panels(noisy.shape, 2)
+    low, high = shown_limits(denoised if np.isfinite(denoised).any() else noisy, beyond=1.0)
+    low, high = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
+    for image, bar, values, name in zip(images, bars, (noisy, denoised), ("Input", "Denoised"), strict=True):
+        show_image(image, bar, values, title=name, label="depth z [m]", colours="viridis_r", low=low, high=high)
+    figure.suptitle(title, fontsize=9, color="0.25")
+    return _write(figure, path, dpi=150)
+
+
+# Parts
 
 
 def _figure(width: float, height: float) -> Any:
@@ -102,107 +227,29 @@ def _figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
-def _metrics(evaluation: Evaluation) -> Any:
-    fields = ("psnr", "ssim", "entropy", "rmse_mm")
-    targets = evaluation.targets
-    width = max(3.1 * len(targets) + 1.0, 5.2)
-    figure = _figure(width, 2.3 * len(fields) + 0.9)
-    axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
-    places, labels = _level_axis(evaluation)
-    lines: dict[str, Any] = {}
-    for column, target in enumerate(targets):
-        for row, field in enumerate(fields):
-            axis = axes[row, column]
-            for method in evaluation.methods:
-                points = [
-                    (x, getattr(evaluation.scores[method, target, level], field))
-                    for x, level in zip(places, evaluation.levels, strict=True)
-                    if (method, target, level) in evaluation.scores
-                ]
-                if points:
-                    bold = method == "pyramid"
-                    (lines[method],) = axis.plot(
-                        *zip(*points, strict=True), color=COLOURS[method], marker="o", markersize=3.5,
-                        linewidth=2.2 if bold else 1.2, zorder=3 if bold else 2,
-                        linestyle="--" if method == "input" else "-",
-                    )  # fmt: skip
-            if field == "rmse_mm":
-                axis.set_yscale("log")
-            axis.grid(color="0.92")
-            axis.set_axisbelow(True)
-            axis.spines[["top", "right"]].set_visible(False)
-            if row == 0:
-                axis.set_title(target.replace("_", " "), fontsize=11)
-            if column == 0:
-                axis.set_ylabel(_FIELDS[field][0])
-            if row == len(fields) - 1:
-                axis.set_xticks(places, labels, fontsize=8)
-                axis.set_xlabel(_level_name(evaluation))
-    names = [TITLES[name] for name in lines]
-    columns = min(len(names), int(width / 1.7))  # 1.7 inches hold the longest name and its line
-    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
-    _stated(figure, evaluation.about)
-    return figure
+def _line(method: str, bold: bool) -> dict[str, Any]:
+    return {
+        "color": COLOURS[method],
+        "marker": "o",
+        "markersize": 3.5,
+        "linewidth": 2.2 if bold else 1.2,
+        "linestyle": "--" if method == "input" else "-",
+    }
 
 
-def _samples(evaluation: Evaluation, *, tight: bool = False, enlarged: bool = False) -> Any:
-    """A row for each target at a middle level and at the highest; truth, then the methods."""
-    levels = list(dict.fromkeys((evaluation.levels[len(evaluation.levels) // 3], evaluation.levels[-1])))
-    keys = [(t, at) for t in evaluation.targets for at in levels if (t, at) in evaluation.samples]
-    methods = [name for name in evaluation.methods if any(name in evaluation.samples[key].images for key in keys)]
-    columns = 1 + len(methods)
-    first = evaluation.samples[keys[0]].clean
-    ratio = 1.0 if enlarged else first.shape[0] / first.shape[1]
-    figure = _figure(2.05 * columns + 0.7, (2.05 * ratio + 0.34) * len(keys) + 0.5)
-    axes = figure.subplots(len(keys), columns, squeeze=False)
-    for row, key in enumerate(keys):
-        sample = evaluation.samples[key]
-        rows, cols = _detail(sample) if enlarged else (slice(None), slice(None))
-        low, high = _limits(sample, rows, cols) if tight else sample.gate
-        shown = {"truth": sample.clean, **{name: sample.images.get(name) for name in methods}}
-        for axis, (name, image) in zip(axes[row], shown.items(), strict=True):
-            axis.set_xticks([])
-            axis.set_yticks([])
-            for spine in axis.spines.values():
-                spine.set_color("0.8")
-            if image is None:
-                axis.text(0.5, 0.5, "not run", ha="center", va="center", color="0.5", transform=axis.transAxes)
-                continue
-            visible = np.where(np.isfinite(sample.clean) | (name == "input"), image, np.nan)[rows, cols]
-            drawn = axis.imshow(visible, cmap=_colours(), vmin=low, vmax=high, interpolation="nearest")
-            if row == 0:
-                axis.set_title("truth" if name == "truth" else TITLES[name], fontsize=9)
-        bar = figure.colorbar(drawn, ax=list(axes[row]), fraction=0.02, pad=0.01)
-        bar.set_label("depth z [m]", fontsize=8)
-        bar.ax.tick_params(labelsize=7)
-        bar.outline.set_visible(False)
-        caption = axes[row, 0].text(0.0, -0.04, sample.about, fontsize=7.5, va="top", transform=axes[row, 0].transAxes)
-        caption.set_in_layout(False)  # runs on below the other images
-    figure.get_layout_engine().set(hspace=0.1)
-    _stated(figure, f"grey: no target; {evaluation.about}")
-    return figure
+def _plain_axis(axis: Any, *, grid: str = "major") -> None:
+    axis.grid(color="0.92", which=grid)
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
-def _ranking(evaluation: Evaluation) -> Any:
-    fields = ("psnr", "ssim", "rmse_mm", "edge_mm")
-    order = evaluation.ranking()[::-1]
-    figure = _figure(12.0, 0.42 * len(order) + 1.5)
-    for axis, field in zip(figure.subplots(1, len(fields), sharey=True), fields, strict=True):
-        values = [getattr(evaluation.mean(method), field) for method in order]
-        axis.barh(range(len(order)), values, color=[COLOURS[one] for one in order], height=0.7)
-        for y, value in enumerate(values):
-            axis.text(value, y, " " + _FIELDS[field][1].format(value), va="center", fontsize=8)
-        axis.set_yticks(range(len(order)), [TITLES[one] for one in order])
-        axis.set_xlim(0, 1.25 * max(values))
-        axis.set_xlabel(_FIELDS[field][0] + (" (more is better)" if LARGER_IS_BETTER[field] else " (less is better)"))
-        axis.spines[["top", "right"]].set_visible(False)
-    _stated(figure, evaluation.about)
-    return figure
-
-
-def _stated(figure: Any, text: str) -> None:
-    width = int(14 * figure.get_figwidth())  # characters of this size
-    figure.supxlabel(textwrap.fill(text, width), fontsize=8, color="0.35")
+def _write(figure: Any, path: str | Path, note: str = "", *, dpi: int = 130) -> Path:
+    """Writes a PNG with a note below the figure."""
+    if note:
+        figure.supxlabel(textwrap.fill(note, int(14 * figure.get_figwidth())), fontsize=8, color="0.35")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")
+    return Path(path)
 
 
 def _colours() -> Any:
@@ -211,95 +258,18 @@ def _colours() -> Any:
     return matplotlib.colormaps["viridis_r"].with_extremes(bad="0.85")
 
 
-def _limits(sample: Sample, rows: slice, columns: slice) -> tuple[float, float]:
-    part = sample.clean[rows, columns]
-    part = part[np.isfinite(part) & (part < sample.gate[1])]
-    low, high = (float(part.min()), float(part.max())) if part.size else sample.gate
+def _limits(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[float, float]:
+    depths = clean[np.isfinite(clean) & (clean < gate[1])]
+    low, high = (float(depths.min()), float(depths.max())) if depths.size else gate
     return low - 0.05 * (high - low) - 0.01, high + 0.05 * (high - low) + 0.01
 
 
-def _detail(sample: Sample) -> tuple[slice, slice]:
+def _detail(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[slice, slice]:
     """A square of a quarter of the height where the truth has most edges."""
-    clean = np.nan_to_num(sample.clean, nan=sample.gate[1] + 0.5)
-    busy = np.minimum(np.abs(np.diff(clean, axis=0))[:, :-1] + np.abs(np.diff(clean, axis=1))[:-1], 0.3)
-    side = max(16, sample.clean.shape[0] // 4)
-    total = np.pad(busy.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    depth = np.nan_to_num(clean, nan=gate[1] + 0.5)
+    edges = np.minimum(np.abs(np.diff(depth, axis=0))[:, :-1] + np.abs(np.diff(depth, axis=1))[:-1], 0.3)
+    side = max(16, clean.shape[0] // 4)
+    total = np.pad(edges.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     sums = total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
-    row, column = np.unravel_index(int(sums.argmax()), sums.shape)
-    return slice(int(row), int(row) + side), slice(int(column), int(column) + side)
-
-
-def _level_axis(evaluation: Evaluation) -> tuple[list[float], list[str]]:
-    """Where levels stand on an axis, and their labels."""
-    if _level_name(evaluation).startswith("BS"):
-        return [float(level) for level in evaluation.levels], [level.lstrip("0") for level in evaluation.levels]
-    return [float(k) for k in range(len(evaluation.levels))], [
-        one.removesuffix(" photons") for one in evaluation.levels
-    ]
-
-
-def _level_name(evaluation: Evaluation) -> str:
-    counted = any("photons" in level for level in evaluation.levels)
-    return "signal photons a pixel" if counted else "BS, part of pixels that report backscatter"
-
-
-# Tables: a title, the names of the columns, and rows of a name and cells (text, whether it is the best)
-
-_Table = tuple[str, list[str], list[tuple[str, list[tuple[str, bool]]]]]
-
-
-def _ranking_table(evaluation: Evaluation) -> _Table:
-    means = {method: dataclasses.asdict(evaluation.mean(method)) for method in evaluation.methods}
-    best = {
-        field: (max if larger else min)(values[field] for values in means.values())
-        for field, larger in LARGER_IS_BETTER.items()
-    }
-    rows = []
-    for method in evaluation.ranking():
-        cells = [
-            (template.format(means[method][field]), means[method][field] == best.get(field))
-            for field, (_, template) in _FIELDS.items()
-        ]
-        rows.append((TITLES[method], cells))
-    title = "Ranking: means over targets and levels (the paper's table 4)"
-    return title, ["method", *(name for name, _ in _FIELDS.values())], rows
-
-
-def _gain_table(evaluation: Evaluation) -> _Table:
-    """PSNR in dB and SSIM in percent above the input's."""
-    rows = []
-    for method in evaluation.ranking():
-        cells = []
-        for level in evaluation.levels:
-            if not any(key[0] == method and key[2] == level for key in evaluation.scores):
-                cells.append(("–", False))
-                continue
-            one, before = evaluation.mean(method, level=level), evaluation.mean("input", level=level)
-            if method == "input":
-                cells.append((f"{one.psnr:.2f}\N{NO-BREAK SPACE}dB, {one.ssim:.3f}", False))
-            else:
-                ssim = 100 * (one.ssim / before.ssim - 1)
-                cells.append(
-                    (f"{one.psnr - before.psnr:+.2f}\N{NO-BREAK SPACE}dB, {ssim:+.0f}\N{NO-BREAK SPACE}%", False)
-                )
-        window = " (" + ", ".join(map(str, evaluation.windows.values())) + ")" if method == "median" else ""
-        rows.append((TITLES[method] + window, cells))
-    return "Gain over the noisy input, level by level", ["PSNR, SSIM", *evaluation.levels], rows
-
-
-def _step_table(evaluation: Evaluation) -> _Table:
-    rows = []
-    for method in evaluation.ranking():
-        found = [evaluation.steps.get((method, level)) for level in evaluation.levels]
-        rows.append(
-            (TITLES[method], [("–" if one is None else f"{one.resolved} of {one.total}", False) for one in found])
-        )
-    return "Steps of 10 cm that the staircase's frames resolve to 3 cm", ["method", *evaluation.levels], rows
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
-    if isinstance(value, list):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    row, column = map(int, np.unravel_index(int(sums.argmax()), sums.shape))
+    return slice(row, row + side), slice(column, column + side)

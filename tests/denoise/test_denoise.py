@@ -208,16 +208,16 @@ def dataset(tmp_path_factory):
 
 
 def test_evaluation_and_report(dataset, tmp_path):
-    found = spadwarp.evaluate(dataset, models=("median", "gating"), frames=2)
+    found = spadwarp.denoise.evaluate(dataset, models=("median", "gating"), frames=2)
     assert found.levels == ("0.042", "0.480") and found.targets == ("staircase",)
     for level in found.levels:
         assert found.mean("median", level=level).psnr > found.mean("input", level=level).psnr + 3
     assert found.ranking()[-1] == "input"
     assert found.windows["0.042"] <= found.windows["0.480"]
     assert found.steps["input", "0.042"].total > 0
-    assert "seed" in found.about and "photons" in found.about and "attenuation lengths" in found.about
-    middle = spadwarp.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
-    assert "the middle 32 x 24 pixels" in middle.about
+    assert "seed" in found.summary and "photons" in found.summary and "attenuation lengths" in found.summary
+    middle = spadwarp.denoise.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
+    assert "the middle 32 x 24 pixels" in middle.summary
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
     result = CliRunner().invoke(
         app, ["evaluate", str(dataset), "--models", "median", "--frames", "1", "--report", str(tmp_path)]
@@ -232,13 +232,13 @@ def test_evaluation_and_report(dataset, tmp_path):
 
 def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
     with pytest.raises(ValueError, match="'unet' is not one of"):
-        spadwarp.evaluate(dataset, models=("unet",))
+        spadwarp.denoise.evaluate(dataset, models=("unet",))
     with pytest.raises(ValueError, match="'histograms' needs histograms, which datasets do not keep"):
-        spadwarp.evaluate(dataset, models=("histograms",))
+        spadwarp.denoise.evaluate(dataset, models=("histograms",))
     with pytest.raises(ValueError, match=r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"):
-        spadwarp.evaluate(dataset, models=("median",), crop=(65, 48))
+        spadwarp.denoise.evaluate(dataset, models=("median",), crop=(65, 48))
     with pytest.raises(FileError, match="no dataset there"):
-        spadwarp.evaluate(tmp_path)
+        spadwarp.denoise.evaluate(tmp_path)
 
 
 def test_training_from_a_dataset(dataset, tmp_path):
@@ -247,18 +247,18 @@ def test_training_from_a_dataset(dataset, tmp_path):
     result = CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "run"), "--device", "cpu"])
     assert result.exit_code == 0, result.output
     assert {one.name for one in (tmp_path / "run").iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
-    assert inference.weights_card("usdn", tmp_path / "run" / "usdn.safetensors")["seed"] == "0"
+    assert inference.weights_metadata("usdn", tmp_path / "run" / "usdn.safetensors")["seed"] == "0"
     own = tmp_path / "run" / "usdn.safetensors"
-    trained = spadwarp.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
-    shipped = spadwarp.evaluate(dataset, models=("usdn",), frames=1, device="cpu")
+    trained = spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
+    shipped = spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, device="cpu")
     assert trained.mean("usdn").psnr < shipped.mean("usdn").psnr  # two steps against a whole training
-    assert trained.mean("input") == shipped.mean("input") and str(own) in trained.about
+    assert trained.mean("input") == shipped.mean("input") and str(own) in trained.summary
     with pytest.raises(ValueError, match="'usdn', which is not among models: dncnn"):
-        spadwarp.evaluate(dataset, models=("dncnn",), weights=own)
+        spadwarp.denoise.evaluate(dataset, models=("dncnn",), weights=own)
     recipe.write_text('model = "usdn"\n')
     assert CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "other")]).exit_code == 2
     with pytest.raises(ConfigError, match="data"):
-        spadwarp.train(recipe, tmp_path / "other")
+        spadwarp.denoise.train(recipe, tmp_path / "other")
 
 
 def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, monkeypatch):
@@ -303,8 +303,8 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, mo
     def both(scenes, noise, *, size, generator, **others):
         if others.get("always_replaced"):  # of the validation
             return draw(scenes, noise, size=size, generator=generator, **others)
-        halves = [vars(draw(scenes, noise, size=size // 2, generator=one, **others)) for one in streams]
-        return training.Batch(**{name: torch.cat([half[name] for half in halves]) for name in halves[0]})
+        halves = [draw(scenes, noise, size=size // 2, generator=one, **others) for one in streams]
+        return training.Batch(*map(torch.cat, zip(*halves, strict=True)))
 
     def mean_loss(output, batch, *, kind):
         halves = zip(*(one.chunk(2) for one in (output, batch.frame, batch.clean, batch.hit)), strict=True)

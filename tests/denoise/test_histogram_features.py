@@ -8,7 +8,7 @@ from scipy.stats import exponnorm, norm
 import spadwarp
 from spadwarp.denoise import inference
 from spadwarp.denoise import synthetic_noise as noise
-from spadwarp.denoise.histogram_features import CLUES, EDGES, WINDOWS, histogram_clues
+from spadwarp.denoise.histogram_features import EDGES, FEATURES, WINDOWS, extract_features
 from spadwarp.denoise.recipe import Noise
 
 torch.set_num_threads(1)
@@ -31,14 +31,14 @@ def histograms(place, photons, background, *, law=None, side=32, bins=BINS, seed
 def clues_of(counts, level, taps=TAPS):
     level = np.reshape(level, (1, 1, -1)) if np.ndim(level) == 1 else level
     arrays = (torch.tensor(np.asarray(one, np.float32))[None] for one in (counts, level, taps / taps.sum()))
-    return histogram_clues(*arrays)[0].numpy()
+    return extract_features(*arrays)[0].numpy()
 
 
 def test_pooled_histograms_find_what_pixels_cannot():
     """One signal photon among twenty of the background: nine and 49 pixels have 9 and 49 of them in a few bins."""
     counts, level = histograms(70.3, 1.0, 20.0)
     found = clues_of(counts, level)
-    assert found.shape == (CLUES, 32, 32) and len(WINDOWS) == 3
+    assert found.shape == (FEATURES, 32, 32) and len(WINDOWS) == 3
     template = np.log1p(np.array([[norm.pdf(j - k, scale=SIGMA) / level[j] for k in range(BINS)] for j in range(BINS)]))
     alone = ((counts - level) @ template).argmax(axis=-1) + 0.5
     right = [np.mean(np.abs(place - 70.3) < 2) for place in (alone, *(BINS * found[:2]))]
@@ -115,8 +115,8 @@ def test_histograms_help_where_photons_are_few():
     template = np.log1p(np.array([[norm.pdf(j - k, scale=SIGMA) / level[j] for k in range(BINS)] for j in range(BINS)]))
     depth = 13.5 + 2.5 * ((counts @ template).argmax(axis=-1) + 0.5) / BINS
     options = {"gate": (13.5, 16.0), "profile": level, "device": "cpu"}
-    alone = spadwarp.denoise.inference.denoise(depth, **options)
-    together = spadwarp.denoise.inference.denoise(depth, counts=counts, background=level, response=TAPS, **options)
+    alone = spadwarp.denoise.apply(depth, **options)
+    together = spadwarp.denoise.apply(depth, counts=counts, background=level, response=TAPS, **options)
     before, after = (np.sqrt(np.nanmean((one - clean) ** 2)) for one in (alone, together))
     assert after < 0.7 * before
 
@@ -126,8 +126,8 @@ def test_a_frame_that_is_turned_gives_the_same_depth():
     counts, level = histograms(np.linspace(40.0, 80.0, 32) + np.zeros((32, 1)), 3.0, 3.0)
     depth = np.full((32, 32), 15.0)
     options = {"gate": (13.5, 16.0), "background": level, "response": TAPS, "device": "cpu"}
-    found = spadwarp.denoise.inference.denoise(depth, counts=counts, **options)
-    turned = spadwarp.denoise.inference.denoise(depth, counts=counts[::-1, ::-1], **options)
+    found = spadwarp.denoise.apply(depth, counts=counts, **options)
+    turned = spadwarp.denoise.apply(depth, counts=counts[::-1, ::-1], **options)
     assert np.nanmax(np.abs(turned[::-1, ::-1] - found)) < 1e-4
 
 
@@ -136,7 +136,7 @@ def test_a_frame_that_is_turned_gives_the_same_depth():
     [
         ({"counts": np.zeros((16, 16))}, "counts are float64"),
         ({"background": np.zeros(5)}, "background has shape"),
-        ({"background": None}, "counts go with background and response"),
+        ({"background": None}, "counts need background and response"),
         ({"response": np.ones(4)}, "response has shape"),
         ({"counts": np.zeros((20, 16, 8))}, "histograms are 1 frames"),
     ],
@@ -144,12 +144,12 @@ def test_a_frame_that_is_turned_gives_the_same_depth():
 def test_errors_name_what_is_wrong(changed, said):
     given = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3), **changed}
     with pytest.raises(ValueError, match=said):
-        spadwarp.denoise.inference.denoise(np.full((16, 16), 15.0), gate=(13.5, 16.0), **given, device="cpu")
+        spadwarp.denoise.apply(np.full((16, 16), 15.0), gate=(13.5, 16.0), **given, device="cpu")
 
 
 def test_shapes_of_clues():
     counts = np.random.default_rng(1).poisson(0.1, (2, 9, 10, 32))
-    found = inference.clues_of(counts, background=np.full(32, 0.1), response=np.ones(3), device="cpu")
-    assert found.shape == (2, CLUES, 9, 10) and found.dtype == np.float32
-    one = inference.clues_of(counts[1], background=np.full(32, 0.1), response=np.ones(3), device="cpu")
+    found = inference.features_of_histograms(counts, background=np.full(32, 0.1), response=np.ones(3), device="cpu")
+    assert found.shape == (2, FEATURES, 9, 10) and found.dtype == np.float32
+    one = inference.features_of_histograms(counts[1], background=np.full(32, 0.1), response=np.ones(3), device="cpu")
     assert np.array_equal(one[0], found[1])

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from spadwarp import ConfigError, FileError
 from spadwarp.denoise import inference, networks
 from spadwarp.denoise import synthetic_noise as noise
-from spadwarp.denoise.histogram_features import CLUES
+from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch
 from spadwarp.denoise.training import fit, loss_of
@@ -52,7 +52,7 @@ def draw(plain, *, size=64, crop=64, seed=3, **options):
 def test_networks_keep_the_size(model, shape):
     network = networks.build_network(model).eval()
     with torch.inference_mode():
-        output = network(torch.rand(1, 3 + CLUES * networks.reads_histograms(network), *shape))
+        output = network(torch.rand(1, 3 + FEATURES * networks.reads_histograms(network), *shape))
     assert output.shape == (1, {"pyramid": 3, "histograms": 4}.get(model, 1), *shape)
     assert torch.isfinite(output).all()
 
@@ -185,7 +185,7 @@ def test_crops_without_a_target_teach_no_depth():
 def test_depth_that_was_chosen_teaches_what_is_the_targets():
     """Of histograms: a depth that is right may not be called wrong because the pixel's own is."""
     hit = torch.ones(1, 1, 32, 32)
-    batch = Batch(torch.zeros(1, 3 + CLUES, 32, 32), 0.5 * hit, hit)
+    batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit)
     right, wrong = (torch.cat([0.5 * hit, 9 * hit, 9 * hit, chosen * hit], dim=1) for chosen in (0.5, 0.1))
     assert loss_of(right, batch, kind="mse") < 1e-3 < 0.1 < loss_of(wrong, batch, kind="mse")
 
@@ -222,12 +222,12 @@ def test_histograms_are_learnt_from_the_weights_for_depth(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
     recipe = TrainingRecipe.from_dict({**RECIPE, "model": "histograms", "start": "pyramid", "noise": noise})
     done = fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
-    depth_alone, _ = inference.load_network("pyramid")
+    depth_alone = inference.load_network("pyramid")
     learnt = load_file(done.weights)
     for name, values in depth_alone.state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.05), name  # six steps
-    assert "enter_clues.weight" in learnt
-    card = inference.weights_card("histograms", done.weights)
+    assert "enter_features.weight" in learnt
+    card = inference.weights_metadata("histograms", done.weights)
     assert set(card["validation_psnr"]) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
 
 

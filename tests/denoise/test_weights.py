@@ -28,7 +28,7 @@ def test_each_network_improves_a_frame_it_has_never_seen(model):
     clean = scene(96, 128)
     noisy = noisy_frame(clean)
     seen = np.isfinite(clean)
-    found = np.where(seen, spadwarp.denoise.inference.denoise(noisy, gate=GATE, model=model, device="cpu"), np.nan)
+    found = np.where(seen, spadwarp.denoise.apply(noisy, gate=GATE, model=model, device="cpu"), np.nan)
     before = metrics.score(clean, np.nan_to_num(noisy, nan=14.75), gate=GATE)
     after = metrics.score(clean, np.nan_to_num(found, nan=14.75), gate=GATE)
     assert after.psnr > before.psnr + 3
@@ -50,13 +50,13 @@ def test_pyramid_beats_the_median_and_knows_where_nothing_is():
 @pytest.mark.parametrize("model", OF_DEPTH)
 def test_any_size(model, shape):
     depth = np.full(shape, 15.0, np.float32)
-    found = spadwarp.denoise.inference.denoise(np.stack([depth, depth]), gate=GATE, model=model, device="cpu")
+    found = spadwarp.denoise.apply(np.stack([depth, depth]), gate=GATE, model=model, device="cpu")
     assert found.shape == (2, *shape) and found.dtype == np.float32
 
 
 def test_a_large_frame():
     depth = np.full((768, 1024), 15.0, np.float32)
-    found = spadwarp.denoise.inference.denoise(depth, gate=GATE, device="cpu")
+    found = spadwarp.denoise.apply(depth, gate=GATE, device="cpu")
     assert found.shape == depth.shape
     assert abs(np.nanmedian(found) - 15.0) < 0.01
 
@@ -87,7 +87,7 @@ def test_backscatter_alone_is_no_target(share, decay):
     place = generator.choice(64, size=(96, 128), p=profile / profile.sum()) + generator.random((96, 128))
     depth = GATE[0] + (GATE[1] - GATE[0]) * place / 64
     depth[generator.random(depth.shape) >= share] = np.nan
-    found = spadwarp.denoise.inference.denoise(depth, gate=GATE, profile=profile, device="cpu")
+    found = spadwarp.denoise.apply(depth, gate=GATE, profile=profile, device="cpu")
     assert np.isfinite(found).mean() < 0.01
 
 
@@ -105,14 +105,14 @@ def test_nothing_stands_for_what_lies_beside_a_target():
 
 @pytest.mark.parametrize("model", [*OF_DEPTH, "median", "gating"])
 def test_an_empty_frame_stays_empty(model):
-    assert np.isnan(spadwarp.denoise.inference.denoise(np.full((32, 40), np.nan), gate=GATE, model=model)).all()
-    assert np.isnan(spadwarp.denoise.inference.denoise(np.zeros((2, 32, 40), np.float32), gate=GATE, model=model)).all()
+    assert np.isnan(spadwarp.denoise.apply(np.full((32, 40), np.nan), gate=GATE, model=model)).all()
+    assert np.isnan(spadwarp.denoise.apply(np.zeros((2, 32, 40), np.float32), gate=GATE, model=model)).all()
 
 
 def test_pyramid_fills_what_the_camera_missed():
     clean = np.full((64, 64), 15.0, np.float32)
     dead = np.random.default_rng(1).random(clean.shape) < 0.1
-    found = spadwarp.denoise.inference.denoise(np.where(dead, np.nan, clean), gate=GATE, device="cpu")
+    found = spadwarp.denoise.apply(np.where(dead, np.nan, clean), gate=GATE, device="cpu")
     assert np.isfinite(found[dead]).mean() > 0.99
     assert np.nanpercentile(np.abs(found - clean), 99) < 0.01
 
@@ -120,17 +120,17 @@ def test_pyramid_fills_what_the_camera_missed():
 @pytest.mark.parametrize("model", OF_DEPTH)
 def test_a_frame_takes_no_part_in_the_next(model):
     frames = np.stack([noisy_frame(scene(), seed=seed) for seed in range(2)])
-    both = spadwarp.denoise.inference.denoise(frames, gate=GATE, model=model, device="cpu")
+    both = spadwarp.denoise.apply(frames, gate=GATE, model=model, device="cpu")
     for frame, found in zip(frames, both, strict=True):
-        alone = spadwarp.denoise.inference.denoise(frame, gate=GATE, model=model, device="cpu")
+        alone = spadwarp.denoise.apply(frame, gate=GATE, model=model, device="cpu")
         assert np.nanmax(np.abs(alone - found)) < 1e-4
 
 
 def test_distance_does_not_matter_but_the_place_in_the_gate_does():
     clean = scene()
     noisy = noisy_frame(clean)
-    near = spadwarp.denoise.inference.denoise(noisy, gate=GATE, device="cpu")
-    far = spadwarp.denoise.inference.denoise(noisy + 35.0, gate=(GATE[0] + 35.0, GATE[1] + 35.0), device="cpu")
+    near = spadwarp.denoise.apply(noisy, gate=GATE, device="cpu")
+    far = spadwarp.denoise.apply(noisy + 35.0, gate=(GATE[0] + 35.0, GATE[1] + 35.0), device="cpu")
     assert np.nanmax(np.abs(far - 35.0 - near)) < 2e-3
 
 
@@ -138,7 +138,7 @@ def test_depth_outside_the_gate_is_said_and_left_out():
     depth = np.full((32, 32), 15.0, np.float32)
     depth[:4] = 40.0
     with pytest.warns(UserWarning, match="128 of 1024 depths lie outside the gate of 13.5 to 16 m"):
-        found = spadwarp.denoise.inference.denoise(depth, gate=GATE, device="cpu")
+        found = spadwarp.denoise.apply(depth, gate=GATE, device="cpu")
     assert np.nanmax(found) <= 16.0
 
 
@@ -156,27 +156,25 @@ def test_depth_outside_the_gate_is_said_and_left_out():
 )
 def test_errors_name_what_is_wrong(arguments, said):
     with pytest.raises(ValueError, match=said):
-        spadwarp.denoise.inference.denoise(**{"depth": np.full((32, 32), 15.0), "gate": GATE, **arguments})
+        spadwarp.denoise.apply(**{"depth": np.full((32, 32), 15.0), "gate": GATE, **arguments})
 
 
 def test_weights_must_be_weights(tmp_path):
     depth = np.full((32, 32), 15.0)
     with pytest.raises(FileError, match="no such file"):
-        spadwarp.denoise.inference.denoise(depth, gate=GATE, weights=tmp_path / "none.safetensors")
+        spadwarp.denoise.apply(depth, gate=GATE, weights=tmp_path / "none.safetensors")
     (tmp_path / "junk.safetensors").write_bytes(b"\x00" * 100)
     with pytest.raises(FileError, match=r"junk.safetensors"):
-        spadwarp.denoise.inference.denoise(depth, gate=GATE, weights=tmp_path / "junk.safetensors")
+        spadwarp.denoise.apply(depth, gate=GATE, weights=tmp_path / "junk.safetensors")
     with pytest.raises(FileError, match="weights of 'usdn', not of 'dncnn'"):
-        spadwarp.denoise.inference.denoise(
-            depth, gate=GATE, model="dncnn", weights=inference.WEIGHTS / "usdn.safetensors"
-        )
+        spadwarp.denoise.apply(depth, gate=GATE, model="dncnn", weights=inference.WEIGHTS / "usdn.safetensors")
     with pytest.raises(DeviceError, match="cuda:77"):
-        spadwarp.denoise.inference.denoise(depth, gate=GATE, device="cuda:77")
+        spadwarp.denoise.apply(depth, gate=GATE, device="cuda:77")
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_weights_say_how_they_were_made(model):
-    card = inference.weights_card(model)
+    card = inference.weights_metadata(model)
     assert card["model"] == model
     assert card["recipe"]["model"] == model
     assert float(card["hours"]) < 8 / 60
@@ -186,7 +184,7 @@ def test_the_weights_say_how_they_were_made(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_weights_of_the_package_come_from_the_training_set(model):
-    assert inference.weights_card(model)["recipe"]["data"] == "data/training"
+    assert inference.weights_metadata(model)["recipe"]["data"] == "data/training"
 
 
 EXTRA = Path(os.environ.get("SPADWARP_EXTRA_DATA", "")) / "ue_exr"

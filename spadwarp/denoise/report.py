@@ -1,0 +1,137 @@
+"""The report of an evaluation: the paper's figures 9 to 13 and its table 4, as PNG and one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spadwarp.denoise.evaluation import Evaluation
+from spadwarp.denoise.metrics import LARGER_IS_BETTER
+from spadwarp.io.atomic import atomic_path
+from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_samples, draw_scores
+from spadwarp.viz.pages import write_page
+
+__all__ = ["TITLES", "write_report"]
+
+_NBSP = "\N{NO-BREAK SPACE}"
+
+# A title, the names of the columns, and rows of a name and cells, each a text and whether it is the best of its column.
+_Table = tuple[str, list[str], list[tuple[str, list[tuple[str, bool]]]]]
+
+
+def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
+    """Writes `report.html`, its pictures and `scores.json` to a folder; returns the paths, the report first.
+
+    Pictures: `metrics.png` (scores against the backscatter fraction, target by target; the paper's figure 9),
+    `samples.png` (methods side by side; 10), `rescaled.png` (the same over the target's own depth; 11), `detail.png` (a
+    part enlarged; 12), `ranking.png` (13). The table is the paper's table 4. Raises `FileError`.
+    """
+    place = Path(folder)
+    pictures = _draw(evaluation, place)
+    with atomic_path(place / "scores.json") as temporary:
+        temporary.write_text(json.dumps(_without_nan(evaluation.to_dict()), indent=1) + "\n")
+    tables = [_means(evaluation), _gains(evaluation), *([_steps(evaluation)] if evaluation.steps else [])]
+    write_page(
+        place / "report.html",
+        "evaluation.html",
+        data=evaluation.data,
+        frames=sum(evaluation.frames.values()),
+        targets=evaluation.targets,
+        summary=evaluation.summary,
+        tables=tables,
+        pictures=[(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()],
+    )
+    return [place / "report.html", *pictures.values(), place / "scores.json"]
+
+
+def _draw(evaluation: Evaluation, place: Path) -> dict[str, Path]:
+    """The pictures by their titles."""
+    scores = {key: dataclasses.asdict(scores) for key, scores in evaluation.scores.items()}
+    means = {method: dataclasses.asdict(evaluation.mean(method)) for method in evaluation.ranking()}
+    note, targets, levels = evaluation.summary, evaluation.targets, evaluation.levels
+    named: dict[str, Any] = {"methods": evaluation.methods, "note": note}
+    keys = [(target, level) for target in targets for level in dict.fromkeys((levels[len(levels) // 3], levels[-1]))]
+    samples = [evaluation.samples[key] for key in keys if key in evaluation.samples]
+    return {
+        "Scores against the level, target by target (the paper's figure 9)": draw_scores(
+            scores, place / "metrics.png", targets=targets, levels=levels, **named
+        ),
+        "Samples over the whole gate (figure 10)": draw_samples(samples, place / "samples.png", **named),
+        "The same samples over the depth of their target (figure 11)": draw_samples(
+            samples, place / "rescaled.png", rescaled=True, **named
+        ),
+        "A part of each sample, enlarged (figure 12)": draw_samples(
+            samples, place / "detail.png", rescaled=True, enlarged=True, **named
+        ),
+        "Means over targets and levels (figure 13)": draw_ranking(
+            means, place / "ranking.png", larger_is_better=LARGER_IS_BETTER, note=note
+        ),
+    }
+
+
+def _means(evaluation: Evaluation) -> _Table:
+    means = {method: dataclasses.asdict(evaluation.mean(method)) for method in evaluation.ranking()}
+    best = {
+        field: (max if larger else min)(values[field] for values in means.values())
+        for field, larger in LARGER_IS_BETTER.items()
+    }
+    rows = [
+        (
+            TITLES[method],
+            [(text.format(values[field]), values[field] == best.get(field)) for field, (_, text) in SCORES.items()],
+        )
+        for method, values in means.items()
+    ]
+    title = "Ranking: means over targets and levels (the paper's table 4)"
+    return title, ["method", *(name for name, _ in SCORES.values())], rows
+
+
+def _gains(evaluation: Evaluation) -> _Table:
+    """PSNR in dB and SSIM in percent above the input's."""
+
+    def gain(method: str, level: str) -> str:
+        if not any((method, target, level) in evaluation.scores for target in evaluation.targets):
+            return "–"
+        scores, before = evaluation.mean(method, level=level), evaluation.mean("input", level=level)
+        if method == "input":
+            return f"{scores.psnr:.2f}{_NBSP}dB, {scores.ssim:.3f}"
+        ssim = 100 * (scores.ssim / before.ssim - 1)
+        return f"{scores.psnr - before.psnr:+.2f}{_NBSP}dB, {ssim:+.0f}{_NBSP}%"
+
+    title, names = "Gain over the noisy input, level by level", ["PSNR, SSIM", *evaluation.levels]
+    windows = f" ({', '.join(map(str, evaluation.windows.values()))})"
+    return title, names, _rows(evaluation, gain, {"median": windows})
+
+
+def _steps(evaluation: Evaluation) -> _Table:
+    def resolved(method: str, level: str) -> str:
+        steps = evaluation.steps.get((method, level))
+        return "–" if steps is None else f"{steps.resolved} of {steps.total}"
+
+    title = "Steps of 10 cm of the staircase that are resolved to 3 cm"
+    return title, ["method", *evaluation.levels], _rows(evaluation, resolved, {})
+
+
+def _rows(
+    evaluation: Evaluation, text: Callable[[str, str], str], suffixes: dict[str, str]
+) -> list[tuple[str, list[tuple[str, bool]]]]:
+    """A row for each method with the text of each level."""
+    return [
+        (TITLES[method] + suffixes.get(method, ""), [(text(method, level), False) for level in evaluation.levels])
+        for method in evaluation.ranking()
+    ]
+
+
+def _without_nan(value: Any) -> Any:
+    """The value with None for numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
