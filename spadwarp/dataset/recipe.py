@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -26,7 +25,8 @@ from pydantic import (
     model_validator,
 )
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
+from spadwarp.io.text import read_toml
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
@@ -310,13 +310,7 @@ class Recipe(_Table):
 
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """Reads a recipe. Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it."""
-    try:
-        tables = tomllib.loads(Path(path).read_bytes().decode())
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
-    return Recipe.from_dict(tables, source=path)
+    return Recipe.from_dict(read_toml(path), source=path)
 
 
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -11,7 +10,8 @@ from typing import Annotated, Any, Literal, Self
 import pydantic
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
+from spadwarp.io.text import read_toml
 from spadwarp.scene.messages import describe
 
 __all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]
@@ -131,12 +131,7 @@ def load_training_recipe(path: str | os.PathLike[str], *, overrides: Mapping[str
 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
-    try:
-        tables = tomllib.loads(Path(path).read_bytes().decode())
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+    tables = read_toml(path)
     for name, value in (overrides or {}).items():
         inner = tables.get(name)
         tables[name] = {**inner, **value} if isinstance(inner, dict) and isinstance(value, Mapping) else value

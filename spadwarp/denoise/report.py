@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from spadwarp.denoise.evaluation import Evaluation
 from spadwarp.denoise.metrics import LARGER_IS_BETTER
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.text import json_text
 from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_samples, draw_scores
 from spadwarp.viz.pages import write_page
 
@@ -35,7 +33,7 @@ def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
     place = Path(folder)
     pictures = _draw(evaluation, place)
     with atomic_path(place / "scores.json") as temporary:
-        temporary.write_text(json.dumps(_without_nan(evaluation.to_dict()), indent=1) + "\n")
+        temporary.write_text(json_text(evaluation.to_dict(), indent=1))
     tables = [_means(evaluation), _gains(evaluation), *([_steps(evaluation)] if evaluation.steps else [])]
     write_page(
         place / "report.html",
@@ -126,12 +124,3 @@ def _rows(
         (TITLES[method] + suffixes.get(method, ""), [(text(method, level), False) for level in evaluation.levels])
         for method in evaluation.ranking()
     ]
-
-
-def _without_nan(value: Any) -> Any:
-    """The value with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {name: _without_nan(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
+from spadwarp.io.text import read_toml
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.camera import Camera
@@ -138,14 +138,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     Relative paths start at the file's folder, those in overrides at the working directory.
     Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
     """
-    try:
-        text = Path(path).read_bytes().decode()
-        tables = tomllib.loads(text)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
-    return _build(tables, overrides=overrides, source=path)
+    return _build(read_toml(path), overrides=overrides, source=path)
 
 
 def _build(
