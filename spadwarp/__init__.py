@@ -42,7 +42,7 @@ _HOMES = {
     "Truth": "result",
     "load_result": "result",
     "save_result": "result",
-    "depth_frame": "frames.depth",
+    "depth_frame": "frames",
     "detect": "frames",
     "Frames": "frames",
     "coates": "frames",
@@ -55,7 +55,8 @@ _HOMES = {
     "load_truth_exr": "result",
     "budget": "analytic.budget",
     "sweep": "analytic.budget",
-    "export": "run.export",
+    "export": "run",
+    "save_analytic": "run",
     "view": "viz.viewer",
     "video": "viz.transient_video",
     "to_torch": "result",
@@ -91,13 +92,21 @@ if TYPE_CHECKING:
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.frames import Frames, InstrumentResponse, coates, crlb, detect, instrument_response
-    from spadwarp.frames.arrival_time import arrival_time
-    from spadwarp.frames.depth import depth_frame
+    from spadwarp.frames import (
+        Frames,
+        InstrumentResponse,
+        coates,
+        crlb,
+        depth_frame,
+        detect,
+        instrument_response,
+    )
+    from spadwarp.frames.estimators import arrival_time
     from spadwarp.parallel import Ray, interruptible, run_jobs
     from spadwarp.result import Result, TorchResult, Truth, load_result, load_truth_exr, save_result, to_torch
     from spadwarp.result.merge import merge
-    from spadwarp.run.export import export
+    from spadwarp.run import save_analytic
+    from spadwarp.run.formats import export
     from spadwarp.scene import PhaseFunction, Scene, load_scene, look_at, opencv_pose, phase_function, presets
     from spadwarp.transport.model import truth_maps
     from spadwarp.transport.records import PhotonRecords, trace

@@ -46,7 +46,7 @@ class BudgetRow:
         signal: S, detections of the return per pulse.
         background: Detections of backscatter, dark counts and ambient light per pulse within the gate.
         alpha: All detections per pulse within the gate.
-        sbnr: Signal over backscatter.
+        signal_to_backscatter: Signal over backscatter.
         sigma_time: Cramér–Rao bound of a depth frame [s]; NaN: no estimate.
         sigma_depth: The same in depth [m].
         outlier_probability: That a fit locks on background instead.
@@ -63,7 +63,7 @@ class BudgetRow:
     signal: float
     background: float
     alpha: float
-    sbnr: float
+    signal_to_backscatter: float
     sigma_time: float
     sigma_depth: float
     outlier_probability: float
@@ -79,14 +79,14 @@ class DepthErrorRow:
         sigma_depth_p90: What 90 % of the pixels stay below [m].
         outlier_probability: Mean over pixels.
         estimate_fraction: Pixels with an estimate over pixels that see a target.
-        sbnr: Median signal over backscatter.
+        signal_to_backscatter: Median signal over backscatter.
     """
 
     sigma_depth: float
     sigma_depth_p90: float
     outlier_probability: float
     estimate_fraction: float
-    sbnr: float
+    signal_to_backscatter: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +259,7 @@ def _axis_rows(
     return rows
 
 
-_FROM_MAPS = ("arrival", "signal", "alpha", "sbnr", "sigma_time", "sigma_depth", "outlier_probability")
+_FROM_MAPS = ("arrival", "signal", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth", "outlier_probability")
 
 
 def _pulses_needed(
@@ -325,14 +325,14 @@ def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:
             sigma_depth_p90=math.nan,
             outlier_probability=math.nan,
             estimate_fraction=0.0,
-            sbnr=math.nan,
+            signal_to_backscatter=math.nan,
         )
     return DepthErrorRow(
         sigma_depth=float(np.median(result.sigma_depth[there])),
         sigma_depth_p90=float(np.quantile(result.sigma_depth[there], 0.9)),
         outlier_probability=float(result.outlier_probability[there].mean()),
         estimate_fraction=float(there.sum() / targets),
-        sbnr=float(np.median(result.sbnr[there])),
+        signal_to_backscatter=float(np.median(result.signal_to_backscatter[there])),
     )
 
 
@@ -344,10 +344,10 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#
 _PANELS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "signal": ("signal [detections per pulse]", 1.0, (1e-10, 1e3)),
     "sigma_depth": ("depth error, Cramér–Rao [mm]", 1e3, (1e-3, 1e4)),
-    "sbnr": ("signal / backscatter", 1.0, (1e-6, 1e6)),
+    "signal_to_backscatter": ("signal / backscatter", 1.0, (1e-6, 1e6)),
     "pulses_for_1cm": ("pulses for 1 cm", 1.0, (1.0, 1e12)),
 }
-_ERROR_PANELS = ("sigma_depth", "outlier_probability", "estimate_fraction", "sbnr")
+_ERROR_PANELS = ("sigma_depth", "outlier_probability", "estimate_fraction", "signal_to_backscatter")
 _LABELS: dict[str, tuple[str, float]] = {
     **{name: (label, scale) for name, (label, scale, _) in _PANELS.items()},
     "alpha": ("detections per pulse α", 1.0),
@@ -398,9 +398,7 @@ def plot_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequen
     `columns`: attributes of the rows; default: what matters most.
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
-    names = list(
-        columns or (_PANELS if budgets else ("sigma_depth", "outlier_probability", "estimate_fraction", "sbnr"))
-    )
+    names = list(columns or (_PANELS if budgets else _ERROR_PANELS))
     figure, axes = _grid(len(names))
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
     x: Any = np.array(curves.values, np.float64) if numeric else [str(value) for value in curves.values]

@@ -49,9 +49,10 @@ class AnalyticResult:
         sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
         sigma_depth: The bound of planar depth [m].
         background_level: Background detections per pulse and σ of the response, under the return.
-        sbnr: Signal over backscatter, both within a pulse's gate; infinite where there is no backscatter.
-        outlier_probability: That a maximum-likelihood fit locks on background, where `sigma_time` is out of reach.
-        stray_probability: That a frame's pixel reports a background photon.
+        signal_to_backscatter: Both per pulse within the gate; infinite where there is no backscatter.
+        outlier_probability: Of a false peak: a maximum-likelihood fit takes background for the return, and `sigma_time`
+            is not reached.
+        background_probability: That a frame's pixel reports a background photon.
         depth: Frames, float32 `[N, H, W]` [m]; NaN for no estimate.
         labels: bool `[N, H, W]`, where a frame's pixel reports a background photon.
         seed: Of the frames.
@@ -66,10 +67,10 @@ class AnalyticResult:
     fisher: Map
     sigma_time: Map
     sigma_depth: Map
-    sbnr: Map
+    signal_to_backscatter: Map
     background_level: Map
     outlier_probability: Map
-    stray_probability: Map
+    background_probability: Map
     depth: NDArray[np.float32]
     labels: NDArray[np.bool_]
     seed: int
@@ -85,50 +86,10 @@ class AnalyticResult:
         return _sample(self, frames, first=first, seed=self.seed if seed is None else seed, device=device)
 
     def save(self, path: str | Path, *, frames: int | None = None, device: Any = None) -> Path:
-        """Writes maps, truth, frames and scene to one HDF5 file, whole or not at all; returns its path.
+        """Writes everything to one HDF5 file, whole or not at all: see `spadwarp.save_analytic`."""
+        import spadwarp
 
-        `frames`: this many are drawn and written in parts, whatever the memory, instead of those held. Raises
-        `FileError` where it cannot be written.
-        """
-
-        from spadwarp.io.hdf5 import write_hdf5
-
-        with write_hdf5(path) as file:
-            file.attrs.update(_attributes(self))
-            file.create_dataset("config", data=self.scene.to_toml())
-            for name, unit in _MAP_UNITS.items():
-                _dataset(file, f"maps/{name}", getattr(self, name), unit)
-            for name, unit in {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}.items():
-                _dataset(file, f"truth/{name}", getattr(self.truth, name), unit)
-            if frames is None:
-                _dataset(file, "depth", self.depth, "m")
-                _dataset(file, "labels", self.labels, "1")
-                return Path(path)
-            shape = self.truth.depth.shape
-            packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
-            depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
-            labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
-            depth.attrs["unit"], labels.attrs["unit"] = "m", "1"
-            part = max(1, (1 << 28) // (5 * self.truth.depth.size))
-            for first in range(0, frames, part):
-                stop = min(first + part, frames)
-                depth[first:stop], labels[first:stop] = self.sample(stop - first, first=first, device=device)
-        return Path(path)
-
-
-_MAP_UNITS = {
-    "signal": "1",
-    "arrival": "s",
-    "backscatter": "1",
-    "alpha": "1",
-    "fisher": "s^-2",
-    "sigma_time": "s",
-    "sigma_depth": "m",
-    "sbnr": "1",
-    "background_level": "1",
-    "outlier_probability": "1",
-    "stray_probability": "1",
-}
+        return spadwarp.save_analytic(self, path, frames=frames, device=device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +163,7 @@ def simulate_analytic(
         scene=scene,
         truth=truth,
         **{name: values.reshape(shape) for name, values in maps.items()},
-        stray_probability=stray.reshape(shape),
+        background_probability=stray.reshape(shape),
         depth=np.empty((0, *shape), np.float32),
         labels=np.empty((0, *shape), np.bool_),
         seed=seed,
@@ -306,7 +267,7 @@ def pixel_maps(
             source=_source(scene),
         )
     with np.errstate(divide="ignore", invalid="ignore"):
-        sbnr = np.where(fisher > 0, signal / backscatter, np.nan)
+        signal_to_backscatter = np.where(fisher > 0, signal / backscatter, np.nan)
     maps = {
         "signal": signal,
         "arrival": arrival,
@@ -315,7 +276,7 @@ def pixel_maps(
         "fisher": fisher,
         "sigma_time": sigma_time,
         "sigma_depth": sigma_time * depth_per_time(scene, views, distances),
-        "sbnr": sbnr,
+        "signal_to_backscatter": signal_to_backscatter,
         "background_level": level,
         "outlier_probability": outlier,
     }
@@ -476,7 +437,7 @@ def _sample(
         wp.array(view.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device),
         flat(np.where(np.isnan(result.sigma_depth), np.nan, result.truth.depth)),
         flat(np.minimum(result.sigma_depth, gate_deviation(scene, view))),
-        flat(result.stray_probability),
+        flat(result.background_probability),
         flat(result._stray.flat_share),
         wp.array(result._stray.paths, **to),
         wp.array(result._stray.cumulative, **to),
@@ -505,40 +466,3 @@ def _sample(
                 wp.copy(row, array)
             wp.synchronize_device(device)
     return depth, labels
-
-
-_PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
-
-
-def _dataset(file: Any, name: str, values: NDArray[Any], unit: str) -> None:
-    file.create_dataset(name, data=values, **(_PACKED if values.size else {})).attrs["unit"] = unit
-
-
-_READ_ME = (
-    "Depth frames [frame, height, width] in metres along z, NaN for no estimate; labels: the pixel reports background "
-    "light. maps/: signal, backscatter and alpha are expected detections per pulse within the gate, arrival and "
-    "sigma_time are seconds, sigma_depth metres, fisher 1/s^2 per detected photon. "
-    "Camera frame: +x right, +y down, +z forward."
-)
-
-
-def _attributes(result: AnalyticResult) -> dict[str, Any]:
-    from spadwarp import __version__
-
-    scene = result.scene
-    return {
-        "format": "spadwarp analytic",
-        "format_version": 1,
-        "read_me": _READ_ME,
-        "version": __version__,
-        "source": str(scene.source or ""),
-        "seed": str(result.seed),
-        "form": scene.analytic.form,
-        "backscatter": scene.analytic.backscatter,
-        "count_law": scene.analytic.count_law,
-        "response_sigma": response_sigma(scene),
-        "gate_start": scene.gate.start,
-        "bin_width": scene.gate.bin_width,
-        "bins": scene.gate.bins,
-        "group_index": scene.medium.group_index,
-    }

@@ -14,7 +14,7 @@ from spadwarp.cli._options import Json, Out, Overwrite, Quiet, arguments_checked
 
 
 class Format(enum.StrEnum):
-    """`spadwarp.run.export.FORMATS`, known without loading it."""
+    """`spadwarp.run.FORMATS`, known without loading it."""
 
     npy = "npy"
     mat = "mat"

@@ -178,11 +178,11 @@ def _summary(result: AnalyticResult) -> dict[str, Any]:
         "signal": median(result.signal),
         "backscatter": median(result.backscatter),
         "alpha": median(result.alpha),
-        "sbnr": median(result.sbnr),
+        "signal_to_backscatter": median(result.signal_to_backscatter),
         "sigma_time": median(result.sigma_time),
         "sigma_depth": median(result.sigma_depth),
         "outlier_probability": float(result.outlier_probability[there].mean()) if there.any() else math.nan,
-        "stray_probability": float(result.stray_probability[there].mean()) if there.any() else math.nan,
+        "background_probability": float(result.background_probability[there].mean()) if there.any() else math.nan,
     }
 
 
@@ -192,11 +192,11 @@ def _told(summary: dict[str, Any]) -> dict[str, str]:
         f"{count(summary['pixels_with_estimate'])} have an estimate; medians of these:",
         "signal": f"{summary['signal']:.3g} detections a pulse, backscatter {summary['backscatter']:.3g}, "
         f"all together {summary['alpha']:.3g}",
-        "SbNR": f"{summary['sbnr']:.3g} signal over backscatter",
+        "signal to backscatter": f"{summary['signal_to_backscatter']:.3g}",
         "bound": f"{1e12 * summary['sigma_time']:.3g} ps, {1e3 * summary['sigma_depth']:.3g} mm of depth",
-        "outliers": f"{_percent(summary['outlier_probability'])} of the fits would lock on background",
+        "outliers": f"{_percent(summary['outlier_probability'])} of the fits would find a false peak",
         "frames": f"{count(summary['frames'])}, seed {summary['seed']}, "
-        f"{_percent(summary['stray_probability'])} of their pixels stray",
+        f"{_percent(summary['background_probability'])} of their pixels report background",
     }
 
 
@@ -224,7 +224,7 @@ def budget(
     """What comes back from a face on the optical axis.
 
     Signal and background per pulse and pixel, depth error, pulses for 1 cm; over range and water, from the analytic
-    model. Depth errors in brackets are not reached: more than 1 % of the fits would lock on background.
+    model. Depth errors in brackets are not reached: more than 1 % of the fits would find a false peak.
 
     \b
     Example:
@@ -331,7 +331,7 @@ def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) 
             f"{row.signal:.3g}",
             f"{row.background:.3g}",
             f"{row.alpha:.3g}",
-            _short(row.sbnr),
+            _short(row.signal_to_backscatter),
             _bracketed(1e12 * row.sigma_time, reached),
             _bracketed(1e3 * row.sigma_depth, reached),
             _percent(row.outlier_probability),
@@ -350,7 +350,7 @@ def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow
             _short(1e3 * row.sigma_depth_p90),
             _percent(row.outlier_probability),
             _percent(row.estimate_fraction),
-            _short(row.sbnr),
+            _short(row.signal_to_backscatter),
         )
     return table
 

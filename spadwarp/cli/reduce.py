@@ -42,7 +42,7 @@ _DETECTOR_FIELDS = ("detector", "laser.pulse_energy", "laser.repetition_rate", "
 
 
 class Estimator(enum.StrEnum):
-    """`spadwarp.frames.arrival_time.METHODS`, known without loading it."""
+    """`spadwarp.frames.METHODS`, known without loading it."""
 
     peak = "peak"
     centroid = "centroid"

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.inference import denoise_frames, features_of_histograms, weights_metadata
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.frames.arrival_time import Method
 from spadwarp.frames.depth import depth_of
+from spadwarp.frames.estimators import Method
 from spadwarp.frames.measured import Histograms, read_array, read_histograms
 from spadwarp.frames.response import instrument_response
 from spadwarp.io.atomic import atomic_path

@@ -19,8 +19,8 @@ from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames, features_of_histograms, own_weights
 from spadwarp.errors import ArgumentError, SpadwarpError
-from spadwarp.frames.arrival_time import arrival_time
 from spadwarp.frames.cramer_rao import crlb_from_histogram
+from spadwarp.frames.estimators import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time

@@ -1,8 +1,8 @@
 """Frames of a SPAD camera: counts, arrival times, depth, the Cramér–Rao bound, files."""
 
-from spadwarp.frames.arrival_time import METHODS, Method, arrival_time
 from spadwarp.frames.cramer_rao import crlb, crlb_from_histogram
-from spadwarp.frames.depth import Reduction, depth_of
+from spadwarp.frames.depth import Reduction, depth_frame, depth_of
+from spadwarp.frames.estimators import METHODS, Method, arrival_time
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.measured import Histograms, read_histograms
@@ -26,6 +26,7 @@ __all__ = [
     "coates",
     "crlb",
     "crlb_from_histogram",
+    "depth_frame",
     "depth_of",
     "detect",
     "detector_response",

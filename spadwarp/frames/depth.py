@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
-from spadwarp.frames.arrival_time import Method, arrival_time
+from spadwarp.frames.estimators import Method, arrival_time
 from spadwarp.frames.measured import Histograms
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_path

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.frames.arrival_time import METHODS, Method
+from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import is_torch
-from spadwarp.frames.arrival_time import Method, arrival_time
+from spadwarp.frames.estimators import Method, arrival_time
 from spadwarp.frames.pile_up import coates
 from spadwarp.frames.response import InstrumentResponse
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.frames.arrival_time import METHODS, Method
 from spadwarp.frames.cramer_rao import crlb
+from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import detector_response

@@ -37,11 +37,11 @@ def write_depth(
     channels = {"range": reduction.range[0], "intensity": reduction.intensity[0].astype(np.float32)}
     if name == "depth":
         channels["Z"] = reduction.first
-    about = {"content": "measured depth", "method": reduction.method, "frame": "+x right, +y down, +z forward"}
+    metadata = {"content": "measured depth", "method": reduction.method, "frame": "+x right, +y down, +z forward"}
     label = "depth z [m]" if name == "depth" else "range [m]"
     written = [
         folder / f"{name}.npy",
-        write_exr(folder / f"{name}.exr", channels, about),
+        write_exr(folder / f"{name}.exr", channels, metadata),
         draw_depth(
             reduction.first,
             reduction.intensity[0],
@@ -52,9 +52,9 @@ def write_depth(
     ]
     if ply is not None:
         assert reduction.directions is not None
-        points, there = point_cloud(reduction.range[0], reduction.directions)
+        points, valid = point_cloud(reduction.range[0], reduction.directions)
         if not len(points):
             raise FileError(f"{ply}: nothing returned in any pixel: there are no points to write")
-        bright = reduction.intensity[0][there].astype(np.float32)
-        written.append(write_ply(ply, points, {"intensity": bright}, comment=comment))
+        intensity = reduction.intensity[0][valid].astype(np.float32)
+        written.append(write_ply(ply, points, {"intensity": intensity}, comment=comment))
     return written

@@ -145,7 +145,7 @@ def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
         maps = (
             ("Signal S", signal, "detections per pulse", "cividis"),
             ("Cramér–Rao bound σ*", 1e3 * result.sigma_depth, "standard deviation of depth [mm]", "magma_r"),
-            ("Signal to backscatter SbNR", result.sbnr, "ratio", "cividis"),
+            ("Signal to backscatter", result.signal_to_backscatter, "ratio", "cividis"),
         )
     for image, bar, (title, values, label, colours) in zip(images, bars, maps, strict=False):
         _show_positive(image, bar, values, title=title, label=label, colours=colours)
@@ -154,14 +154,14 @@ def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
         bars[3],
         np.where(np.isnan(truth), np.nan, result.outlier_probability),
         title="Outlier probability",
-        label="that a fit locks on background",
+        label="probability of a false peak",
         colours="inferno_r",
         low=0.0,
         high=1.0,
     )
     show_image(images[4], bars[4], truth, title="Truth", **depth)
-    strays = f", {labels.sum()} stray" if labels.any() else ""
-    show_image(images[5], bars[5], frame, title=f"A depth frame{strays}", **depth)
+    outliers = f", {labels.sum()} outliers" if labels.any() else ""
+    show_image(images[5], bars[5], frame, title=f"A depth frame{outliers}", **depth)
     scene = result.scene
     figure.suptitle(
         f"analytic, {scene.analytic.form} form; water c = {scene.medium.extinction:.3g} 1/m; "

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.frames.arrival_time import Method
+from spadwarp.frames.estimators import Method
 from spadwarp.io.atomic import atomic_path
 from spadwarp.result.result import COMPONENTS, Component, Result
 from spadwarp.scene import Medium

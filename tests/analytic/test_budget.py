@@ -41,7 +41,7 @@ def test_rows_run_over_waters_and_ranges_and_the_gate_follows():
         assert row.gate_stop - row.gate_start == pytest.approx(2e-8)
     for few, more in zip(harbour, clear, strict=True):
         assert few.signal < more.signal and few.sigma_depth > more.sigma_depth
-        assert few.pulses_for_1cm > more.pulses_for_1cm and few.sbnr < more.sbnr
+        assert few.pulses_for_1cm > more.pulses_for_1cm and few.signal_to_backscatter < more.signal_to_backscatter
     assert [row.signal for row in clear] == sorted((row.signal for row in clear), reverse=True)
     named = budget(SCENE, ranges=[4.0], media={"tank": {"extinction": 1.0, "albedo": 0.9}})[0]
     assert (named.medium, named.extinction) == ("tank", 1.0)

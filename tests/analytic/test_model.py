@@ -16,6 +16,10 @@ from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result.result import Truth
 
+MAPS = (
+    *("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth"),
+    *("signal_to_backscatter", "outlier_probability", "background_probability"),
+)
 GATE = {"start_ns": 5.0, "bin_width_ps": 100.0, "bins": 200}
 
 
@@ -53,8 +57,7 @@ def test_maps_and_frames_fit_together():
     result = simulate_analytic(one, frames=200, seed=3)
     hit = ~np.isnan(result.truth.depth)
     assert 0.3 < hit.mean() < 1
-    for name in ("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth", "sbnr"):
-        assert getattr(result, name).shape == (12, 16)
+    assert all(getattr(result, name).shape == (12, 16) for name in MAPS)
     seen = result.fisher > 0
     assert (seen == (result.signal > 0)).all() and seen.sum() == hit.sum()
     assert np.isnan(result.sigma_time[~seen]).all() and np.isfinite(result.sigma_time[seen]).all()
@@ -132,7 +135,7 @@ def test_no_backscatter_is_an_infinite_ratio_and_no_stray_pixels():
     one = lidar_scene(analytic={"backscatter": "constant"}, detector={"dark_count_rate": 0.0})
     result = simulate_analytic(one, frames=3)
     seen = result.fisher > 0
-    assert np.isinf(result.sbnr[seen]).all() and np.isnan(result.sbnr[~seen]).all()
+    assert np.isinf(result.signal_to_backscatter[seen]).all() and np.isnan(result.signal_to_backscatter[~seen]).all()
     assert (result.outlier_probability[seen] == 0).all() and not result.labels.any()
 
 
@@ -222,16 +225,7 @@ def test_a_file_holds_maps_frames_and_scene(tmp_path):
     path = result.save(tmp_path / "deep" / "frames.h5")
     assert [p.name for p in path.parent.iterdir()] == ["frames.h5"]
     with h5py.File(path) as file:
-        for name in (
-            "signal",
-            "arrival",
-            "alpha",
-            "fisher",
-            "sigma_time",
-            "sigma_depth",
-            "sbnr",
-            "outlier_probability",
-        ):
+        for name in MAPS:
             np.testing.assert_array_equal(file[f"maps/{name}"][...], getattr(result, name))
         np.testing.assert_array_equal(file["depth"][...], result.depth)
         np.testing.assert_array_equal(file["labels"][...], result.labels)

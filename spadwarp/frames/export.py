@@ -1,0 +1,200 @@
+"""Frames of any source in the formats of other programs: NumPy, MATLAB, PicoQuant, EXR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ArgumentError, FileError
+from spadwarp.io.atomic import atomic_path
+from spadwarp.io.exr import write_exr
+from spadwarp.scene import Scene
+from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.units import time_from_path
+
+__all__ = ["FrameSequence", "SequenceFrame", "exr_metadata", "write_exr_frame", "write_mat", "write_npy", "write_ptu"]
+
+_LARGEST_VARIABLE = 2**31 - 1  # bytes of one array in a MATLAB 5 file
+_LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SequenceFrame:
+    """One frame.
+
+    Attributes:
+        images: Name → `[H, W]`; `Z` is the depth [m] where the source has it.
+        counts: `[H, W, T]`; None where there is depth alone.
+        expected: Expected counts before pile-up `[H, W, T]`, of all light and noise.
+        background: Its part that is not target, counts of a pixel over all bins, mean over pixels.
+        pulses: Of the frame.
+        gate_start, bin_width: [s].
+        period: At which time wraps [s], or None.
+        scene: What the camera looked at.
+        depth: True depth [m] `[H, W]`.
+        content: What the images are, in words.
+    """
+
+    images: dict[str, NDArray[Any]]
+    counts: NDArray[Any] | None = None
+    expected: NDArray[np.float32] | None = None
+    background: float | None = None
+    pulses: int = 0
+    gate_start: float = 0.0
+    bin_width: float = 0.0
+    period: float | None = None
+    scene: Scene | None = None
+    depth: NDArray[np.float32] | None = None
+    content: str = ""
+
+    def true_bins(self) -> NDArray[np.float64]:
+        """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
+        assert self.scene is not None and self.depth is not None and self.counts is not None
+        view = pixel_directions(self.scene.camera)
+        distance = range_from_depth(self.depth.astype(np.float64), view)
+        path = path_from_range(distance, view, self.scene.beam.position)
+        time = time_from_path(path, self.scene.medium.group_index) - self.gate_start
+        if self.period is not None:
+            time = np.mod(time, self.period)
+        found = np.floor(time / self.bin_width) + 1.0
+        return np.where((found >= 1) & (found <= self.counts.shape[-1]), found, 0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameSequence:
+    """Frames of one source, read one at a time.
+
+    Attributes:
+        name: What to call the source in an error.
+        count: Of the frames.
+        frame: Number of a frame, from 0 → the frame.
+        largest_count: Of a pixel in any frame, if that is known.
+    """
+
+    name: str
+    count: int
+    frame: Callable[[int], SequenceFrame]
+    largest_count: int | None = None
+
+    def with_counts(self, number: int, ending: str) -> tuple[SequenceFrame, NDArray[Any]]:
+        """A frame and its counts; `ArgumentError` if it has none, which files of `ending` are for."""
+        frame = self.frame(number)
+        if frame.counts is None:
+            raise ArgumentError(f"{self.name}: frame {number} is depth without counts, which {ending} is for")
+        return frame, frame.counts
+
+
+def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
+    """Counts `[H, W, T]`, or depth `[H, W]` where there are none; of several frames with these before."""
+
+    def array_of(number: int) -> NDArray[Any]:
+        frame = frames.frame(number)
+        return frame.images["Z"] if frame.counts is None else frame.counts
+
+    first = array_of(chosen[0])
+    with atomic_path(path) as temporary:
+        shape = first.shape if len(chosen) == 1 else (len(chosen), *first.shape)
+        array = np.lib.format.open_memmap(temporary, mode="w+", dtype=first.dtype, shape=shape)
+        for row, number in enumerate(chosen):
+            array[... if len(chosen) == 1 else row] = array_of(number)
+        array.flush()
+        del array
+    return path
+
+
+def write_mat(frames: FrameSequence, path: Path, number: int) -> Path:
+    """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables."""
+    from scipy.io import savemat
+    from scipy.sparse import csc_matrix
+
+    frame, counts = frames.with_counts(number, ".mat")
+    height, width, bins = counts.shape
+    if frame.scene is None or frame.depth is None:
+        raise ArgumentError("result is missing: .mat holds the truth of the scene that the counts were drawn from")
+    if frame.expected is None or frame.background is None:
+        raise ArgumentError(f"{frames.name} does not hold the expected counts of its frames: draw them anew")
+    if 4 * counts.size > _LARGEST_VARIABLE:
+        raise FileError(f"{path}: {height} x {width} x {bins} values are more than a MATLAB 5 file can hold")
+    total = frame.expected.sum(axis=-1, dtype=np.float64)
+    signal = np.clip(total - frame.background, 0.0, None)
+    photons = max(float(total.mean()) - frame.background, 0.0)
+    true_bins = frame.true_bins()
+    variables = {
+        # Pixels column by column, as MATLAB's reshape takes them.
+        "spad": csc_matrix(counts.transpose(1, 0, 2).reshape(width * height, bins).astype(np.float64)),
+        "rates": frame.expected,
+        "bin": true_bins,
+        "range_bins": true_bins,
+        "bin_size": frame.bin_width,
+        "gate_start": frame.gate_start,
+        "depth": np.nan_to_num(frame.depth),
+        "intensity": (signal / max(float(signal.max()), 1e-300)).astype(np.float32),
+        "SBR": photons / frame.background if frame.background > 0 else np.inf,
+        "photons": photons,
+        "mean_signal_photons": photons,
+        "mean_background_photons": frame.background,
+        "pulses": float(frame.pulses),
+    }
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        savemat(file, variables, do_compression=True)
+    return path
+
+
+def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
+    """Counts as a T3 image of PicoQuant, one record a detection, the frames one after the other."""
+    import ptufile
+
+    first, counts = frames.with_counts(chosen[0], ".ptu")
+    height, width, bins = counts.shape
+    if bins > _LARGEST_DTIME:
+        raise FileError(f"{path}: {bins} bins are more than the {_LARGEST_DTIME} of a T3 record")
+    most = frames.largest_count
+    if most is None:
+        most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
+    sync = max(first.period or 0.0, bins * first.bin_width)
+    comment = (
+        f"Counts of a simulated SPAD array, {first.pulses} pulses a frame. "
+        f"Bin 0 begins at {first.gate_start * 1e9:.6f} ns of flight."
+    )
+    with (
+        atomic_path(path) as temporary,
+        ptufile.PtuWriter(
+            temporary,
+            (1, height, width, 1, bins),
+            global_resolution=sync,
+            tcspc_resolution=first.bin_width,
+            # A pixel lasts long enough for its detections, one a sync.
+            pixel_time=sync * max(most, 1),
+            comment=comment,
+            tags={"CreatorSW_Name": "spadwarp"},
+        ) as file,
+    ):
+        for number in chosen:
+            frame, counts = frames.with_counts(number, ".ptu")
+            if (frame.gate_start, frame.bin_width) != (first.gate_start, first.bin_width):
+                raise ArgumentError(f"frames {chosen[0]} and {number} have different gates: a .ptu file has one")
+            file.write(np.ascontiguousarray(counts, np.uint32))
+    return path
+
+
+def write_exr_frame(frames: FrameSequence, path: Path, number: int) -> Path:
+    """The images of one frame."""
+    frame = frames.frame(number)
+    # EXR's integers have no sign, and few programs show them.
+    images = frame.images.items()
+    channels = {name: image.astype(np.float32) if image.dtype.kind in "iu" else image for name, image in images}
+    content = f"frame {number} of {frames.count}" + (f", {frame.content}" if frame.content else "")
+    return write_exr(path, channels, exr_metadata(frame.scene, content))
+
+
+def exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | float]:
+    """Metadata of an EXR image of depth."""
+    metadata: dict[str, str | int | float] = {"content": content, "Z": "planar depth [m]"}
+    if scene is not None:
+        metadata |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
+    return metadata
