@@ -1,23 +1,33 @@
-"""The command line. A command is a function in one of these files, hung on `app`; importing the file adds it.
+"""The command line: a file for each command. Importing it hangs its function on `app`.
 
 Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
 """
 
-from spadwarp.cli import bench, dataset, denoise, doctor, exports, inspect, look, plan, reduce, runs, simulate
+from spadwarp.cli import (  # noqa: F401  in the order of the help
+    simulate,
+    detect,
+    depth,
+    view,
+    video,
+    export,
+    merge,
+    analytic,
+    budget,
+    sweep,
+    water,
+    dataset,
+    denoise,
+    evaluate,
+    train,
+    check,
+    info,
+    presets,
+    targets,
+    devices,
+    validate,
+    bench,
+    doctor,
+)
 from spadwarp.cli._app import app, main
 
-__all__ = [
-    "app",
-    "bench",
-    "dataset",
-    "denoise",
-    "doctor",
-    "exports",
-    "inspect",
-    "look",
-    "main",
-    "plan",
-    "reduce",
-    "runs",
-    "simulate",
-]
+__all__ = ["app", "main"]

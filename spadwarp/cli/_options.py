@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -86,7 +87,25 @@ Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threa
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Allow an output directory that is not empty.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+TorchDevice = Annotated[
+    str | None,
+    typer.Option("--device", metavar="NAME", help='"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
+]
+RunOrFrames = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", help="A result or frames, or the directory of one of them.", show_default=False),
+]
+Frame = Annotated[int, typer.Option(min=0, metavar="N", help="Which frame, of frames.")]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write what is told here as JSON.")]
+
+
+class Estimator(enum.StrEnum):
+    """`spadwarp.frames.METHODS`, known without loading it."""
+
+    peak = "peak"
+    centroid = "centroid"
+    matched = "matched"
+    likelihood = "likelihood"
 
 
 def read_scene(

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import complain
-from spadwarp.cli._options import count
 
 Report = Callable[[str, int, int], None]
 
@@ -56,7 +56,7 @@ def _lines(unit: str) -> Report:
         waited = time.monotonic() - told
         due = (done - told_done >= 0.1 * total and waited >= 1.0) or waited >= patience
         if done > told_done and (due or done == total):
-            line = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
+            line = f"{100 * done / total:3.0f} %  {opt.count(done)} of {opt.count(total)} {unit}"
             if rate:
                 line += f", {rate:.3g} {unit}/s"
                 line += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
@@ -90,7 +90,7 @@ def _bar(unit: str) -> Iterator[Report]:
                 bar.console.print(stage, markup=False, highlight=False)
                 return
             rate, _ = pace(done)
-            text = f"{count(done)} {unit}" + (f", {rate:.3g} {unit}/s" if rate else "")
+            text = f"{opt.count(done)} {unit}" + (f", {rate:.3g} {unit}/s" if rate else "")
             bar.update(task, description=text, completed=done, total=total)
 
         yield report

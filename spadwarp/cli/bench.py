@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
-from spadwarp.cli._options import Device, Json, Photons, Quiet, check_writable, in_bytes, write_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -24,12 +24,12 @@ def bench(
         list[str] | None,
         typer.Argument(metavar="CASE", help='Names of cases, or "scaling"; all cases if left out.', show_default=False),
     ] = None,
-    device: Device = None,
-    photons: Photons = None,
+    device: opt.Device = None,
+    photons: opt.Photons = None,
     repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest counts.")] = 3,
     list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and leave.")] = False,
-    quiet: Quiet = False,
-    json_path: Json = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
     compare: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also print the ratio of the rates to those that --json wrote earlier."),
@@ -55,7 +55,7 @@ def bench(
         return
     before = None if compare is None else load_report(compare)
     if json_path is not None:
-        check_writable(json_path.parent)
+        opt.check_writable(json_path.parent)
     results: list[BenchResult] = []
 
     def found(result: BenchResult) -> None:
@@ -76,7 +76,7 @@ def bench(
         )
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
-            write_json(report(results), json_path)
+            opt.write_json(report(results), json_path)
         raise
     summary = report(results)
     if not quiet:
@@ -95,7 +95,7 @@ def bench(
         if not quiet:
             made = before["provenance"]
             _show(_ratio_table(faster), f"over {compare}: {made['device_name']}, {made['date']}")
-    write_json(summary, json_path)
+    opt.write_json(summary, json_path)
     missed = [result.case for result in results if result.check is not None and not result.check["passed"]]
     if missed:
         fail(f"{', '.join(missed)}: a mean is not what it should be")
@@ -138,7 +138,7 @@ def _row(result: BenchResult) -> str:
             f"{rate:.3g} {unit}",
             _rate(result.rates.get("collisions")),
             _rate(result.rates.get("queries")),
-            "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
+            "-" if memory is None else opt.in_bytes(memory) + ("" if result.memory is not None else "*"),
             "-" if result.error_per_root_second is None else f"{100 * result.error_per_root_second:.3g} %",
         ]
     )

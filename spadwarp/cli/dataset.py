@@ -9,21 +9,8 @@ from typing import Annotated
 import typer
 
 import spadwarp
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, fail, say
-from spadwarp.cli._options import (
-    Devices,
-    EngineName,
-    Json,
-    Quiet,
-    RayAddress,
-    Workers,
-    arguments_checked,
-    count,
-    in_bytes,
-    read_engine,
-    rows,
-    write_json,
-)
 from spadwarp.cli._progress import progress
 
 group = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -43,15 +30,15 @@ def make(
         list[str] | None,
         typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the recipe; may be repeated."),
     ] = None,
-    device: Devices = None,
+    device: opt.Devices = None,
     processes: Annotated[
         int, typer.Option(min=1, metavar="N", help="Processes of each GPU at most; fewer for few shards or cores.")
     ] = 4,
-    engine_name: EngineName = "local",
-    ray_address: RayAddress = None,
-    workers: Workers = None,
-    quiet: Quiet = False,
-    json_path: Json = None,
+    engine_name: opt.EngineName = "local",
+    ray_address: opt.RayAddress = None,
+    workers: opt.Workers = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
 ) -> None:
     """Makes a dataset, or what is missing or broken of it.
 
@@ -66,7 +53,7 @@ def make(
     recipe = spadwarp.load_recipe(recipe_path)
     if overrides:
         recipe = recipe.with_overrides(overrides)
-    engine = read_engine(engine_name, ray_address, workers)
+    engine = opt.read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
         found = spadwarp.make_dataset(
             recipe, out, device=device, processes=processes, engine=engine, shard=_part(shard), progress=report
@@ -80,15 +67,15 @@ def make(
         "missing": len(found.missing),
     }
     if not quiet:
-        table = {"made": f"{count(len(found.made))} shards with {count(found.frames)} frames in {out}"}
+        table = {"made": f"{opt.count(len(found.made))} shards with {opt.count(found.frames)} frames in {out}"}
         if found.kept:
-            table["kept"] = f"{count(len(found.kept))} shards that were there and whole"
+            table["kept"] = f"{opt.count(len(found.kept))} shards that were there and whole"
         if found.broken:
             table["replaced"] = "; ".join(found.broken)
         if found.missing:
-            table["missing"] = f"{count(len(found.missing))} shards that others are to make"
-        say(rows(table))
-    write_json(summary, json_path)
+            table["missing"] = f"{opt.count(len(found.missing))} shards that others are to make"
+        say(opt.rows(table))
+    opt.write_json(summary, json_path)
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -99,7 +86,7 @@ def _part(text: str) -> tuple[int, int]:
 
 
 @group.command()
-def verify(folder: Folder, quiet: Quiet = False, json_path: Json = None) -> None:
+def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None) -> None:
     """Compares every file of a dataset with its checksum.
 
     Exit code 1 if something is missing or damaged.
@@ -109,7 +96,7 @@ def verify(folder: Folder, quiet: Quiet = False, json_path: Json = None) -> None
       spadwarp dataset verify data/small/
     """
     wrong = spadwarp.verify_dataset(folder)
-    write_json({"folder": folder, "wrong": wrong}, json_path)
+    opt.write_json({"folder": folder, "wrong": wrong}, json_path)
     if wrong:
         fail("\n".join(wrong) + "\n`spadwarp dataset make` makes these anew")
     if not quiet:
@@ -117,7 +104,7 @@ def verify(folder: Folder, quiet: Quiet = False, json_path: Json = None) -> None
 
 
 @group.command()
-def info(folder: Folder, json_path: Json = None) -> None:
+def info(folder: Folder, json_path: opt.Json = None) -> None:
     """What a dataset holds.
 
     \b
@@ -130,14 +117,14 @@ def info(folder: Folder, json_path: Json = None) -> None:
     size = sum(one["bytes"] for one in manifest["files"].values())
     table = {
         "name": manifest["name"],
-        "frames": f"{count(manifest['frames'])} of {manifest['width']} x {manifest['height']} pixels, "
-        f"{count(manifest['scenes'])} scenes, {in_bytes(size)}",
+        "frames": f"{opt.count(manifest['frames'])} of {manifest['width']} x {manifest['height']} pixels, "
+        f"{opt.count(manifest['scenes'])} scenes, {opt.in_bytes(size)}",
         "depth": f"{manifest['depth_offset']:.6g} m + {manifest['depth_step']:.6g} m per unit",
     }
     for name, split in manifest["splits"].items():
-        table[name] = f"{count(split['frames'])} frames: {', '.join(split['targets']) or 'none'}"
-    say(rows(table))
-    write_json(manifest, json_path)
+        table[name] = f"{opt.count(split['frames'])} frames: {', '.join(split['targets']) or 'none'}"
+    say(opt.rows(table))
+    opt.write_json(manifest, json_path)
 
 
 class Split(enum.StrEnum):
@@ -166,7 +153,7 @@ def preview(
     """
     from spadwarp.viz.contact_sheet import draw_dataset
 
-    with arguments_checked():
+    with opt.arguments_checked():
         path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
     say(f"written: {path}")
 

@@ -8,16 +8,16 @@ from typing import Annotated
 import typer
 
 import spadwarp
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
-from spadwarp.cli._options import Device, Json, Quiet, rows, write_json
 
 
 @app.command()
 def doctor(
-    device: Device = None,
+    device: opt.Device = None,
     self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Trace two small scenes.")] = True,
-    quiet: Quiet = False,
-    json_path: Json = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
 ) -> None:
     """What is installed and seen, and a self-test.
 
@@ -34,14 +34,14 @@ def doctor(
     found = spadwarp.doctor.diagnosis.doctor(device=device, self_test=self_test, progress=None if quiet else complain)
     if not quiet:
         for title, facts in found.facts.items():
-            say(f"{title}\n{rows(facts, indent='  ')}")
+            say(f"{title}\n{opt.rows(facts, indent='  ')}")
         if found.gpu:
             say("No GPU is used\n" + "\n".join(f"  {reason}" for reason in found.gpu))
         if found.tests:
             took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
             say(f"Self-test ({took})")
-            say(rows({test.name: _told(test) for test in found.tests}, indent="  "))
-    write_json({**dataclasses.asdict(found), "healthy": found.healthy}, json_path)
+            say(opt.rows({test.name: _told(test) for test in found.tests}, indent="  "))
+    opt.write_json({**dataclasses.asdict(found), "healthy": found.healthy}, json_path)
     if not found.healthy:
         failed = [f"self-test: {test.name}: {_told(test)}" for test in found.tests if not test.passed]
         fail("\n".join([*found.problems, *failed]))

@@ -12,31 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import INTERRUPTED, app, complain, fail, say
-from spadwarp.cli._options import (
-    Devices,
-    EngineName,
-    Json,
-    Mesh,
-    Overrides,
-    Overwrite,
-    Photons,
-    Quiet,
-    RayAddress,
-    Seed,
-    Threads,
-    Workers,
-    check_writable,
-    count,
-    load_run,
-    one_device,
-    prepare_directory,
-    read_engine,
-    read_scene,
-    rows,
-    whole_number,
-    write_json,
-)
 from spadwarp.cli._progress import progress
 from spadwarp.errors import ConfigError, FileError
 
@@ -64,15 +41,15 @@ def simulate(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)
     ] = None,
-    mesh: Mesh = None,
-    device: Devices = None,
-    engine_name: EngineName = "local",
-    ray_address: RayAddress = None,
-    workers: Workers = None,
-    photons: Photons = None,
-    seed: Seed = None,
-    overrides: Overrides = None,
-    threads: Threads = None,
+    mesh: opt.Mesh = None,
+    device: opt.Devices = None,
+    engine_name: opt.EngineName = "local",
+    ray_address: opt.RayAddress = None,
+    workers: opt.Workers = None,
+    photons: opt.Photons = None,
+    seed: opt.Seed = None,
+    overrides: opt.Overrides = None,
+    threads: opt.Threads = None,
     records: Annotated[
         bool, typer.Option("--records", help="Also write the terminal state of every photon: records.h5.")
     ] = False,
@@ -107,7 +84,9 @@ def simulate(
     ] = 60.0,
     first_photon: Annotated[
         int,
-        typer.Option(parser=whole_number, metavar="ID", help="Id of the first photon; `spadwarp merge` adds the runs."),
+        typer.Option(
+            parser=opt.whole_number, metavar="ID", help="Id of the first photon; `spadwarp merge` adds the runs."
+        ),
     ] = 0,
     shard_text: Annotated[
         str | None,
@@ -115,9 +94,9 @@ def simulate(
             "--shard", metavar="I/N", help="Only part I of N equal parts of the photons; `spadwarp merge` adds them."
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    json_path: Json = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
 ) -> None:
     """Trace photons through a scene into histograms.
 
@@ -153,11 +132,11 @@ def simulate(
     else:
         if scene_path is None or out is None:
             raise typer.BadParameter("is missing", param_hint="SCENE" if scene_path is None else "--out")
-        scene = read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
+        scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
     if records and (first_photon or shard_text):
         raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
     shard = None if shard_text is None else _shard(shard_text)
-    engine = read_engine(engine_name, ray_address, workers)
+    engine = opt.read_engine(engine_name, ray_address, workers)
     if records and scene.transport.photons >= 2**31:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
     for message in spadwarp.check(scene):
@@ -169,11 +148,11 @@ def simulate(
         raise typer.BadParameter(problem, param_hint="--out")
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     needed = bytes_needed(scene, records=records, batches=batches, checkpoint=checkpoint > 0)
-    prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
+    opt.prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
     if earlier is None:
         _forget(kept)
     if json_path is not None:
-        check_writable(json_path.parent)
+        opt.check_writable(json_path.parent)
 
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
@@ -191,7 +170,7 @@ def simulate(
             checkpoint=kept if checkpoint > 0 else None,
             checkpoint_every=checkpoint,
         )
-    single = one_device(device, engine)
+    single = opt.one_device(device, engine)
     written, frame = write_run(result, out, device=single)
     _forget(kept)
     if records and not result.partial:
@@ -204,7 +183,7 @@ def simulate(
     if not quiet:
         say(described(result, frame, written))
     error = result.relative_error if _has_errors(result) else None
-    write_json({**result.summary(), "relative_error": error, "files": written}, json_path)
+    opt.write_json({**result.summary(), "relative_error": error, "files": written}, json_path)
     if relative_error is not None and not result.partial and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
@@ -212,7 +191,7 @@ def simulate(
         left_out = "; no records were written" if records else ""
         asked = result.requested[1] - result.requested[0]
         fail(
-            f"interrupted after {count(result.photons)} of {count(asked)} photons, "
+            f"interrupted after {opt.count(result.photons)} of {opt.count(asked)} photons, "
             f"which are written and marked partial{left_out}",
             INTERRUPTED,
         )
@@ -224,7 +203,7 @@ def _earlier(place: Path, photons: int | None) -> Result:
     if place.is_dir():
         there = [path for name in ("result.h5", _CHECKPOINT) if (path := place / name).is_file()]
         place = max(there, key=lambda path: path.stat().st_mtime_ns, default=place)
-    earlier = load_run(place)
+    earlier = opt.load_run(place)
     start, stop = earlier.requested
     wanted = stop - start if photons is None else photons
     if wanted <= earlier.photons:
@@ -318,8 +297,8 @@ def described(result: Result, frame: NDArray[np.float64], written: list[Path]) -
     ledger = summary["ledger"]
     returned = np.isfinite(frame)
     lines = {
-        "photons": f"{count(result.photons)}, seed {result.seed}, on {result.provenance['device']} in {seconds:.3g} s "
-        f"({result.photons / seconds:.3g}/s)",
+        "photons": f"{opt.count(result.photons)}, seed {result.seed}, on {result.provenance['device']} "
+        f"in {seconds:.3g} s ({result.photons / seconds:.3g}/s)",
         "collected": f"{sum(collected.values()):.3g} of the emitted light: "
         + ", ".join(f"{name.replace('_', '-')} {part:.3g}" for name, part in collected.items()),
         "detections": f"{summary['detections_per_pulse']:.3g} a pulse, all pixels together",
@@ -342,4 +321,4 @@ def described(result: Result, frame: NDArray[np.float64], written: list[Path]) -
         f"{name} {100 * part:.3g} %" for name, part in parts if part
     )
     lines["written"] = ", ".join(path.name for path in written) + f" in {written[0].parent}"
-    return rows(lines)
+    return opt.rows(lines)

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 import spadwarp
+from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
-from spadwarp.cli._options import Json, Out, Overwrite, Quiet, arguments_checked, prepare_directory, rows, write_json
 
 
 class Format(enum.StrEnum):
@@ -36,14 +36,14 @@ def export(
         list[Format],
         typer.Option("--format", help="Format to write; may be repeated.", show_default=False),
     ],
-    out: Out,
+    out: opt.Out,
     frames: Annotated[
         str | None, typer.Option(metavar="N or A:B", help="Only frame N, or A to B - 1; by default all.")
     ] = None,
     split: Annotated[str, typer.Option(metavar="NAME", help="Of a dataset: train, validation, test or all.")] = "all",
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    json_path: Json = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
 ) -> None:
     """Results, frames and datasets in the formats of other programs.
 
@@ -64,9 +64,9 @@ def export(
     """
     source = _inside(path)
     chosen = _frames(frames)
-    prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
+    opt.prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
     written: dict[str, list[Path]] = {}
-    with arguments_checked():
+    with opt.arguments_checked():
         # Those that not every source has go first, so that nothing is written where one is refused.
         for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
             path = out / f"{source.resolve().stem}.{one.value}"
@@ -76,8 +76,8 @@ def export(
         for name, paths in written.items():
             more = f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else ""
             lines[name] = f"{paths[0]}{more}"
-        say(rows(lines))
-    write_json({"files": [path for paths in written.values() for path in paths]}, json_path)
+        say(opt.rows(lines))
+    opt.write_json({"files": [path for paths in written.values() for path in paths]}, json_path)
 
 
 def _inside(place: Path) -> Path:

@@ -1,0 +1,90 @@
+"""Tables of numbers for people, and as CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spadwarp.analytic.budget import BudgetRow
+
+
+def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
+    from spadwarp.analytic.budget import OUTLIERS
+
+    table = _table(
+        title,
+        "range [m]",
+        "c·r",
+        "signal",
+        "background",
+        "α",
+        "S/B",
+        "σ* [ps]",
+        "σ* [mm]",
+        "outliers",
+        "pulses for 1 cm",
+    )
+    before = None
+    for name, row in zip(names, found, strict=True):
+        reached = row.outlier_probability <= OUTLIERS
+        table.add_row(
+            name if name != before else "",
+            f"{row.range:.4g}",
+            f"{row.optical_depth:.3g}",
+            f"{row.signal:.3g}",
+            f"{row.background:.3g}",
+            f"{row.alpha:.3g}",
+            _short(row.signal_to_backscatter),
+            _bracketed(1e12 * row.sigma_time, reached),
+            _bracketed(1e3 * row.sigma_depth, reached),
+            _percent(row.outlier_probability),
+            "never" if math.isinf(row.pulses_for_1cm) else f"{row.pulses_for_1cm:.3g}",
+        )
+        before = name
+    return table
+
+
+def _table(first: str, *titles: str) -> Table:
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column(escape(first), no_wrap=True)
+    for title in titles:
+        table.add_column(escape(title), justify="right", no_wrap=True)
+    return table
+
+
+def _short(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return "∞" if math.isinf(value) else f"{value:.3g}"
+
+
+def _bracketed(value: float, reached: bool) -> str:
+    text = _short(value)
+    return text if reached or text == "-" else f"({text})"
+
+
+def _percent(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
+
+
+def _write_csv(path: Path, table: Sequence[dict[str, Any]]) -> Path:
+    import csv
+
+    from spadwarp.io.atomic import atomic_path
+
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
+    return path

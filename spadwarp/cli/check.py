@@ -1,0 +1,74 @@
+"""`spadwarp check`: what may be wrong with a scene, without running it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+
+@app.command()
+def check(
+    scene_path: opt.ScenePath,
+    mesh: opt.Mesh = None,
+    overrides: opt.Overrides = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Validate a scene without running it; warn with numbers.
+
+    Exit code 0 with or without warnings, 2 for a scene that is not valid.
+
+    \b
+    Example:
+      spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
+    """
+    from spadwarp.checks import summary
+    from spadwarp.mesh import build_mesh
+
+    scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
+    triangles = build_mesh(scene)
+    messages, numbers = spadwarp.check(scene, triangles), summary(scene, triangles)
+    faces = 0 if triangles is None else triangles.face_count
+    if not quiet:
+        say(opt.rows(_derived(numbers, faces)))
+        say()
+    for message in messages:
+        if message.level == "warning" or not quiet:
+            say(str(message))
+    if not quiet and not any(message.level == "warning" for message in messages):
+        say(f"{scene_path}: valid, no warnings")
+    found = [dataclasses.asdict(message) for message in messages]
+    opt.write_json({"scene": scene_path, "faces": faces, **numbers, "messages": found}, json_path)
+
+
+def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
+    """What follows from a scene, for people."""
+
+    def between(pair: tuple[float, float] | None, unit: str) -> str:
+        return "none in the view and the beam" if pair is None else f"{pair[0]:.5g} to {pair[1]:.5g} {unit}"
+
+    def about(value: float | None, text: str) -> str:
+        return "-" if value is None else text.format(value)
+
+    return {
+        "attenuation length": "; ".join(
+            f"{water['attenuation_length']:.4g} m, albedo {water['albedo']:.3g}"
+            + (f" from {water['start']:.4g} m on" if "start" in water else "")
+            for water in (numbers, *numbers["layers"])
+        ),
+        "target": f"{between(numbers['target_range'], 'm')}, {opt.count(faces)} faces",
+        "optical depth": about(numbers["optical_depth"], "{:.3g} one way"),
+        "returns": between(numbers["target_arrival_ns"], "ns"),
+        "gate": f"{between(numbers['gate_range'], 'm')}, a bin {1000 * numbers['bin_range']:.3g} mm",
+        "unambiguous": f"to {numbers['unambiguous_range']:.4g} m",
+        "view": f"{numbers['horizontal_fov_deg']:.3g} x {numbers['vertical_fov_deg']:.3g} degrees",
+        "pulse": f"{numbers['photons_per_pulse']:.3g} photons, detected with {100 * numbers['pde']:.3g} % efficiency",
+        "signal": about(numbers["signal_per_pulse"], "{:.3g} unscattered detections a pulse in a pixel"),
+        "sampling": about(numbers["samples_per_pixel"], "{:.3g} traced photons on what a pixel sees, unscattered"),
+        "histograms": opt.in_bytes(numbers["histogram_bytes"]),
+    }

@@ -1,0 +1,136 @@
+"""`spadwarp detect`: counts of a SPAD camera from expected histograms."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, complain, say
+from spadwarp.cli._progress import progress
+from spadwarp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from spadwarp import Result
+    from spadwarp.frames import Recording
+
+# What a detector sees of a scene; the rest has decided which photons came.
+_DETECTOR_FIELDS = ("detector", "laser.pulse_energy", "laser.repetition_rate", "laser.pulse_fwhm_ps")
+
+
+@app.command()
+def detect(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A result, or its directory.", show_default=False)],
+    out: opt.Out,
+    pulses: Annotated[
+        int | None,
+        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame. By default detector.pulses."),
+    ] = None,
+    frames: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Frames to record.")] = 1,
+    seed: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Key of the random numbers.")] = 0,
+    method: Annotated[
+        list[opt.Estimator] | None,
+        typer.Option(help="Estimator of depth; may be repeated. By default all four; the last is drawn."),
+    ] = None,
+    coates: Annotated[bool, typer.Option("--coates", help="Undo pile-up (Coates) before depth is estimated.")] = False,
+    tags: Annotated[bool, typer.Option("--tags", help="Also keep the time tag of every detection.")] = False,
+    window: Annotated[
+        tuple[float, int] | None,
+        typer.Option(metavar="NS BINS", help="Start and bins of the detector's window. By default the run's gate."),
+    ] = None,
+    overrides: opt.Overrides = None,
+    device: opt.Device = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Frames of counts that the camera would record of a run.
+
+    Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
+    takes fields of the detector, and pulse_energy, repetition_rate and pulse_fwhm_ps of the laser.
+
+    \b
+    Example:
+      spadwarp detect run1/result.h5 --pulses 20000 --frames 100 --seed 3 --out frames/
+      spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
+    """
+    from spadwarp.frames import record_frames
+    from spadwarp.viz.frames import draw_recording
+
+    result = _with_detector(opt.load_run(run), overrides)
+    chosen: Any = [one.value for one in method or opt.Estimator]
+    width, height = result.scene.camera.width, result.scene.camera.height
+    pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if window is None else window[1]
+    shots = result.scene.detector.pulses if pulses is None else pulses
+    counted = min(shots, bins) if result.scene.detector.mode == "first_photon" else bins
+    opt.prepare_directory(out, overwrite=overwrite, needed=pixels * (4 * counted + 4 * len(chosen) + 8) + (16 << 20))
+    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as report:
+        recording = record_frames(
+            result,
+            out / "frames.h5",
+            pulses=pulses,
+            frames=frames,
+            seed=seed,
+            methods=list(dict.fromkeys(chosen)),
+            undo_pile_up=coates,
+            tags=tags,
+            window=None if window is None else (window[0] * 1e-9, window[1]),
+            device=device,
+            progress=report,
+        )
+    for note in recording.notes:
+        complain(f"note: {note}")
+    written = [recording.path, draw_recording(recording, result, out / "frame.png")]
+    summary = _summary(recording, frames)
+    if not quiet:
+        lines = _told(recording, summary)
+        lines["written"] = ", ".join(path.name for path in written) + f" in {out}"
+        say(opt.rows(lines))
+    opt.write_json({**summary, "files": written}, json_path)
+
+
+def _with_detector(result: Result, overrides: list[str] | None) -> Result:
+    """The result with another detector; other fields would belong to another run."""
+    for one in overrides or []:
+        field = one.partition("=")[0].strip()
+        if not any(field == known or field.startswith(f"{known}.") for known in _DETECTOR_FIELDS):
+            raise ConfigError(f"--set: {field} is not a field of {', '.join(_DETECTOR_FIELDS)}; simulate again")
+    return dataclasses.replace(result, scene=result.scene.with_overrides(overrides or []))
+
+
+def _summary(recording: Recording, frames: int) -> dict[str, Any]:
+    import numpy as np
+
+    first, bound = recording.first, recording.bound_depth[np.isfinite(recording.bound_depth)]
+    pixels = first.counts.shape[1] * first.counts.shape[2]
+    return {
+        "pulses": first.pulses,
+        "frames": frames,
+        "seed": first.seed,
+        "detections_per_frame_and_pixel": recording.detections / (frames * pixels),
+        "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
+        "bound": {"pixels": int(bound.size), "median_m": float(np.median(bound)) if bound.size else None},
+        "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
+        "notes": list(recording.notes),
+    }
+
+
+def _told(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
+    median = summary["bound"]["median_m"]
+    lines = {
+        "frames": f"{opt.count(summary['frames'])} of {opt.count(summary['pulses'])} pulses, seed {summary['seed']}",
+        "detections": f"{summary['detections_per_frame_and_pixel']:.4g} a frame and pixel, "
+        f"{summary['detections_per_pulse_and_pixel']:.3g} a pulse and pixel",
+        "bound": "no information on depth in any pixel"
+        if median is None
+        else f"{1000 * median:.3g} mm of depth in the median pixel (Cramér–Rao, one frame)",
+    }
+    for name, error in recording.errors.items():
+        lines[name] = (
+            f"{100 * error.estimate_fraction:.3g} % of the target's pixels; error {1000 * error.median:.3g} mm in the "
+            f"median, below {1000 * error.p90:.3g} mm in 90 %"
+        )
+    return lines

@@ -1,0 +1,24 @@
+"""`spadwarp devices`: what photons can be traced on."""
+
+from __future__ import annotations
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+
+@app.command()
+def devices(json_path: opt.Json = None) -> None:
+    """Where photons can be traced: the CPU and the GPUs.
+
+    \b
+    Example:
+      spadwarp devices
+    """
+    found = spadwarp.devices()
+    for device in found:
+        memory = f", {opt.in_bytes(device['memory'])}" if device["memory"] else ""
+        say(f"{device['name']:<8}  {device['description']}{memory}" + ("  (default)" if device["default"] else ""))
+    if len(found) == 1:
+        say("no NVIDIA GPU with driver R580 or newer is seen")
+    opt.write_json({"devices": found}, json_path)

@@ -1,0 +1,174 @@
+"""`spadwarp evaluate`: every method on the same frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+from spadwarp.cli._progress import progress
+
+
+@app.command()
+def evaluate(
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATA", help="A dataset's folder; or a Monte Carlo result.", show_default=False),
+    ],
+    models: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES",
+            help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid, of results histograms too.',
+        ),
+    ] = "all",
+    split: Annotated[str, typer.Option(metavar="NAME", help="test, validation, train or all.")] = "test",
+    frames: Annotated[
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Frames of each target and level.")
+    ] = 20,
+    bm3d_frames: Annotated[
+        int,
+        typer.Option(parser=opt.whole_number, metavar="N", help="Frames of each level for BM3D, up to a minute each."),
+    ] = 0,
+    crop: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            metavar="WIDTH HEIGHT", help="Only the middle part of each frame [pixels]; 128 96 spares BM3D time."
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Also write here: report.html, its pictures, scores.json; of a result photons.png alone.",
+        ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of spadwarp train, for the network it names. By default the package's."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Of the counts that are drawn from a result.")
+    ] = 0,
+    device: opt.TorchDevice = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Compare denoisers on a dataset, or on frames of few photons.
+
+    On a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved. On a Monte Carlo result:
+    frames of 1 to 100 signal photons a pixel at several signal-to-background ratios, RMSE beside the Cramér-Rao bound.
+
+    \b
+    Examples:
+      spadwarp dataset make configs/datasets/paper.toml --out data/paper/
+      spadwarp evaluate data/paper/ --models all --report report/
+      spadwarp evaluate data/paper/ --weights runs/pyramid/pyramid.safetensors --report report/
+      spadwarp evaluate data/paper/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
+      spadwarp evaluate out/result.h5 --report photons/
+    """
+    from rich.table import Table
+
+    from spadwarp.denoise import TITLES, write_report
+    from spadwarp.denoise import evaluate as run
+
+    chosen = ["median", "gating", "usdn", "dncnn", "pyramid"] if models == "all" else models.split(",")
+    chosen = [name.strip() for name in chosen]
+    if "bm3d" in chosen and bm3d_frames == 0:
+        bm3d_frames = 20
+    if report is not None:
+        opt.check_writable(report)
+    if data.is_file() or (data / "result.h5").is_file():
+        _sweep(
+            data,
+            [*chosen, "histograms"] if models == "all" else chosen,
+            report,
+            weights=weights,
+            seed=seed,
+            device=device,
+            quiet=quiet,
+            json_path=json_path,
+        )
+        return
+    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+        found = run(
+            data,
+            models=chosen,
+            split=split,
+            frames=frames,
+            bm3d_frames=bm3d_frames,
+            crop=crop,
+            weights=weights,
+            device=device,
+            progress=told,
+        )
+    written = write_report(found, report) if report is not None else []
+    if not quiet:
+        table = Table("method", *found.levels, "mean")
+        for method in found.ranking():
+            gains = []
+            for level in (*found.levels, None):
+                one, before = found.mean(method, level=level), found.mean("input", level=level)
+                gains.append(f"{one.psnr:.2f}" if method == "input" else f"{one.psnr - before.psnr:+.2f}")
+            table.add_row(TITLES[method], *gains)
+        say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
+        opt.show_table(table)
+        if found.steps:
+            steps = {
+                method: [one for (name, _), one in found.steps.items() if name == method] for method in found.methods
+            }
+            say(
+                opt.rows(
+                    {
+                        TITLES[method]: f"{sum(one.resolved for one in all_)} of {sum(one.total for one in all_)} steps"
+                        for method, all_ in steps.items()
+                    }
+                )
+            )
+        if written:
+            say(f"written: {written[0]}")
+    opt.write_json({**found.to_dict(), "files": written}, json_path)
+
+
+def _sweep(
+    data: Path,
+    models: list[str],
+    report: Path | None,
+    *,
+    weights: Path | None,
+    seed: int,
+    device: str | None,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Frames of few photons from a result."""
+    from rich.table import Table
+
+    from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
+
+    result = opt.load_run(data)
+    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+        found = photon_sweep(
+            result,
+            models=[one for one in models if one != "bm3d"],
+            weights=weights,
+            seed=seed,
+            device=device,
+            progress=told,
+        )
+    written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
+    if not quiet:
+        say(f"RMSE [mm]; {found.summary}")
+        for row, ratio in enumerate(found.sbr):
+            table = Table(f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons))
+            for name, values in found.rmse.items():
+                title = "likelihood of each pixel" if name == "input" else TITLES[name]
+                table.add_row(title, *(f"{1e3 * one:.3g}" for one in values[row]))
+            table.add_row("Cramér–Rao bound", *(f"{1e3 * one:.3g}" for one in found.bound[row]))
+            opt.show_table(table)
+        if written:
+            say(f"written: {written[0]}")
+    opt.write_json({**found.to_dict(), "files": written}, json_path)

@@ -1,0 +1,72 @@
+"""`spadwarp info`: what a file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A result, or the directory it lies in.")],
+    json_path: opt.Json = None,
+) -> None:
+    """What is in a result, and how it was made.
+
+    With the energy ledger: where the emitted light went.
+
+    \b
+    Example:
+      spadwarp info out/result.h5
+    """
+    result = opt.load_run(path)
+    summary = result.summary()
+    outside = {name: result.counters[name] * result.unit / result.photons for name in ("before_gate", "after_gate")}
+    say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _told(summary, outside).items()))
+    opt.write_json(summary, json_path)
+
+
+def _told(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str, dict[str, str]]:
+    """A result's summary by headings."""
+    image, gate, medium, made = summary["image"], summary["gate"], summary["medium"], summary["provenance"]
+    depth, ledger, timing = summary["truth"]["depth_m"], summary["ledger"], summary["timing"]
+    fractions, counters = ledger["fractions"], summary["counters"]
+    photons = opt.count(summary["photons"]) + (", stopped early" if summary["partial"] else "")
+    water = ", ".join(f"{name.replace('_', ' ')} {_number(value)}" for name, value in medium.items())
+    collected = {name.replace("_", "-"): f"{part:.4g}" for name, part in summary["collected_fraction"].items()}
+    collected |= {f"({name.replace('_', ' the ')})": f"{part:.4g}" for name, part in outside.items()}
+    return {
+        "Result": {
+            "photons": f"{photons}, seed {summary['seed']}",
+            "image": f"{image['width']} x {image['height']} pixels x {gate['bins']} bins of {gate['bin_width_ps']:.5g} "
+            f"ps from {gate['start_ns']:.5g} ns (path {gate['path_m'][0]:.4g} to {gate['path_m'][1]:.4g} m)",
+            "water": water,
+            "truth": f"{summary['truth']['pixels']} pixels"
+            + (f", {depth[0]:.4g} to {depth[1]:.4g} m" if depth else ""),
+            "returns": f"in {summary['pixels_with_return']} pixels, {summary['detections_per_pulse']:.4g} detections a "
+            "pulse",
+        },
+        "Collected, as fractions of the emitted light": collected,
+        f"Energy ledger, {'exact' if ledger['exact'] else 'off by ' + str(ledger['difference']) + ' units'}": {
+            name: f"{100 * part:10.6f} %" for name, part in fractions.items() if part
+        }
+        | {"sum": f"{100 * sum(fractions.values()):10.6f} %"},
+        "Counted": {name: opt.count(number) for name, number in counters.items() if name not in outside},
+        "Made": {
+            "from": summary["scene"] or "Python",
+            "on": f"{made['device']} ({made['device_name']}), {made['date']}"
+            + (f", the first of {len(made['parts'])} parts" if "parts" in made else ""),
+            "with": ", ".join(f"{name} {made[name]}" for name in ("spadwarp", "warp", "numpy", "python")),
+            "in": ", ".join(f"{name} {seconds:.3g} s" for name, seconds in timing.items()),
+        },
+    }
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

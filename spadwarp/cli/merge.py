@@ -1,0 +1,49 @@
+"""`spadwarp merge`: runs added up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+from spadwarp.cli.simulate import bytes_needed, described, write_run
+
+if TYPE_CHECKING:
+    pass
+
+
+@app.command()
+def merge(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Results, or the directories they lie in.", show_default=False),
+    ],
+    out: opt.Out,
+    device: opt.Device = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Add runs of one scene and seed that traced different photons.
+
+    The sum is, bit for bit, the run of all the photons at once. Writes what `spadwarp simulate` writes.
+
+    \b
+    Example:
+      spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --out a/
+      spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
+      spadwarp merge a/ b/ --out ab/
+    """
+    result = spadwarp.merge(opt.load_run(place) for place in runs)
+    needed = bytes_needed(result.scene, records=False, batches=result.batch_size > 0)
+    opt.prepare_directory(out, overwrite=overwrite, needed=needed)
+    written, frame = write_run(result, out, device=device)
+    if not quiet:
+        ids = ", ".join(f"{opt.count(start)} to {opt.count(stop - 1)}" for start, stop in result.photon_ranges)
+        say(opt.rows({"photon ids": ids}))
+        say(described(result, frame, written))
+    opt.write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": written}, json_path)

@@ -1,0 +1,90 @@
+"""`spadwarp sweep`: budget or depth error over any field of the scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spadwarp import Scene
+    from spadwarp.analytic.budget import DepthErrorRow
+from spadwarp.cli._tables import _budget_table, _percent, _short, _table, _write_csv
+
+
+class Quantity(enum.StrEnum):
+    """What `spadwarp.sweep` can be of."""
+
+    budget = "budget"
+    depth_error = "depth-error"
+
+
+@app.command()
+def sweep(
+    scene_path: opt.ScenePath,
+    vary: Annotated[
+        str,
+        typer.Option(metavar="FIELD=FROM:TO:N", help="Field and values; :log for a geometric progression; or a,b,c."),
+    ],
+    out: opt.Out,
+    of: Annotated[Quantity, typer.Option(help="Budget of the central pixel, or depth error of all.")] = Quantity.budget,
+    mesh: opt.Mesh = None,
+    overrides: opt.Overrides = None,
+    device: opt.Device = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Curves over any field of the scene, from the analytic model.
+
+    Writes sweep.png and sweep.csv.
+
+    \b
+    Example:
+      spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
+    """
+    from spadwarp.analytic.budget import plot_sweep
+
+    scene: Scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
+    opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
+    with opt.arguments_checked():
+        curves = spadwarp.sweep(scene, vary=vary, of=of.value, device=device)
+    plot_sweep(curves, out / "sweep.png")
+    values, some = list(curves.values), list[Any](curves.rows)
+    found = [dataclasses.asdict(row) for row in some]
+    table = [{curves.field: value, **row} for value, row in zip(values, found, strict=True)]
+    written = [out / "sweep.png", _write_csv(out / "sweep.csv", table)]
+    if not quiet:
+        names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in values]
+        opt.show_table(
+            _budget_table(names, curves.field, some)
+            if of is Quantity.budget
+            else _error_table(names, curves.field, some)
+        )
+        say(f"written: {', '.join(path.name for path in written)} in {out}")
+    opt.write_json(
+        {"field": curves.field, "values": values, "of": of.value, "rows": found, "files": written}, json_path
+    )
+
+
+def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:
+    table = _table(title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "S/B")
+    for name, row in zip(names, found, strict=True):
+        table.add_row(
+            name,
+            _short(1e3 * row.sigma_depth),
+            _short(1e3 * row.sigma_depth_p90),
+            _percent(row.outlier_probability),
+            _percent(row.estimate_fraction),
+            _short(row.signal_to_backscatter),
+        )
+    return table

@@ -1,0 +1,73 @@
+"""`spadwarp train`: a recipe and a dataset in, weights out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+from spadwarp.cli._progress import progress
+from spadwarp.errors import ConfigError
+
+
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Argument(metavar="RECIPE", help="Training recipe (TOML).", show_default=False)],
+    out: opt.Out,
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Dataset in place of the recipe's.", show_default=False)
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(parser=opt.whole_number, metavar="N", help="Updates. By default the recipe's.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(parser=opt.whole_number, metavar="N", help="Seed. By default the recipe's.")
+    ] = None,
+    device: opt.TorchDevice = None,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """Train a denoiser on the clean scenes of a dataset.
+
+    Noise is drawn anew for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
+    command goes on with a run that was cut short. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+
+    \b
+    Example:
+      spadwarp dataset make configs/datasets/training.toml --out data/training/
+      spadwarp train configs/training/pyramid.toml --out runs/pyramid/
+    """
+    from spadwarp.denoise import load_training_recipe
+    from spadwarp.denoise import train as run
+
+    changes: dict[str, Any] = {}
+    if data is not None:
+        changes["data"] = str(data)
+    if seed is not None:
+        changes["seed"] = seed
+    if steps is not None:
+        changes["optimiser"] = {"steps": steps}
+    chosen = load_training_recipe(recipe, overrides=changes)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out: {out} is a file; a directory is needed")
+    opt.check_writable(out)
+    first = int(os.environ.get("RANK", "0")) == 0
+    with opt.arguments_checked(), progress(quiet=quiet or not first, unit="steps") as told:
+        trained = run(chosen, out, device=device, progress=told)
+    if first:
+        if not quiet:
+            say(
+                opt.rows(
+                    {
+                        "model": f"{chosen.model}, {opt.count(chosen.optimiser.steps)} steps, seed {chosen.seed}",
+                        "validation": f"{trained.psnr:.2f} dB PSNR, mean over six levels of backscatter",
+                        "time": f"{trained.seconds:.0f} s",
+                        "written": f"{trained.weights} ({opt.in_bytes(trained.weights.stat().st_size)})",
+                    }
+                )
+            )
+        opt.write_json({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights}, json_path)

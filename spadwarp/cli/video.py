@@ -1,0 +1,51 @@
+"""`spadwarp video`: light in flight as a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+
+@app.command()
+def video(
+    run: opt.RunOrFrames,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Ends in .gif, or in .mp4, which needs ffmpeg.")] = Path(
+        "light.gif"
+    ),
+    window: Annotated[
+        str | None, typer.Option(metavar="FROM,TO", help="Times of flight [ns]; by default all with light in them.")
+    ] = None,
+    pictures: Annotated[int, typer.Option(min=1, metavar="N", help="At most; bins are merged.")] = 120,
+    fps: Annotated[float, typer.Option(metavar="N", help="Pictures per second, up to 50.")] = 12.0,
+    linear: Annotated[bool, typer.Option("--linear", help="A linear colour scale, not four decades.")] = False,
+    frame: opt.Frame = 0,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Light in flight: what each pixel receives, bin after bin.
+
+    \b
+    Examples:
+      spadwarp video out/
+      spadwarp video out/ --out light.mp4 --window 40,55 --fps 20
+    """
+    scale: Literal["log", "linear"] = "linear" if linear else "log"
+    with opt.arguments_checked():
+        path = spadwarp.video(run, out, window_ns=_window(window), pictures=pictures, fps=fps, scale=scale, frame=frame)
+    if not quiet:
+        say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")
+
+
+def _window(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        start, stop = (float(word) for word in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not FROM,TO, two numbers", param_hint="--window") from None
+    return start, stop

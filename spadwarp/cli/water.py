@@ -1,0 +1,48 @@
+"""`spadwarp water`: optical properties of water."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import typer
+
+import spadwarp
+from spadwarp.cli import _options as opt
+from spadwarp.cli._app import app, say
+
+
+@app.command()
+def water(
+    wavelength_nm: Annotated[float, typer.Argument(metavar="NM", help="Vacuum wavelength, 400 to 700 [nm].")],
+    chlorophyll: Annotated[float, typer.Option(metavar="C", help="0 (pure water) to 30 [mg/m3].")] = 0.0,
+    temperature: Annotated[float, typer.Option(metavar="T", help="0 to 30 [degrees Celsius].")] = 20.0,
+    salinity: Annotated[float, typer.Option(metavar="S", help="0 (fresh) to 40 [g/kg].")] = 35.0,
+    json_path: opt.Json = None,
+) -> None:
+    """Absorption, scattering and indices of water at a wavelength.
+
+    What a scene gets by medium.chlorophyll, temperature and salinity.
+
+    \b
+    Example:
+      spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
+    """
+    with opt.arguments_checked():
+        optics = spadwarp.water_optics(
+            wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
+        )
+    say(
+        opt.rows(
+            {
+                "absorption": f"{optics.absorption:.4g} 1/m, of pure water {optics.water_absorption:.4g}",
+                "scattering": f"{optics.scattering:.4g} 1/m, of pure water {optics.water_scattering:.4g}",
+                "extinction": f"{optics.extinction:.4g} 1/m, attenuation length {1.0 / optics.extinction:.4g} m",
+                "albedo": f"{optics.albedo:.4g}",
+                "phase index": f"{optics.phase_index:.5f}",
+                "group index": f"{optics.group_index:.5f}",
+            }
+        )
+    )
+    asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
+    opt.write_json({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction}, json_path)
