@@ -276,7 +276,7 @@ def _pulses_needed(
     chosen = scene.analytic
     alpha, sigma = maps["alpha"], response_sigma(scene)
     per_acquisition = 1.0 if chosen.count_law == "per_pulse" else chosen.exposure * scene.laser.repetition_rate
-    if chosen.count_law == "per_frame_paper":
+    if chosen.count_law == "per_frame_lu2024":
         recorded = -np.expm1(per_acquisition * np.log1p(-np.minimum(alpha, 1 - 1e-16)))
     else:
         recorded = -np.expm1(-alpha * per_acquisition)

@@ -4,8 +4,8 @@ Per pixel, from the truth of the scene: signal detections per pulse (eq 3–7), 
 8), Fisher information (eq 9) and Cramér–Rao bound; then frames of arrival + noise with background photons in between.
 Equation numbers are those of *A Simulation Method for Underwater SPAD Depth Imaging Datasets*, Sensors 24, 3886 (2024).
 
-What the model leaves out: multiple scattering, shadows of a laser beside the lens, folding at the repetition period,
-pile-up (the information is that of α ≪ 1 per acquisition) and instrument responses that are not Gaussian.
+What the model leaves out: multiple scattering, shadows of a laser beside the lens, range aliasing, pile-up (the
+information is that of α ≪ 1 per acquisition) and instrument responses that are not Gaussian.
 """
 
 from __future__ import annotations
@@ -253,16 +253,16 @@ def pixel_maps(
         signal_d,
         arrival_d,
         total_d,
-        count_law=chosen.count_law.replace("paper", "lu2024"),
-        acquisitions=chosen.pulses if chosen.count_law == "per_pulse" else chosen.frames,
+        count_law=chosen.count_law,
+        acquisitions=chosen.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=per_frame,
         outliers=outliers,
     )
     signal, arrival, backscatter = signal_d.numpy(), arrival_d.numpy(), total_d.numpy()
     alpha, fisher, sigma_time, level, outlier = (one.numpy() for one in statistics)
-    if chosen.count_law == "per_frame_paper" and alpha.max(initial=0.0) > 1.0:
+    if chosen.count_law == "per_frame_lu2024" and alpha.max(initial=0.0) > 1.0:
         raise ConfigError(
-            f"analytic.count_law = 'per_frame_paper' needs alpha < 1; it reaches {alpha.max():.4g} detections per "
+            f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {alpha.max():.4g} detections per "
             "pulse here, use 'per_frame'",
             source=_source(scene),
         )
@@ -317,10 +317,10 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
         problems.append("analytic: laser.profile = 'measured' has no closed form; simulate takes any")
     if scene.scan.mode != "none":
         problems.append(f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it")
-    paper = chosen.form == "paper"
-    if paper and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90):
+    lu2024 = chosen.form == "lu2024"
+    if lu2024 and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90):
         problems.append(
-            f"analytic.form = 'paper' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
+            f"analytic.form = 'lu2024' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
             f"of {laser.half_angle_deg}"
         )
     if scene.medium.layers:
@@ -333,7 +333,7 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     if problems:
         raise ConfigError(problems, source=_source(scene))
     lidar: Any = Lidar()
-    lidar.lu2024 = int(paper)
+    lidar.lu2024 = int(lu2024)
     lidar.photons = laser.photons_per_pulse
     lidar.pde = scene.detector.pde
     lidar.extinction = scene.medium.extinction

@@ -499,7 +499,7 @@ def _detect(case: Case, device: wp.Device, _: int | None, repeats: int) -> Bench
     source: Any = wp.array(light.astype(np.float32), dtype=wp.float32, device=device)
     options: dict[str, Any] = {
         "pulses": pulses,
-        "detector": Detector(fold=False),
+        "detector": Detector(wrap=False),
         "laser": Laser(),
         "gate_start": 0.0,
         "bin_width": bin_width,

@@ -339,12 +339,12 @@ def _timing(shape: _Shape) -> Iterator[CheckMessage]:
         text = (
             f"the target returns after up to {last:.5g} ns, later than the next pulse ({period_ns:.5g} ns): the "
             f"unambiguous range is {unambiguous:.4g} m, "
-            + ("time folds" if scene.detector.fold else "ignored, since detector.fold is false")
+            + ("time wraps" if scene.detector.wrap else "ignored, since detector.wrap is false")
         )
         values = {"unambiguous_range": unambiguous, "last_ns": last, "period_ns": period_ns}
-        yield CheckMessage("warning" if scene.detector.fold else "note", "laser.repetition_rate", text, values)
+        yield CheckMessage("warning" if scene.detector.wrap else "note", "laser.repetition_rate", text, values)
     if (length := (gate.stop - gate.start) * 1e9) > period_ns * (1 + 1e-9):
-        text = f"the gate of {length:.5g} ns is longer than the pulse period, {period_ns:.5g} ns: time folds within it"
+        text = f"the gate of {length:.5g} ns is longer than the pulse period, {period_ns:.5g} ns: time wraps within it"
         yield CheckMessage("note", "gate.bins", text, {"gate_ns": length, "period_ns": period_ns})
     if gate.bin_width_ps > shape.irf_fwhm_ps:
         text = (
@@ -486,14 +486,14 @@ def _molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
 def _cutoff_collisions(scene: Scene) -> float:
     """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
     transport, albedo = scene.transport, scene.medium.albedo
-    if albedo != "paper":
+    if albedo != "lu2024":
         albedo = max(water.scattering / water.extinction for water in scene.medium.waters)
     if transport.termination != "cutoff" or transport.weight_cutoff == 0.0 or albedo == 1.0:
         return math.inf
     if albedo == 0.0:
         return 1.0
     # The mean of ln ω for ω uniform in (0, 0.97) is ln 0.97 − 1.
-    step = math.log(0.97) - 1.0 if albedo == "paper" else math.log(albedo)
+    step = math.log(0.97) - 1.0 if albedo == "lu2024" else math.log(albedo)
     return max(1.0, math.ceil(math.log(transport.weight_cutoff) / step))
 
 

@@ -47,8 +47,8 @@ def make(
     \b
     Examples:
       spadwarp dataset make configs/datasets/small.toml --out data/small/
-      spadwarp dataset make configs/datasets/paper.toml --out data/paper/ --device cuda:all
-      spadwarp dataset make configs/datasets/paper.toml --out data/paper/ --shard 3/64
+      spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all
+      spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --shard 3/64
     """
     recipe = spadwarp.load_recipe(recipe_path)
     if overrides:

@@ -27,7 +27,7 @@ def detect(
     out: opt.Out,
     pulses: Annotated[
         int | None,
-        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame. By default detector.pulses."),
+        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame. By default detector.pulses_per_frame."),
     ] = None,
     frames: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Frames to record.")] = 1,
     seed: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Key of the random numbers.")] = 0,
@@ -64,7 +64,7 @@ def detect(
     chosen: Any = [one.value for one in method or opt.Estimator]
     width, height = result.scene.camera.width, result.scene.camera.height
     pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if window is None else window[1]
-    shots = result.scene.detector.pulses if pulses is None else pulses
+    shots = result.scene.detector.pulses_per_frame if pulses is None else pulses
     counted = min(shots, bins) if result.scene.detector.mode == "first_photon" else bins
     opt.prepare_directory(out, overwrite=overwrite, needed=pixels * (4 * counted + 4 * len(chosen) + 8) + (16 << 20))
     with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as report:

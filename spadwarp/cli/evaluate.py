@@ -64,10 +64,10 @@ def evaluate(
 
     \b
     Examples:
-      spadwarp dataset make configs/datasets/paper.toml --out data/paper/
-      spadwarp evaluate data/paper/ --models all --report report/
-      spadwarp evaluate data/paper/ --weights runs/pyramid/pyramid.safetensors --report report/
-      spadwarp evaluate data/paper/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
+      spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/
+      spadwarp evaluate data/lu2024/ --models all --report report/
+      spadwarp evaluate data/lu2024/ --weights runs/pyramid/pyramid.safetensors --report report/
+      spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
     """
     from rich.table import Table

@@ -254,7 +254,7 @@ def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Pa
         raise FileError(f"{text}: cannot be written: {error.strerror}") from error
     written.append(text)
     options: dict[str, Any] = {}
-    if output.depth_method == "matched":
+    if output.depth_method in ("matched", "likelihood"):
         from spadwarp.frames import detector_response
 
         options["irf"] = detector_response(scene.detector, scene.laser)

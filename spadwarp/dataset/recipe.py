@@ -30,6 +30,7 @@ from spadwarp.io.text import read_toml
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
+from spadwarp.scene.renamed import current_fields, current_path
 from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
@@ -181,12 +182,14 @@ class Exposure(_Table):
     """How long a frame is exposed: by pulses, or by the photons that come back from the median pixel."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
-    pulses: Positive | None = Field(None, description="pulses of a frame; the scene's if neither is given")
+    pulses_per_depth_frame: Positive | None = Field(
+        None, description="pulses of a frame; the scene's if neither is given"
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        if self.signal_photons is not None and self.pulses is not None:
-            raise ValueError("needs either signal_photons or pulses")
+        if self.signal_photons is not None and self.pulses_per_depth_frame is not None:
+            raise ValueError("needs either signal_photons or pulses_per_depth_frame")
         return self
 
 
@@ -233,7 +236,7 @@ class Recipe(_Table):
     frames: Frames = Frames()
     monte_carlo: MonteCarlo = MonteCarlo()
     vary: dict[str, Annotated[Distribution, BeforeValidator(_distribution)]] = Field(
-        default_factory=dict, description='further fields of the scene: "laser.preset" = ["paper", ...]'
+        default_factory=dict, description='further fields of the scene: "laser.preset" = ["lu2024", ...]'
     )
     scene: dict[str, Any] = Field(..., description="the scene without targets and gate, as in a scene file")
     _source: Path | None = PrivateAttr(None)
@@ -261,7 +264,7 @@ class Recipe(_Table):
         """
         name = None if source is None else str(source)
         try:
-            recipe = cls.model_validate(_with_paths(tables, source))
+            recipe = cls.model_validate(_with_paths(_current(tables), source))
         except ValidationError as error:
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
@@ -298,7 +301,7 @@ class Recipe(_Table):
         pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
         tables = self.to_dict()
         for key, value in pairs:
-            parts = [str(part) for part in (key.split(".") if isinstance(key, str) else key)]
+            parts = current_path(key if isinstance(key, str) else ".".join(map(str, key))).split(".")
             inner = tables
             for part in parts[:-1]:
                 inner = inner.setdefault(part, {})
@@ -311,6 +314,14 @@ class Recipe(_Table):
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """Reads a recipe. Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it."""
     return Recipe.from_dict(read_toml(path), source=path)
+
+
+def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe's own tables with the words that hold now; a scene sees to its own."""
+    return {
+        name: current_fields(name, table) if name == "exposure" and isinstance(table, Mapping) else table
+        for name, table in tables.items()
+    }
 
 
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:

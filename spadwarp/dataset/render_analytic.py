@@ -120,7 +120,7 @@ def exposed(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64], *, m
         where = f"its target lies at {draw.distance:.4g} m"
         raise ConfigError(f"scene {draw.index}: no return within the gate; {where}")
     pulses = min(max(1, round(draw.signal_photons / float(np.median(detections)))), most)
-    return scene.with_overrides({"analytic.pulses": pulses})
+    return scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
 
 
 def _render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
@@ -191,7 +191,7 @@ def _draw_frames(
     on = pick_device(device)
     shape, view = truth.depth.shape, pixel_directions(scene.camera).reshape(-1, 3)
     probability, flat, fractions = _stray(scene, draw, maps)
-    speed, pulses = scene.medium.pulse_speed, scene.analytic.pulses
+    speed, pulses = scene.medium.pulse_speed, scene.analytic.pulses_per_depth_frame
 
     def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
@@ -237,7 +237,7 @@ def _stray(
     dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
     noise = backscatter + dark
     # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
-    alone = -np.expm1(-scene.analytic.pulses * noise)
+    alone = -np.expm1(-scene.analytic.pulses_per_depth_frame * noise)
     probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
     flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
     return probability, flat, np.ones(len(draw.fractions))

@@ -40,7 +40,7 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
     seen = (returned > 0) & np.isfinite(result.truth.depth)
     if draw.signal_photons is not None:
         scene = exposed(scene, draw, returned[seen], most=_MOST_PULSES)
-    pulses = min(scene.analytic.pulses, _MOST_PULSES)
+    pulses = min(scene.analytic.pulses_per_depth_frame, _MOST_PULSES)
     taken = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
     time_bound = crlb(result, pulses=pulses, device=device)
     view = pixel_directions(scene.camera)

@@ -18,6 +18,7 @@ import numpy as np
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
 from spadwarp.dataset.targets import find_targets
 from spadwarp.scene import Scene
+from spadwarp.scene.renamed import former_path
 from spadwarp.units import time_from_range
 
 __all__ = ["Plan", "SceneDraw", "Shard"]
@@ -125,7 +126,7 @@ class Plan:
         else:
             depth = target.truth(self._template.camera, recipe.targets.export_preset).depth
             distance = float(np.nanmedian(depth))
-        changes = {name: draw(f"vary.{name}", one) for name, one in recipe.vary.items()}
+        changes = {name: draw(f"vary.{former_path(name)}", one) for name, one in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         if recipe.water.attenuation_lengths is not None:
             lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
@@ -173,8 +174,8 @@ class Plan:
         exposure = recipe.exposure
         signal = None if exposure.signal_photons is None else draw("exposure.signal", exposure.signal_photons)
         analytic = scene.analytic.to_dict()
-        if exposure.pulses is not None:
-            analytic["pulses"] = max(1, round(draw("exposure.pulses", exposure.pulses)))
+        if exposure.pulses_per_depth_frame is not None:
+            analytic["pulses_per_depth_frame"] = max(1, round(draw("exposure.pulses", exposure.pulses_per_depth_frame)))
         first = index * self.frames_per_scene
         return SceneDraw(
             index=index,

@@ -107,7 +107,7 @@ def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
         "gate_near": range_from_time(scene.gate.start, medium.group_index),
         "gate_far": range_from_time(scene.gate.stop, medium.group_index),
         "reflectance": np.nan if target is None else target.reflectance,
-        "pulses": scene.analytic.pulses,
+        "pulses": scene.analytic.pulses_per_depth_frame,
         "photons": draw.photons or 0,
         "signal": one.signal,
         "backscatter": one.backscatter,

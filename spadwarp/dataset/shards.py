@@ -161,7 +161,7 @@ def _frame_rows(plan: Plan, shard: Shard, one: RenderedScene) -> dict[str, NDArr
         "backscatter_fraction": np.array(draw.fractions, np.float32),
         "attenuation_lengths": np.full(count, draw.attenuation_lengths, np.float32),
         "distance": np.full(count, draw.distance, np.float32),
-        "pulses": np.full(count, one.scene.analytic.pulses, np.int64),
+        "pulses": np.full(count, one.scene.analytic.pulses_per_depth_frame, np.int64),
         "intensity_step": np.full(count, one.frames.intensity_step, np.float32),
     }
 

@@ -97,7 +97,7 @@ def crlb(
 
     Args:
         result: Of `spadwarp.simulate`.
-        pulses: Of one depth frame; default: the scene's `analytic.pulses`.
+        pulses: Of one depth frame; default: the scene's `analytic.pulses_per_depth_frame`.
         law, device: See `crlb_from_histogram`.
     """
     scene = result.scene
@@ -108,7 +108,7 @@ def crlb(
         signal,
         background,
         bin_width=scene.gate.bin_width,
-        pulses=scene.analytic.pulses if pulses is None else pulses,
+        pulses=scene.analytic.pulses_per_depth_frame if pulses is None else pulses,
         irf=detector_response(scene.detector, scene.laser),
         law=law,
         device=device,

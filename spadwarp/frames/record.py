@@ -101,7 +101,7 @@ def record_frames(
         FileError: The file cannot be written.
     """
     scene = result.scene
-    pulses = scene.detector.pulses if pulses is None else pulses
+    pulses = scene.detector.pulses_per_frame if pulses is None else pulses
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}

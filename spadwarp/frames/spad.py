@@ -145,7 +145,7 @@ def _plan(source: Any, *, background: Any, detector: Detector | None, laser: Las
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
     if options["pulses"] is None:
-        options["pulses"] = detector.pulses
+        options["pulses"] = detector.pulses_per_frame
     _check_integers(**{name: options[name] for name in ("pulses", "frames", "first_frame", "seed", "camera_seed")})
     total = options["pulses"] * options["frames"]
     if options["summed"] and total > 2**31 - 1:
@@ -155,8 +155,8 @@ def _plan(source: Any, *, background: Any, detector: Detector | None, laser: Las
         raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
     if not (math.isfinite(start) and math.isfinite(width) and width > 0):
         raise ArgumentError(f"gate_start = {start} s, bin_width = {width} s: finite and a width > 0 are needed")
-    if laser is None and (detector.fold or detector.mode == "free_running" or options["tags"]):
-        raise ArgumentError("laser is missing: the detector needs its repetition rate (unless fold = false)")
+    if laser is None and (detector.wrap or detector.mode == "free_running" or options["tags"]):
+        raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     if options["irf"] is None:
         options["irf"] = detector_response(detector, laser)
     return _Plan(source=source, background=background, detector=detector, laser=laser, **options)
@@ -198,7 +198,7 @@ def _expected(plan: _Plan, device: Any) -> _Light:
         plan.bin_width,
         plan.tdc_widths,
         period=math.inf if plan.laser is None else 1.0 / plan.laser.repetition_rate,
-        fold=detector.fold,
+        wrap=detector.wrap,
         free_running=plan.free_running,
     )
     matrix = response_matrix(
@@ -207,7 +207,7 @@ def _expected(plan: _Plan, device: Any) -> _Light:
         source_width=plan.bin_width,
         source_bins=shape[2],
         edges=window.start + window.edges,
-        period=window.period if detector.fold else None,
+        period=window.period if detector.wrap else None,
     )
     noise = kernels.dark_count_rates(
         rows.shape[0],
@@ -317,13 +317,13 @@ def _pack(plan: _Plan, light: _Light, drawn: _Drawn) -> Frames:
         gate_start=window.start,
         bin_width=plan.bin_width,
         edges=window.edges[: window.recorded + 1],
-        period=window.period if plan.detector.fold else None,
+        period=window.period if plan.detector.wrap else None,
         irf=plan.irf,
         expected=drawn.expected[:, : window.recorded].reshape(*light.image, -1),
         background=drawn.background[:, : window.recorded].reshape(*light.image, -1),
         seed=plan.seed,
         tags=None if drawn.events is None else _time_tags(drawn.events, light.image, plan.first_frame),
-        notes=missing_light(window, plan.gate_start) if plan.detector.fold else (),
+        notes=missing_light(window, plan.gate_start) if plan.detector.wrap else (),
     )
 
 

@@ -35,14 +35,14 @@ def detector_window(
     tdc_widths: ArrayLike | None,
     *,
     period: float,
-    fold: bool,
+    wrap: bool,
     free_running: bool,
 ) -> Window:
     """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
     start, bins = window
     if not math.isfinite(start) or isinstance(bins, bool) or not isinstance(bins, (int, np.integer)) or bins < 1:
         raise ArgumentError(f"window = {window} is not (start [s], bins >= 1)")
-    if fold:
+    if wrap:
         # The detector knows no time beyond that from one pulse to the next.
         bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
         if bins < 1:
@@ -56,12 +56,12 @@ def detector_window(
             raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
         widths = widths / widths.mean()
     edges = np.append(0.0, np.cumsum(widths)) * bin_width
-    if not fold:
+    if not wrap:
         period = max(period, edges[-1])
     left = period - edges[-1]
     if free_running and left > 1e-9 * period:
         # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
-        more = math.ceil(left / bin_width) if fold else 1
+        more = math.ceil(left / bin_width) if wrap else 1
         edges = np.append(edges, edges[-1] + left * np.arange(1, more + 1) / more)
     return Window(start, edges, bins, period)
 

@@ -141,7 +141,7 @@ def _of_dataset(folder: Path, split: str) -> Iterator[FrameSequence]:
                 pulses=pulses,
                 gate_start=scene.gate.start,
                 bin_width=scene.gate.bin_width,
-                period=1.0 / scene.laser.repetition_rate if scene.detector.fold else None,
+                period=1.0 / scene.laser.repetition_rate if scene.detector.wrap else None,
                 **common,
             )
 

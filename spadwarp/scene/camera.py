@@ -88,7 +88,7 @@ class Camera(Section):
             )
         if not intrinsics.is_invertible(self):
             raise ValueError(
-                f"distortion = {list(self.distortion)} folds the image: some of its {self.width} x {self.height} "
+                f"distortion = {list(self.distortion)} is not one-to-one: some of its {self.width} x {self.height} "
                 "pixels show no direction, or two"
             )
         return self

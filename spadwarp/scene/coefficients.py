@@ -11,16 +11,16 @@ COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
     """All four coefficients from exactly two of them, the given ones as they are.
 
-    With `albedo = "paper"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
+    With `albedo = "lu2024"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
     Raises `ValueError` whose text names field, value and range, without the section.
     """
     if len(pair) != 2:
         given = ", ".join(pair) or "none"
         raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
     a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
-    if albedo == "paper":
+    if albedo == "lu2024":
         if c is None:
-            raise ValueError("albedo = 'paper' goes with extinction only")
+            raise ValueError("albedo = 'lu2024' goes with extinction only")
         return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
     if albedo is not None:
         if c is None:

@@ -36,8 +36,10 @@ class Detector(Section):
     afterpulsing_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count causes another")
     afterpulsing_time_constant_ns: float = Field(50.0, gt=0, description="decay time of afterpulsing [ns]")
     crosstalk_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count fires a neighbour")
-    fold: bool = Field(True, description="fold time modulo the pulse period, as a detector sees it")
-    pulses: Whole = Field(20_000, ge=1, le=2**63 - 1, description="pulses in one exposure")
+    wrap: bool = Field(
+        True, description="time of flight modulo the pulse period (range aliasing), as a detector sees it"
+    )
+    pulses_per_frame: Whole = Field(20_000, ge=1, le=2**63 - 1, description="laser pulses in one frame of counts")
     counter_depth: Whole = Field(
         0, ge=0, le=2**31 - 1, description="largest count a histogram bin holds; 0 is unlimited"
     )

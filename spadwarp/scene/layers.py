@@ -20,9 +20,9 @@ class Water(Section):
     absorption: float = Field(0.0, ge=0, description="absorption coefficient a [1/m]")
     scattering: float = Field(0.0, ge=0, description="scattering coefficient b [1/m]")
     extinction: float = Field(0.0, gt=0, description="extinction (beam attenuation) coefficient c = a + b [1/m]")
-    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["paper"] = Field(
+    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = Field(
         0.0,
-        description='single-scattering albedo b/c, or "paper": uniform in (0, 0.97) at each collision',
+        description='single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision',
     )
     chlorophyll: float | None = Field(
         None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"

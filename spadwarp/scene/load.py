@@ -14,6 +14,7 @@ from typing import Any
 from spadwarp.errors import ConfigError
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.preset import PRESETS
+from spadwarp.scene.renamed import current_fields
 
 Table = dict[str, Any]
 Key = tuple[str | int, ...]
@@ -49,6 +50,7 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
 
     A value of None takes the field back to its default.
     """
+    base, layer = current_fields(section, base), current_fields(section, layer)
     preset = PRESETS.get(section, {}).get(str(layer.get("preset")))
     if preset is not None:
         base = merge_section(section, base, preset.values)
@@ -77,7 +79,7 @@ def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:
     keep = {}
     if len(new) == 1:
         kept = _KEEPS[new[0]]
-        if len(old) < 2 or (old.get("albedo") == "paper" and kept not in old and new[0] not in old):
+        if len(old) < 2 or (old.get("albedo") == "lu2024" and kept not in old and new[0] not in old):
             return
         try:
             keep[kept] = old[kept] if kept in old else complete_coefficients(old)[kept]
@@ -164,7 +166,10 @@ def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> Table:
     for key, value in pairs:
         for leaf, leaf_value in _leaves(key, value):
             _insert(layer, leaf, leaf_value)
-    return layer
+    return {
+        section: fields if section == "targets" or not isinstance(fields, Mapping) else current_fields(section, fields)
+        for section, fields in layer.items()
+    }
 
 
 def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:

@@ -104,7 +104,7 @@ class Medium(Water):
             if i and layer.start <= self.layers[i - 1].start:
                 before = self.layers[i - 1].start
                 raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
-            if (layer.albedo == "paper") != (self.albedo == "paper"):
+            if (layer.albedo == "lu2024") != (self.albedo == "lu2024"):
                 raise ValueError(
                     f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
                 )

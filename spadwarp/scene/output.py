@@ -17,4 +17,6 @@ class Output(Section):
     exr: bool = Field(True, description="truth and depth, as EXR")
     png: bool = Field(True, description="pictures for a first look")
     pdf: bool = Field(False, description="the same pictures as vectors, for print")
-    depth_method: Literal["peak", "centroid", "matched"] = Field("centroid", description="how the depth frame is made")
+    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = Field(
+        "centroid", description="how the depth frame is made"
+    )

@@ -87,7 +87,7 @@ _SOLONENKO = {
 }
 _MACCARONE = {"1.7m-1.2": 0.71, "1.7m-4.4": 2.59, "1.7m-5.7": 3.35, "3m-7.5": 2.5}  # extinction [1/m]
 
-_PAPER = "A Simulation Method for Underwater SPAD Depth Imaging Datasets, Sensors 24, 3886 (2024)"
+_LU2024 = "A Simulation Method for Underwater SPAD Depth Imaging Datasets, Sensors 24, 3886 (2024)"
 _PETZOLD_SOURCE = (
     "Petzold 1972 (SIO Ref. 72-78), 530 nm: AUTEC-8 clear ocean, HAOCE-11 coastal, NUC-2040 harbour, NUC-2240 harbour"
 )
@@ -121,22 +121,26 @@ def _media() -> Iterator[tuple[str, dict[str, Any], str]]:
     for key, extinction in _MACCARONE.items():
         tank = {"absorption": 0.0445, "extinction": extinction, "anisotropy": _WATER_G}
         yield f"maccarone-{key}", {**tank, "phase_index": phase, "group_index": group}, _MACCARONE_SOURCE
-    paper = {"extinction": 0.035, "albedo": "paper", "anisotropy": _WATER_G}
-    yield "paper", paper, f"{_PAPER}: albedo uniform in (0, 0.97) at each collision; 0.035 1/m is below pure water"
+    numbers = {"extinction": 0.035, "albedo": "lu2024", "anisotropy": _WATER_G}
+    yield "lu2024", numbers, f"{_LU2024}: albedo uniform in (0, 0.97) at each collision; 0.035 1/m is below pure water"
 
 
 def _lasers() -> Iterator[tuple[str, dict[str, Any], str]]:
     visuv = {"wavelength_nm": 532.0, "pulse_energy": 37.5e-9, "repetition_rate": 20e6, "pulse_fwhm_ps": 85.0}
     yield "picoquant-visuv-532", visuv, "PicoQuant VisUV-532 as used in published work: 85 ps, 20 MHz, 750 mW (37.5 nJ)"
-    paper = {"wavelength_nm": 532.0, "pulse_energy": 4e-9, "repetition_rate": 10e6, "pulse_fwhm_ps": 72.0}
+    numbers = {"wavelength_nm": 532.0, "pulse_energy": 4e-9, "repetition_rate": 10e6, "pulse_fwhm_ps": 72.0}
     cone = {"profile": "uniform_cone", "half_angle_deg": 1.9702}  # atan 0.0344
-    yield "paper", {**paper, **cone}, f"{_PAPER}, released numbers: 4 nJ, 10 MHz, 72 ps, cone of tangent 0.0344"
+    yield "lu2024", {**numbers, **cone}, f"{_LU2024}, released numbers: 4 nJ, 10 MHz, 72 ps, cone of tangent 0.0344"
 
 
 def _cameras() -> Iterator[tuple[str, dict[str, Any], str]]:
     # 256 pixels of 9.2 um subtend 20 degrees at a focal length of 128 * 9.2 um / tan 10 deg = 6.678 mm.
-    paper = {"width": 256, "height": 192, "horizontal_fov_deg": 20.0, "focal_length": 6.678e-3, "f_number": 2.0}
-    yield "paper", paper, f"{_PAPER}: 256 x 192 pixels, 20 degrees, f/2; the focal length follows from pixels of 9.2 um"
+    numbers = {"width": 256, "height": 192, "horizontal_fov_deg": 20.0, "focal_length": 6.678e-3, "f_number": 2.0}
+    yield (
+        "lu2024",
+        numbers,
+        f"{_LU2024}: 256 x 192 pixels, 20 degrees, f/2; focal length from pixels of 9.2 um",
+    )
     pf32 = {"width": 32, "height": 32, "pixel_pitch_um": 50.0}
     yield "photon-force-pf32", pf32, f"{_PF32_SOURCE}; the lens (focal_length, f_number) is the scene's"
 
@@ -148,17 +152,17 @@ def _detectors() -> Iterator[tuple[str, dict[str, Any], str]]:
         {**_PF32, "fill_factor": 0.2},
         f"{_PF32_SOURCE}; fill factor 20 % with microlenses",
     )
-    paper = {"pdp": 0.28, "fill_factor": 1.0, "jitter_fwhm_ps": 0.0, "dark_count_rate": 126.0}
+    numbers = {"pdp": 0.28, "fill_factor": 1.0, "jitter_fwhm_ps": 0.0, "dark_count_rate": 126.0}
     yield (
-        "paper",
-        paper,
-        f"{_PAPER}, released numbers: q 0.28, dark counts 126 1/s, fill factor within the pixel's 9.2 um",
+        "lu2024",
+        numbers,
+        f"{_LU2024}, released numbers: q 0.28, dark counts 126 1/s, fill factor within the pixel's 9.2 um",
     )
 
 
 def _gates() -> Iterator[tuple[str, dict[str, Any], str]]:
     yield "photon-force-pf32", {"bin_width_ps": 55.0, "bins": 1024}, f"{_PF32_SOURCE}; give start_ns for far targets"
-    yield "paper", {"start_ns": 0.0, "bin_width_ps": 150.0, "bins": 10000}, f"{_PAPER}, released numbers"
+    yield "lu2024", {"start_ns": 0.0, "bin_width_ps": 150.0, "bins": 10000}, f"{_LU2024}, released numbers"
 
 
 _SECTIONS = {"medium": _media, "laser": _lasers, "camera": _cameras, "detector": _detectors, "gate": _gates}

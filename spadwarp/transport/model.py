@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from spadwarp_kernels import Model
 
 # The paper's albedo is uniform in (0, 0.97).
-PAPER_ALBEDO = 0.97
+LU2024_ALBEDO = 0.97
 
 _UNLIMITED = 1.0e30
 
@@ -55,7 +55,7 @@ def build_model(
     _check_domain(scene, camera)
     medium = sk.Medium()
     medium.extinction = scene.medium.extinction
-    medium.albedo = PAPER_ALBEDO if scene.medium.albedo == "paper" else scene.medium.albedo
+    medium.albedo = LU2024_ALBEDO if scene.medium.albedo == "lu2024" else scene.medium.albedo
     medium.anisotropy = scene.medium.anisotropy
     medium.axis_threshold = scene.transport.axis_threshold
     if scene.medium.has_phase_table:
@@ -154,7 +154,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
     return sk.make_layers(
         [-_UNLIMITED, *(layer.start - shift for layer in medium.layers)],
         [water.extinction for water in medium.waters],
-        [PAPER_ALBEDO if water.albedo == "paper" else water.albedo for water in medium.waters],
+        [LU2024_ALBEDO if water.albedo == "lu2024" else water.albedo for water in medium.waters],
         [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
         axis=(axis @ rotation_matrix(camera.rotation_deg)).tolist(),
         device=device,
@@ -168,7 +168,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
-        random_albedo=scene.medium.albedo == "paper",
+        random_albedo=scene.medium.albedo == "lu2024",
         mesh=mesh is not None,
         brute_force=mesh is not None and mesh.face_count <= sk.BRUTE_FORCE_FACES,
         bounded=scene.domain.shape != "unbounded" or math.isfinite(scene.transport.lateral_limit),

@@ -71,6 +71,7 @@ def _ledger(run: Run) -> list[Quantity]:
         "max_collisions": 20,
         "axis_threshold": 0.9998,
     }
+    # The older word for "lu2024": the text of these tables seeds the photons.
     water = {"extinction": 0.6, "albedo": "paper", "anisotropy": 0.924}
     quantities = []
     for estimator in ("analog", "next_event", "guided"):

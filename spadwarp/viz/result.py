@@ -273,7 +273,7 @@ def _decorate(axis: Axes, title: str) -> None:
 
 def _caption(result: Result, figure: Figure) -> None:
     medium = result.scene.medium
-    albedo = "U(0, 0.97)" if medium.albedo == "paper" else f"{medium.albedo:.3g}"
+    albedo = "U(0, 0.97)" if medium.albedo == "lu2024" else f"{medium.albedo:.3g}"
     water = f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, {_phase_text(medium)}"
     if medium.layers:
         extinctions = ", ".join(f"{one.extinction:.3g}" for one in medium.waters)

@@ -47,7 +47,7 @@ def test_rows_run_over_waters_and_ranges_and_the_gate_follows():
     assert (named.medium, named.extinction) == ("tank", 1.0)
 
 
-@pytest.mark.parametrize("count_law", ["per_pulse", "per_frame", "per_frame_paper"])
+@pytest.mark.parametrize("count_law", ["per_pulse", "per_frame", "per_frame_lu2024"])
 def test_the_pulses_needed_are_enough_and_not_too_many(count_law):
     """With them the bound is within 1 cm and outliers are within 1 %; with a tenth less one of the two is not."""
     one = SCENE.with_overrides(
@@ -59,7 +59,7 @@ def test_the_pulses_needed_are_enough_and_not_too_many(count_law):
         assert 10 < needed < 1e15
 
         def row(pulses):
-            field = "analytic.pulses" if count_law == "per_pulse" else "analytic.frames"
+            field = "analytic.pulses_per_depth_frame" if count_law == "per_pulse" else "analytic.frames"
             count = max(1, math.ceil(pulses / per_frame))
             return budget(one.with_overrides({field: count}), ranges=[distance])[0]  # noqa: B023
 

@@ -189,15 +189,15 @@ def test_bad_input_is_named():
             simulate_analytic(mc, frames=0, backscatter_profile=profile)
     for sections, match in [
         (
-            {"analytic": {"form": "paper"}, "laser": {"profile": "gaussian", "half_angle_deg": 20.0}},
-            "form = 'paper' needs",
+            {"analytic": {"form": "lu2024"}, "laser": {"profile": "gaussian", "half_angle_deg": 20.0}},
+            "form = 'lu2024' needs",
         ),
         ({"laser": {"profile": "collimated", "beam_radius": 0.5}}, "needs a diverging laser.profile"),
         ({"detector": {"irf": "exponentially_modified_gaussian"}}, "the analytic model needs 'gaussian'"),
         ({"detector": {"jitter_fwhm_ps": 0.0}, "laser": {"pulse_fwhm_ps": 0.0}}, "both 0"),
         (
-            {"analytic": {"count_law": "per_frame_paper"}, "laser": {"pulse_energy": 1e-3, "half_angle_deg": 35.0}},
-            "'per_frame_paper' needs alpha < 1; it reaches",
+            {"analytic": {"count_law": "per_frame_lu2024"}, "laser": {"pulse_energy": 1e-3, "half_angle_deg": 35.0}},
+            "'per_frame_lu2024' needs alpha < 1; it reaches",
         ),
     ]:
         with pytest.raises(ConfigError, match=match):
@@ -206,7 +206,7 @@ def test_bad_input_is_named():
 
 def test_paper_form_is_equation_7_in_every_pixel():
     one = lidar_scene(
-        analytic={"form": "paper", "backscatter": "constant"},
+        analytic={"form": "lu2024", "backscatter": "constant"},
         laser={"half_angle_deg": 20.0, "position": [0.0, 0.0, 0.0]},
     )
     result = simulate_analytic(one, truth=flat_truth(one, depth=3.0, reflectance=0.3), frames=0)

@@ -121,7 +121,7 @@ def test_beyond_the_unambiguous_range():
     message = find(check(fast, plate(5.0)), "laser.repetition_rate")
     assert message.values["unambiguous_range"] == pytest.approx(SPEED_OF_LIGHT / (2 * 1.3638 * 40e6))
     assert summary(fast, plate(5.0))["unambiguous_range"] == message.values["unambiguous_range"]
-    unfolded = check(fast.with_overrides({"detector.fold": False}), plate(5.0))
+    unfolded = check(fast.with_overrides({"detector.wrap": False}), plate(5.0))
     assert "ignored" in find(unfolded, "laser.repetition_rate", "note").text
 
 

@@ -345,7 +345,7 @@ def test_recipes_that_come_with_spadwarp(path):
     assert spadwarp.Recipe.from_dict(tomllib.loads(given.to_toml())) == given
     splits = {split: {one.name for one in plan.targets if one.split == split} for split in SPLITS}
     assert all(splits.values()) and "staircase" in splits["test"]
-    if path.stem in ("paper", "montecarlo"):
+    if path.stem in ("lu2024", "montecarlo"):
         assert len(plan.targets) == 20 and plan.scene_count == 1000
     codes = (np.array([1, 65535]) * plan.depth_step + plan.depth_offset).tolist()
     for index in range(0, plan.scene_count, max(1, plan.scene_count // 7)):

@@ -188,7 +188,7 @@ def test_what_cannot_be_read(tmp_path):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "set"
-    recipe = spadwarp.load_recipe("configs/datasets/paper.toml").with_overrides(
+    recipe = spadwarp.load_recipe("configs/datasets/lu2024.toml").with_overrides(
         {
             "scenes_per_target": 1,
             "scenes_per_shard": 1,
@@ -200,7 +200,7 @@ def dataset(tmp_path_factory):
             "pose.yaw_deg": 0.0,
             "pose.pitch_deg": 0.0,
             "pose.roll_deg": 0.0,
-            "scene.camera": {"preset": "paper", "width": 64, "height": 48},
+            "scene.camera": {"preset": "lu2024", "width": 64, "height": 48},
         }
     )
     spadwarp.make_dataset(recipe, folder, device="cpu")
@@ -375,7 +375,7 @@ def test_frames_of_few_photons_meet_the_bound_where_they_are_many(tmp_path):
 # No leakage
 
 
-@pytest.mark.parametrize("test_recipe", ["paper", "small"])
+@pytest.mark.parametrize("test_recipe", ["lu2024", "small"])
 def test_training_and_test_share_no_target_and_no_seed(test_recipe):
     from spadwarp.dataset.sampling import Plan
 

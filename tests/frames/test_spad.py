@@ -61,7 +61,7 @@ def test_a_target_beyond_the_unambiguous_range_appears_one_period_early():
     np.testing.assert_allclose(times, 23.05e-9, atol=BIN / 4)
     near = found.arrival_time("matched", gate=(0.0, 10e-9))
     np.testing.assert_allclose(near, 2.05e-9, atol=BIN / 4)
-    straight = detect(cube, pulses=50_000, seed=2, detector=Detector(dark_count_rate=0.0, fold=False), **CALL)
+    straight = detect(cube, pulses=50_000, seed=2, detector=Detector(dark_count_rate=0.0, wrap=False), **CALL)
     assert straight.counts.shape[-1] == 1000 and straight.period is None
     np.testing.assert_allclose(straight.arrival_time("matched"), 73.05e-9, atol=BIN / 4)
 
@@ -82,8 +82,8 @@ def test_light_that_the_source_does_not_hold_is_noted():
     late = {**CALL, "gate_start": 120e-9}
     assert "120 ns" in detect(_spike(10), pulses=10, seed=1, **late).notes[0]
     short = detect(_spike(10, bins=50), pulses=10, seed=1, **{**CALL, "gate_start": 10e-9})
-    assert short.notes == ()  # 0 to 10 ns fold to 50 to 60 ns, after the window
-    assert detect(_spike(10), pulses=10, seed=1, detector=Detector(fold=False), **late).notes == ()
+    assert short.notes == ()  # 0 to 10 ns wrap to 50 to 60 ns, after the window
+    assert detect(_spike(10), pulses=10, seed=1, detector=Detector(wrap=False), **late).notes == ()
 
 
 def test_dark_counts_and_ambient_light_are_the_background():
@@ -158,7 +158,7 @@ def test_pile_up_is_undone():
 def test_crosstalk_adds_its_mean_to_the_neighbours():
     cube = np.zeros((5, 5, 100))
     cube[2, 2, 30] = 0.8
-    detector = Detector(dark_count_rate=0.0, crosstalk_probability=0.05, fold=False)
+    detector = Detector(dark_count_rate=0.0, crosstalk_probability=0.05, wrap=False)
     found = detect(cube, pulses=2_000_000, seed=8, detector=detector, irf=InstrumentResponse(), **CALL)
     expected = 2_000_000 * -np.expm1(0.05 * np.expm1(-0.8))
     neighbours = found.counts[0, [1, 3, 2, 2], [2, 2, 1, 3], 30]

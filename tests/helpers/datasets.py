@@ -18,9 +18,9 @@ TABLES = {
     "frames": {"per_scene": 3, "backscatter_fraction": list(BS)},
     "scene": {
         "medium": {"extinction": 0.1, "albedo": 0.5},
-        "laser": {"preset": "paper", "half_angle_deg": 14.0, "repetition_rate": 5e6},
-        "camera": {"preset": "paper", "width": 36, "height": 24},
-        "detector": {"preset": "paper"},
+        "laser": {"preset": "lu2024", "half_angle_deg": 14.0, "repetition_rate": 5e6},
+        "camera": {"preset": "lu2024", "width": 36, "height": 24},
+        "detector": {"preset": "lu2024"},
     },
 }
 

@@ -102,7 +102,7 @@ def test_walk_agrees_with_doubling():
 
 
 def test_walk_keeps_its_energy():
-    photons = walk(Medium(1.0, "paper", 0.924), pencil(10_000), np.random.default_rng(2), weight_cutoff=2e-4)
+    photons = walk(Medium(1.0, "lu2024", 0.924), pencil(10_000), np.random.default_rng(2), weight_cutoff=2e-4)
     assert photons.absorbed + photons.weight.sum() == pytest.approx(10_000, rel=1e-12)
     assert set(photons.reason) == {"cutoff"}
 

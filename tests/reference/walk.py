@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class Medium:
-    """extinction [1/m]; albedo 0–1 or "paper" (ω ~ U(0, 0.97) at each collision); Henyey–Greenstein anisotropy g."""
+    """extinction [1/m]; albedo 0–1 or "lu2024" (ω ~ U(0, 0.97) at each collision); Henyey–Greenstein anisotropy g."""
 
     extinction: float
     albedo: float | str
@@ -113,7 +113,7 @@ def walk(
         reason[ended] = np.where(wall <= left, _FACES[face], "max_path")[~collided]
         alive = alive[collided]
 
-        albedo = 0.97 * rng.random(alive.size) if medium.albedo == "paper" else float(medium.albedo)
+        albedo = 0.97 * rng.random(alive.size) if medium.albedo == "lu2024" else float(medium.albedo)
         before = weight[alive]
         weight[alive] = before * albedo
         absorbed += float((before - weight[alive]).sum())

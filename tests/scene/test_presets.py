@@ -19,8 +19,8 @@ def test_every_preset_names_its_source():
 def test_sections_and_names():
     assert set(PRESETS) == {"medium", "laser", "camera", "detector", "gate"}
     assert len(presets()) == sum(map(len, PRESETS.values()))
-    assert presets("laser").keys() == {"picoquant-visuv-532", "paper"}
-    assert presets("detector").keys() == {"photon-force-pf32", "photon-force-pf32-microlens", "paper"}
+    assert presets("laser").keys() == {"picoquant-visuv-532", "lu2024"}
+    assert presets("detector").keys() == {"photon-force-pf32", "photon-force-pf32-microlens", "lu2024"}
     with pytest.raises(KeyError):
         presets("targets")
 
@@ -34,11 +34,11 @@ def test_what_presets_returns_is_the_callers_own():
 def test_every_medium_is_complete_and_adds_up(name):
     medium = Medium(preset=name)
     assert medium.absorption + medium.scattering == pytest.approx(medium.extinction, rel=1e-12)
-    if medium.albedo != "paper":
+    if medium.albedo != "lu2024":
         assert medium.albedo == pytest.approx(medium.scattering / medium.extinction, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", sorted(set(MEDIA) - {"paper"}))
+@pytest.mark.parametrize("name", sorted(set(MEDIA) - {"lu2024"}))
 def test_every_medium_but_the_papers_absorbs_at_least_as_pure_water_does(name):
     assert Medium(preset=name).absorption >= pure_water_absorption(530.0)
 
@@ -59,7 +59,7 @@ def test_every_medium_but_the_papers_absorbs_at_least_as_pure_water_does(name):
         ("jerlov-I-solonenko", 0.0525),
         ("jerlov-III-solonenko", 1.0926),
         ("jerlov-9C-solonenko", 3.714),
-        ("paper", 0.035),
+        ("lu2024", 0.035),
     ],
 )
 def test_published_extinctions(name, extinction):
@@ -85,7 +85,7 @@ def test_water_gets_murkier_along_a_series():
 
 
 def test_the_papers_camera_has_pixels_of_9_2_um_and_20_degrees():
-    camera = Camera(preset="paper")
+    camera = Camera(preset="lu2024")
     assert camera.focal_length is not None
     assert camera.focal_length * camera.pixel_tangent == pytest.approx(9.2e-6, rel=1e-3)
     assert camera.horizontal_fov_deg == 20.0

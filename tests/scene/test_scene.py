@@ -74,12 +74,12 @@ def test_contradicting_or_empty_coefficients_are_refused():
 
 
 def test_the_papers_albedo_goes_with_extinction_and_reads_as_its_mean():
-    medium = Medium(extinction=0.2, albedo="paper")
-    assert medium.albedo == "paper"
+    medium = Medium(extinction=0.2, albedo="lu2024")
+    assert medium.albedo == "lu2024"
     assert medium.scattering == pytest.approx(0.2 * 0.97 / 2)
     assert medium.absorption + medium.scattering == pytest.approx(0.2)
-    assert problems({"medium": {"absorption": 0.1, "albedo": "paper"}}) == (
-        "medium.albedo = 'paper' goes with extinction only",
+    assert problems({"medium": {"absorption": 0.1, "albedo": "lu2024"}}) == (
+        "medium.albedo = 'lu2024' goes with extinction only",
     )
 
 
@@ -115,9 +115,9 @@ def test_overriding_two_coefficients_replaces_both():
 
 
 def test_a_single_coefficient_that_leaves_the_papers_albedo_without_a_meaning_is_refused():
-    (text,) = problems({"medium": {"preset": "paper"}}, {"medium.absorption": 0.1})
+    (text,) = problems({"medium": {"preset": "lu2024"}}, {"medium.absorption": 0.1})
     assert text.endswith("; given: absorption, extinction, albedo")
-    assert scene(medium={"preset": "paper"}).with_overrides(["medium.extinction=0.9"]).medium.albedo == "paper"
+    assert scene(medium={"preset": "lu2024"}).with_overrides(["medium.extinction=0.9"]).medium.albedo == "lu2024"
 
 
 def test_index_names_stand_for_water_at_532_nm():
@@ -145,7 +145,7 @@ def test_a_preset_gives_its_fields_and_each_can_be_overridden(name):
 
 
 def test_the_order_is_preset_file_override():
-    base = scene(laser={"preset": "paper", "pulse_energy": 1e-6})
+    base = scene(laser={"preset": "lu2024", "pulse_energy": 1e-6})
     assert (base.laser.pulse_energy, base.laser.pulse_fwhm_ps) == (1e-6, 72.0)
     assert base.with_overrides(["laser.pulse_fwhm_ps=50"]).laser.pulse_fwhm_ps == 50.0
     other = base.with_overrides(["laser.preset=picoquant-visuv-532"]).laser
@@ -153,10 +153,10 @@ def test_the_order_is_preset_file_override():
 
 
 def test_excluding_fields_displace_each_other_only_across_layers():
-    camera = scene(camera={"preset": "paper"}).with_overrides({"camera.pixel_pitch_um": 9.2}).camera
+    camera = scene(camera={"preset": "lu2024"}).with_overrides({"camera.pixel_pitch_um": 9.2}).camera
     assert camera.horizontal_fov_deg is None
     assert math.degrees(camera.horizontal_fov) == pytest.approx(20.0, abs=0.01)
-    assert scene(camera={"preset": "paper", "aperture_diameter": 0.02}).camera.f_number is None
+    assert scene(camera={"preset": "lu2024", "aperture_diameter": 0.02}).camera.f_number is None
     (text,) = problems({"camera": {**MINIMAL["camera"], "f_number": 2.0}})
     assert text == "camera needs either aperture_diameter or f_number with focal_length"
     base = scene(targets=[{"builtin": "plane", "size": [1, 2]}])
@@ -168,7 +168,7 @@ def test_none_takes_a_field_back_to_its_default():
     base = scene(transport={"max_path": 10.0, "photons": 5})
     back = base.with_overrides({"transport": {"max_path": None, "photons": None}})
     assert back == scene()
-    paper = scene(detector={"preset": "paper"}).with_overrides({"detector.pdp": None})
+    paper = scene(detector={"preset": "lu2024"}).with_overrides({"detector.pdp": None})
     assert (paper.detector.pdp, paper.detector.preset) == (0.247, None)
     assert reloaded(paper) == paper
 
@@ -183,9 +183,9 @@ def test_none_takes_a_field_back_to_its_default():
         (" medium.extinction = .9 ", ("medium", "extinction"), 0.9),
         ("transport.photons=2e9", ("transport", "photons"), 2e9),
         ("transport.seed=0x10", ("transport", "seed"), 16),
-        ("detector.fold=false", ("detector", "fold"), False),
+        ("detector.wrap=false", ("detector", "wrap"), False),
         ("medium.preset=jerlov-1C-williamson", ("medium", "preset"), "jerlov-1C-williamson"),
-        ('medium.albedo="paper"', ("medium", "albedo"), "paper"),
+        ('medium.albedo="lu2024"', ("medium", "albedo"), "lu2024"),
         ("laser.position=[0.1, 0, 0]", ("laser", "position"), [0.1, 0, 0]),
         ("targets[0].reflectance=0.3", ("targets", 0, "reflectance"), 0.3),
         ("targets.12.mesh=a=b.stl", ("targets", 12, "mesh"), "a=b.stl"),
@@ -245,8 +245,8 @@ def test_overrides_that_name_no_field_are_refused(overrides):
     ("override", "message"),
     [
         ("medium.anisotropy=1.2", "medium.anisotropy = 1.2 (an override) is outside (-1, 1)"),
-        ("medium.albedo=1.5", "medium.albedo = 1.5 (an override) is outside [0, 1] and not 'paper'"),
-        ("medium.albedo=none", "medium.albedo = 'none' (an override) is neither a number nor 'paper'"),
+        ("medium.albedo=1.5", "medium.albedo = 1.5 (an override) is outside [0, 1] and not 'lu2024'"),
+        ("medium.albedo=none", "medium.albedo = 'none' (an override) is neither a number nor 'lu2024'"),
         ("transport.max_collisions=0", "transport.max_collisions = 0 (an override) is outside [1, 2147483647]"),
         ("transport.axis_threshold=0", "transport.axis_threshold = 0 (an override) is outside (0, 1]"),
         ("transport.max_path=inf", "transport.max_path = inf (an override) is outside (0, inf)"),
@@ -254,7 +254,7 @@ def test_overrides_that_name_no_field_are_refused(overrides):
         ("transport.seed=-1", "transport.seed = -1 (an override) is outside [0, 18446744073709551615]"),
         ("camera.width=3.5", "camera.width = 3.5 (an override) is not an integer"),
         ("camera.width=true", "camera.width = True (an override) is not an integer"),
-        ("detector.fold=1", "detector.fold = 1 (an override) is not true or false"),
+        ("detector.wrap=1", "detector.wrap = 1 (an override) is not true or false"),
         ("laser.position=[1, 2]", "laser.position = [1, 2] has the wrong number of values"),
         ("laser.direction=[0, 0, 'up']", "laser.direction[2] = 'up' (an override) is not a number"),
         ("laser.direction=[0, 0, 0]", "laser.direction = [0.0, 0.0, 0.0] has no length"),
@@ -336,7 +336,7 @@ def test_any_tables_are_a_scene_or_a_config_error(tables, overrides):
 vector = st.tuples(*[st.floats(-100, 100)] * 3)
 section_values = {
     "medium": st.one_of(
-        st.fixed_dictionaries({"extinction": st.floats(1e-3, 9), "albedo": st.floats(0, 1) | st.just("paper")}),
+        st.fixed_dictionaries({"extinction": st.floats(1e-3, 9), "albedo": st.floats(0, 1) | st.just("lu2024")}),
         st.fixed_dictionaries({"absorption": st.floats(1e-3, 9), "scattering": st.floats(0, 9)}),
         st.fixed_dictionaries({"preset": st.sampled_from(sorted(presets("medium")))}),
         st.fixed_dictionaries({"preset": st.just("uwoc-clear"), "scattering": st.floats(0, 9)}),
@@ -360,7 +360,7 @@ section_values = {
     ),
     "camera": st.one_of(
         st.just(MINIMAL["camera"]),
-        st.fixed_dictionaries({"preset": st.just("paper")}, optional={"pixel_pitch_um": st.floats(1, 100)}),
+        st.fixed_dictionaries({"preset": st.just("lu2024")}, optional={"pixel_pitch_um": st.floats(1, 100)}),
         st.fixed_dictionaries(
             {"width": st.just(8), "height": st.just(6), "fx": st.floats(10, 50), "aperture_diameter": st.just(0.01)},
             optional={
@@ -376,7 +376,7 @@ section_values = {
     "scan": st.fixed_dictionaries(
         {}, optional={"mode": st.sampled_from(["none", "confocal"]), "distance": st.sampled_from([3.0, math.inf])}
     ),
-    "detector": st.fixed_dictionaries({}, optional={"fold": st.booleans(), "irf": st.just('/a "b"\\c\x07\n.csv')}),
+    "detector": st.fixed_dictionaries({}, optional={"wrap": st.booleans(), "irf": st.just('/a "b"\\c\x07\n.csv')}),
     "gate": st.fixed_dictionaries(
         {"start_ns": st.floats(0, 500), "bin_width_ps": st.floats(1, 1e4), "bins": st.just(10.0)}
     ),
@@ -524,7 +524,7 @@ def test_ways_to_give_a_camera_exclude_each_other(tmp_path):
         "camera.distortion = [0.1, 0.2] has the wrong number of values",
     )
     (text,) = problems({"camera": {**MINIMAL["camera"], "horizontal_fov_deg": 120.0, "distortion": [-0.4, 0, 0, 0]}})
-    assert text.startswith("camera.distortion = [-0.4, 0.0, 0.0, 0.0, 0.0] folds the image")
+    assert text.startswith("camera.distortion = [-0.4, 0.0, 0.0, 0.0, 0.0] is not one-to-one")
     lens = {"width": 8, "height": 6, "focal_length": 0.05, "pixel_pitch_um": 100.0, "f_number": 2.0}
     assert problems({"camera": {**lens, "focus_distance": 0.04}}) == (
         "camera.focus_distance = 0.04 is outside (0.05, inf], beyond the focal length",
@@ -539,3 +539,26 @@ def test_ways_to_give_a_camera_exclude_each_other(tmp_path):
     assert problems(overrides={"camera.calibration": str(path), "camera.width": 9}) == (
         "camera.width = 9 is not 8, the image's of the calibration",
     )
+
+
+OLDER_WORDS = {
+    "detector": ({"fold": False, "pulses": 500}, {"wrap": False, "pulses_per_frame": 500}),
+    "analytic": (
+        {"form": "paper", "count_law": "per_frame_paper", "pulses": 70},
+        {"form": "lu2024", "count_law": "per_frame_lu2024", "pulses_per_depth_frame": 70},
+    ),
+    "laser": ({"preset": "paper"}, {"preset": "lu2024"}),
+    "medium": ({"preset": None, "extinction": 0.4, "albedo": "paper"}, {"extinction": 0.4, "albedo": "lu2024"}),
+}
+
+
+@pytest.mark.parametrize("section", OLDER_WORDS)
+def test_older_words_load_as_the_words_for_them_now(section):
+    older, now = OLDER_WORDS[section]
+    assert scene(**{section: older}) == scene(**{section: now})
+    paths = {f"{section}.{name}": value for name, value in older.items()}
+    assert scene().with_overrides(paths) == scene().with_overrides(**{section: now})
+
+
+def test_an_older_word_beside_the_word_for_it_now_is_refused():
+    assert problems({"detector": {"fold": True, "wrap": True}})[0].startswith("detector.fold is not a known field")
