@@ -27,7 +27,7 @@ def detect(
     out: opt.Out,
     pulses: Annotated[
         int | None,
-        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame. By default detector.pulses_per_frame."),
+        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame, else detector.pulses_per_frame."),
     ] = None,
     frames: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Frames to record.")] = 1,
     seed: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Key of the random numbers.")] = 0,
