@@ -1,4 +1,5 @@
-"""Hypothesis in all tests: the same examples each time, and nothing fails because a machine is slow."""
+"""What all tests share: devices, markers, runs. Hypothesis draws the same examples each time, and nothing fails because
+a machine is slow."""
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -6,9 +7,23 @@ from hypothesis import HealthCheck, settings
 import spadwarp
 from helpers.runs import RUN
 from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES
 
 settings.register_profile("spadwarp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("spadwarp")
+
+
+def pytest_collection_modifyitems(items):
+    """What is marked neither `physics` nor `slow` is `fast`."""
+    for item in items:
+        if not {"physics", "slow"} & {mark.name for mark in item.iter_markers()}:
+            item.add_marker("fast")
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """The CPU, and the first GPU where there is one; bits are never compared between them."""
+    return request.param
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES, equal_means_p
+from helpers.statistics_of_samples import equal_means_p
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, pick_device, transport_spec
 
@@ -28,7 +28,6 @@ def _cells(estimator, device, photons, **sections):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
 def test_estimators_agree_in_every_component(axis_threshold, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
@@ -45,7 +44,6 @@ def test_estimators_agree_in_every_component(axis_threshold, device):
     assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_estimators_agree_with_a_tabulated_phase_function(device):
     """Two terms, one of them backward, under a raised near-axis threshold."""
     water = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
@@ -59,7 +57,6 @@ def test_estimators_agree_with_a_tabulated_phase_function(device):
     assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
     """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
     water = {"phase_function": "fournier_forand"}
@@ -72,7 +69,6 @@ def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
     assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
     """Through the file, the table, and the directions and angles of its own that guided takes from it."""
     angle = np.concatenate([[0.0], np.geomspace(0.01, 20.0, 400), np.linspace(20.0, 180.0, 641)[1:]])
@@ -84,7 +80,6 @@ def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
     assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator, device):
     """Pencil beam onto a plate: R/pi exp(-2 c d) A/d^2 to 1 %, for a lens small against the distance."""
@@ -103,7 +98,6 @@ def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator,
     assert arrival == pytest.approx(4.4, abs=0.06)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided", "analog"])
 def test_clear_water_gives_straight_lines_only(estimator, device):
     one = scene(medium={"albedo": 0.0}, transport={"estimator": estimator})
@@ -113,7 +107,6 @@ def test_clear_water_gives_straight_lines_only(estimator, device):
     assert not result.component("forward_scattered").any()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_reflectance_scales_the_ballistic_return(device):
     """Half the reflectance, half the light: one surface each, the same photons, so equal to the rounding of the
     tally."""
@@ -131,7 +124,6 @@ def test_reflectance_scales_the_ballistic_return(device):
     assert bright == pytest.approx(2 * dark, rel=1e-5)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_blocker_casts_a_shadow(device):
     """A black screen between plate and lens removes the plate's light from the pixels that it covers, and only
     there."""
@@ -147,7 +139,6 @@ def test_a_blocker_casts_a_shadow(device):
     np.testing.assert_allclose(shaded[:, 0], open_view[:, 0], rtol=0.05)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
     """A staircase, tilted, close to a wide lens: with and without the map the same tallies, with fewer shadow rays."""

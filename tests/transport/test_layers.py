@@ -7,7 +7,7 @@ import pytest
 
 import spadwarp
 from helpers.scenes import WATER, scene
-from helpers.statistics_of_samples import DEVICES, equal_means_p
+from helpers.statistics_of_samples import equal_means_p
 from reference.adding_doubling import stack
 from reference.single_scatter import Lidar, single_scatter_total
 from spadwarp.checks import summary
@@ -23,7 +23,6 @@ SAME = {"layers": [{"start": start, "extinction": 0.5, "albedo": 0.8} for start 
 DEPTH = 0.5 * 1.2 + 1.5 * 0.5 + 0.2 * 0.5
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_layers_of_one_water_are_that_water(estimator, device):
     """Not a bit differs on the CPU; on CUDA the compiler may round differently."""
@@ -41,7 +40,6 @@ def test_layers_of_one_water_are_that_water(estimator, device):
         np.testing.assert_allclose(layered.tallies.sum(axis=(1, 2)), plain.tallies.sum(axis=(1, 2)), rtol=1e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_estimators_agree_through_layers(device):
     def cells(estimator, photons):
         one = scene(medium=LAYERED, transport={"estimator": estimator})
@@ -61,7 +59,6 @@ def test_estimators_agree_through_layers(device):
     assert (guided.reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_ballistic_light_is_weakened_by_every_layer(estimator, device):
     """Pencil beam onto a plate: R/pi exp(-2 tau) A/d^2 to 1 %."""
@@ -77,7 +74,6 @@ def test_ballistic_light_is_weakened_by_every_layer(estimator, device):
     assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_single_scattering_is_that_of_the_quadrature(estimator, device):
     """By bins of 25 cm of path, which show each layer; the plate is black and behind the gate."""
@@ -115,7 +111,6 @@ def test_single_scattering_is_that_of_the_quadrature(estimator, device):
     assert (error < 0.05 * expected).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_slab_of_three_layers_passes_and_returns_what_adding_says(device):
     infinite = math.inf
     one = scene(

@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.opencv import project_points
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES, equal_means_p
+from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_world
 
@@ -43,7 +43,6 @@ def _cells(estimator, device, photons, **sections):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
     cells = {
@@ -62,7 +61,6 @@ def test_estimators_agree_behind_every_lens(camera, device):
     assert (cells["guided"][:, :24].reshape(SEEDS, 3, 8).sum(axis=(0, 2)) > 0).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
     """The same photons through a hole of 20 µm, focused at 1.2 m or everywhere: the same image to what rounding
@@ -77,7 +75,6 @@ def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
     np.testing.assert_allclose(thin.histogram.sum(axis=(0, 1)), pinhole.histogram.sum(axis=(0, 1)), rtol=0.01)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("focus", [0.6, 2.5, math.inf])
 def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
     """Radius a·|1/z − 1/focus| as a tangent: for a small spot at z its image is even, and ends there."""
@@ -108,7 +105,6 @@ def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
     assert image[inner].sum() / image.sum() == pytest.approx(np.count_nonzero(inner) / (math.pi * disc**2), rel=0.03)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
     rvec, tvec, coefficients = (0.2, -0.3, 0.4), (0.1, -0.05, 1.0), (-0.25, 0.05, 0.01, -0.008, 0.0)
     spots = np.array([[0.55, 0.35, 2.0], [-0.5, 0.4, 1.5]])  # as the camera sees them
@@ -141,7 +137,6 @@ def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
         assert there == pytest.approx(np.linalg.norm(place - one.camera.position) - 0.06, abs=0.005)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_moving_everything_together_changes_nothing(device):
     """Camera, laser and target under one rigid motion: the same histories to float32, so the same histogram."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
@@ -169,7 +164,6 @@ def test_moving_everything_together_changes_nothing(device):
         np.testing.assert_allclose(there.depth(), here.depth(), rtol=0.01)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_domain_stands_in_the_world(device):
     """A camera that is turned against a box of water: photons end on the faces that the ledger names."""
     box = {"shape": "box", "lower": [-0.5, -0.8, -0.4], "upper": [0.6, 0.9, 1.0]}
@@ -198,7 +192,6 @@ def test_a_camera_outside_the_water_is_refused():
         spadwarp.simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_layers_of_water_stand_in_the_world(device):
     """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])

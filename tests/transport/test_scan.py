@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES, equal_means_p
+from helpers.statistics_of_samples import equal_means_p
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import scan_axes
@@ -35,7 +35,6 @@ def _one_pixel(one, row, column):
     return one.with_overrides(camera=camera, laser={"direction": direction}, scan={"mode": "none"})
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 @pytest.mark.parametrize("camera", [{}, {"distortion": [-0.1, 0.0, 0.01, 0.0, 0.0], "focus_distance": 1.5}])
 def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, estimator, device):
@@ -60,7 +59,6 @@ def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, estimator, device):
     assert result.tallies.any(axis=(0, 3)).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_the_estimators_agree_in_a_scan(device):
     """From 1 m on: nearer, next_event's rare and bright events next to the lens have no normal mean yet."""
     cells, gate = {}, {"start_ns": 6.671, "bins": 4}
@@ -78,7 +76,6 @@ def test_the_estimators_agree_in_a_scan(device):
     assert total.std() / total.mean() / math.sqrt(24) < 0.01
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_pixels_of_a_scan_see_their_own_light_alone(device):
     """Clear water, a beam narrower than a pixel: each pixel gets the full return of a pencil beam, R/pi e^(-2cr) A
     cos^2/r^2 times the cosine at the lens, whatever the number of pixels; without a scan the beam is in one alone."""

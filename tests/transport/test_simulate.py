@@ -11,14 +11,12 @@ from hypothesis import strategies as st
 
 import spadwarp
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES
 
 
 def _bits(result):
     return result.tallies.tobytes(), dict(result.ledger), dict(result.counters)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, device):
     one = scene(transport={"estimator": estimator})
@@ -68,7 +66,6 @@ def test_the_ledger_closes_exactly(estimator, **values):
     assert all(value >= 0 for value in entries.values())
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_signed_entries_of_the_ledger_have_expectation_zero(device):
     """Directed bounces and roulette move weight between photons and create none, on the mean over 32 seeds."""
     one = scene(transport={"estimator": "guided", "termination": "roulette", "weight_cutoff": 0.2})
@@ -79,7 +76,6 @@ def test_signed_entries_of_the_ledger_have_expectation_zero(device):
         assert abs(values.mean()) < 4.5 * values.std(ddof=1) / np.sqrt(len(values))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
     """With an absurd cut-off the rule of the paper loses light that scattered more than once; roulette loses none."""
     values = {}
@@ -101,7 +97,6 @@ def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
     assert mean["exact"] - mean["cutoff"] > 10 * np.hypot(error["cutoff"], error["exact"])
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_closed_target_keeps_its_light(device):
     """A laser inside a closed box of reflectance 0.9: no weight leaves the domain around it."""
     one = scene(
@@ -117,7 +112,6 @@ def test_a_closed_target_keeps_its_light(device):
     assert result.counters["surface_events"] > 20_000
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_every_light_path_ends_for_a_reason_and_records_agree_with_the_ledger(device):
     one = scene(
         domain={"shape": "slab", "lower": [0, 0, 0], "upper": [0, 0, 2.0]},

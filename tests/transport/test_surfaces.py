@@ -14,7 +14,7 @@ from PIL import Image
 
 import spadwarp
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES, equal_means_p
+from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
 from spadwarp.mesh.colours import srgb_to_linear
@@ -263,7 +263,6 @@ def _corner(path) -> list[dict]:
     return [plate, {**wall, "reflectance": 0.2, "specular": 0.7, "roughness": 0.15}]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     targets = _corner(shaded_square(tmp_path / "square.ply", greens=(40, 120, 180, 200)))
     cells = {}
@@ -283,7 +282,6 @@ def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     assert total.std() / total.mean() / math.sqrt(24) < 0.01
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(device):
     """A pencil beam from the side onto a tilted plate: (R/pi + s D G/(4 cos cos)) cos A/r^2 exp(-c path) to 1 %."""
     point, laser = np.array([0.0, 0.0, 2.0]), np.array([-0.8, 0.3, 0.2])
@@ -313,7 +311,6 @@ def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(device):
     assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_glossy_plate_shines_where_it_mirrors_the_laser(device):
     """A cone from the side: the highlight lies where the facets face half-way, wide by the lobe's slopes."""
     one = scene(

@@ -7,7 +7,6 @@ from scipy import stats
 
 import spadwarp
 from helpers.scenes import scene
-from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels import Batches
 
 
@@ -20,7 +19,6 @@ def _same(a, b):
         np.testing.assert_array_equal(a.second_moment, b.second_moment)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_squares_are_exact_to_128_bits(device):
     rng = np.random.default_rng(0)
     rows = [rng.integers(0, 2**61, size=(3, 50), dtype=np.int64) // [[1], [2**20], [2**40]] for _ in range(300)]
@@ -38,7 +36,6 @@ def test_squares_are_exact_to_128_bits(device):
     assert batches.count == 300
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_standard_error_is_the_spread_between_seeds(device):
     """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
     one = scene(transport={"estimator": "guided"})
@@ -130,7 +127,6 @@ def test_what_cannot_be_merged_is_refused():
         _ = a.standard_error
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     one = scene(transport={"estimator": "guided"})
     run = spadwarp.simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)

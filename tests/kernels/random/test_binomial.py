@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from helpers.launch import launched, on_device
 from spadwarp_kernels.random import binomial, expm1, log1p
 
 
@@ -23,31 +24,16 @@ def _functions(x: wp.array(dtype=wp.float64), grown: wp.array(dtype=wp.float64),
 
 
 def _sample(n, hazard, *, seed=3, base=0, size=400_000):
-    counts = wp.zeros(size, dtype=int, device="cpu")
-    wp.launch(_draw, size, [n, hazard, seed, base, counts], device="cpu")
-    return counts.numpy()
+    return launched(_draw, [n, hazard, seed, base], [int], count=size)[0]
 
 
 @pytest.mark.parametrize(
     ("n", "p"),
     [
-        (1, 0.3),
-        (5, 0.5),
-        (40, 0.02),
-        (40, 0.97),
-        (30, 0.4),
-        (20, 0.5),
-        (21, 0.9),
-        (100, 0.0999),  # the last of inversion
-        (100, 0.1001),  # the first of rejection
-        (1000, 0.3),
-        (1000, 0.985),
-        (10_000, 5e-4),
-        (1_000_000, 1.5e-5),
-        (1_000_000, 5e-4),
-        (100_000_000, 3e-7),
-        (2**31 - 1, 1e-9),
-        (2**31 - 1, 2e-8),
+        *((1, 0.3), (5, 0.5), (40, 0.02), (40, 0.97), (30, 0.4), (20, 0.5), (21, 0.9)),
+        *((100, 0.0999), (100, 0.1001)),  # the last of inversion, the first of rejection
+        *((1000, 0.3), (1000, 0.985), (10_000, 5e-4), (1_000_000, 1.5e-5), (1_000_000, 5e-4)),
+        *((100_000_000, 3e-7), (2**31 - 1, 1e-9), (2**31 - 1, 2e-8)),
     ],
 )
 def test_frequencies_follow_the_law(n, p):
@@ -95,7 +81,7 @@ def test_draws_depend_on_seed_and_id_alone():
 
 def test_small_arguments_keep_their_digits():
     x = np.concatenate([-np.geomspace(1e-18, 0.9, 200), np.geomspace(1e-18, 30.0, 200)])
-    arrays = [wp.zeros(x.size, dtype=wp.float64, device="cpu") for _ in range(2)]
-    wp.launch(_functions, x.size, [wp.array(x, dtype=wp.float64, device="cpu"), *arrays], device="cpu")
-    np.testing.assert_allclose(arrays[0].numpy(), np.expm1(x), rtol=1e-12)
-    np.testing.assert_allclose(arrays[1].numpy(), np.log1p(x), rtol=1e-12)
+    inputs = [on_device(x, dtype=wp.float64)]
+    grown, logged = launched(_functions, inputs, (wp.float64, wp.float64), count=x.size)
+    np.testing.assert_allclose(grown, np.expm1(x), rtol=1e-12)
+    np.testing.assert_allclose(logged, np.log1p(x), rtol=1e-12)

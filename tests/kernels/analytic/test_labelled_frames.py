@@ -5,18 +5,12 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.statistics_of_samples import DEVICES
 from spadwarp_kernels.analytic import FrameCoding, draw_frames
 
 WIDTH, HEIGHT = 52, 40  # rows that do not end at a byte
 OFFSET, STEP = 9.0, 1e-3
 PATHS = np.array([20.0, 24.0, 30.0, 34.0])
 CUMULATIVE = np.array([0.0, 0.5, 0.9, 1.0])
-
-
-@pytest.fixture(params=DEVICES)
-def device(request):
-    return request.param
 
 
 def draw(device, *, depth=14.0, sigma=0.01, alpha=1e-4, pulses=20_000, probability=1.0, flat=0.0, fraction, **changes):

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.statistics_of_samples import DEVICES
+from helpers.launch import launched
 
 AXIS = np.array([0.36, -0.48, 0.8])
 START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read
@@ -47,10 +47,7 @@ def flown(device, extinction):
     medium = sk.Medium()
     medium.extinction = extinction[0]
     layers = sk.make_layers(START, extinction, [0.5] * 5, [0.9] * 5, axis=AXIS, device=device)
-    out = [wp.zeros(COUNT, dtype=kind, device=device) for kind in (float, float, float, int)]
-    rays_there = [wp.array(a, dtype=kind, device=device) for a, kind in ((x, wp.vec3), (u, wp.vec3), (xi, float))]
-    wp.launch(fly, COUNT, inputs=[medium, layers, *rays_there], outputs=out, device=device)
-    return [one.numpy() for one in out]
+    return launched(fly, [medium, layers, x, u, xi], (float, float, float, int), device)
 
 
 def optical_depth(x, u, length):
@@ -66,7 +63,6 @@ def optical_depth(x, u, length):
     return total
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_free_paths_end_where_the_optical_depth_is_reached(device):
     x, u, xi = rays()
     distance, _, mean, index = flown(device, EXTINCTION)
@@ -79,7 +75,6 @@ def test_free_paths_end_where_the_optical_depth_is_reached(device):
     assert (np.bincount(index) > 200).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_layers_of_one_extinction_are_no_layers(device):
     """The same bits as without them, whatever the boundaries."""
     distance, homogeneous, mean, _ = flown(device, [0.7] * 5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.statistics_of_samples import DEVICES
+from helpers.launch import launched, on_device
 from spadwarp_kernels.random import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
 
 
@@ -44,34 +44,28 @@ def _keyed_blocks(keys: RoundKeys, base: wp.uint64, out: wp.array(dtype=wp.vec4u
     ],
 )
 def test_known_answers(counter_key, expected):
-    words = wp.array(np.array(counter_key, np.uint32), dtype=wp.uint32, device="cpu")
-    out = wp.zeros(1, dtype=wp.vec4ui, device="cpu")
-    wp.launch(_philox, 1, [words, out], device="cpu")
-    assert out.numpy()[0].tolist() == expected
+    words = on_device(np.array(counter_key, np.uint32), dtype=wp.uint32)
+    assert launched(_philox, [words], [wp.vec4ui], count=1)[0][0].tolist() == expected
 
 
 def test_uniforms_stay_below_one_and_reach_their_grid():
     words = np.array([0, 1, 255, 256, 0x7FFFFFFF, 0xFFFFFF00, 0xFFFFFFFF], np.uint32)
-    device_words = wp.array(words, dtype=wp.uint32, device="cpu")
-    coarse = wp.zeros(words.size, dtype=float, device="cpu")
-    fine = wp.zeros(words.size, dtype=float, device="cpu")
-    wp.launch(_uniforms, words.size, [device_words, coarse, fine], device="cpu")
-    assert coarse.numpy().max() < 1.0 and fine.numpy().max() < 1.0
-    np.testing.assert_array_equal(coarse.numpy(), (words >> 8).astype(np.float64) / 2.0**24)
-    assert fine.numpy()[1] == np.float32(2.0**-32)
+    inputs = [on_device(words, dtype=wp.uint32)]
+    coarse, fine = launched(_uniforms, inputs, (float, float), count=words.size)
+    assert coarse.max() < 1.0 and fine.max() < 1.0
+    np.testing.assert_array_equal(coarse, (words >> 8) / 2.0**24)
+    assert fine[1] == 2.0**-32
 
 
 def test_ids_beyond_32_bits_have_streams_of_their_own():
-    low, high = (wp.zeros(1000, dtype=wp.vec4ui, device="cpu") for _ in range(2))
-    wp.launch(_blocks, 1000, [7, 0, low], device="cpu")
-    wp.launch(_blocks, 1000, [7, 1 << 32, high], device="cpu")
-    assert len(np.unique(np.concatenate([low.numpy(), high.numpy()]), axis=0)) == 2000
+    blocks = [launched(_blocks, [7, base], [wp.vec4ui], count=1000)[0] for base in (0, 1 << 32)]
+    assert len(np.unique(np.concatenate(blocks), axis=0)) == 2000
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", [0, 1, 0x123456789ABCDEF0, 2**64 - 1])
 def test_round_keys_give_the_blocks_of_their_seed(seed, device):
-    plain, keyed = (wp.zeros(1000, dtype=wp.vec4ui, device=device) for _ in range(2))
-    wp.launch(_blocks, 1000, [seed, 1 << 33, plain], device=device)
-    wp.launch(_keyed_blocks, 1000, [round_keys(seed), 1 << 33, keyed], device=device)
-    np.testing.assert_array_equal(plain.numpy(), keyed.numpy())
+    plain, keyed = (
+        launched(kernel, [start, 1 << 33], [wp.vec4ui], device, 1000)[0]
+        for kernel, start in ((_blocks, seed), (_keyed_blocks, round_keys(seed)))
+    )
+    np.testing.assert_array_equal(plain, keyed)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.statistics_of_samples import DEVICES
+from helpers.launch import launched
 from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
 
 NORMAL = np.array([0.36, -0.48, 0.8])
@@ -38,18 +38,13 @@ def _evaluate(
 
 
 def draw(angle, alpha, count, device):
-    v = wp.empty(count, dtype=wp.vec3, device=device)
-    leaving = wp.empty(count, dtype=float, device=device)
-    wp.launch(_draw, count, [wp.vec3(*incoming(angle)), wp.vec3(*NORMAL), alpha, v, leaving], device=device)
-    return v.numpy().astype(np.float64), leaving.numpy()
+    inputs = [wp.vec3(*incoming(angle)), wp.vec3(*NORMAL), alpha]
+    return launched(_draw, inputs, (wp.vec3, float), device, count)
 
 
 def evaluate(u, v, alpha, device="cpu"):
     u, v = np.broadcast_arrays(u, v)
-    arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=device) for a in (u, v)]
-    out = [wp.empty(len(v), dtype=float, device=device) for _ in range(3)]
-    wp.launch(_evaluate, len(v), [*arrays, wp.vec3(*NORMAL), alpha, *out], device=device)
-    return [a.numpy().astype(np.float64) for a in out]
+    return launched(_evaluate, [u, v, wp.vec3(*NORMAL), alpha], [float] * 3, device)
 
 
 def incoming(angle_deg):
@@ -94,7 +89,6 @@ def albedo(angle_deg, alpha):
 CASES = [(0.0, 0.02), (60.0, 0.02), (30.0, 0.2), (75.0, 0.3), (85.0, 1.0)]
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("angle", "alpha"), CASES)
 def test_sampled_facets_follow_the_visible_normals(angle, alpha, device):
     count, rows, columns = (10_000_000 if device != "cpu" else 200_000), 20, 24
@@ -153,7 +147,6 @@ def test_light_and_eye_may_change_places(alpha):
     np.testing.assert_allclose(there, back, rtol=1e-4)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("angle", "alpha"), CASES)
 def test_lobe_reflects_its_albedo_and_no_more(angle, alpha, device):
     expected = albedo(angle, alpha)

@@ -9,9 +9,9 @@ from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
 import spadwarp_kernels as sk
-from helpers.statistics_of_samples import DEVICES, chi2_p
+from helpers.launch import launched
+from helpers.statistics_of_samples import chi2_p
 from reference import fournier_forand
-from reference.single_scatter import henyey_greenstein
 from spadwarp_kernels import TABULATED, random_block, u01_fine
 
 COUNT = 1_000_000
@@ -67,10 +67,7 @@ def _medium(name, device):
 
 def _evaluated(name, t, theta, device="cpu"):
     """pdf(t), lobe(t), complement(theta), q(theta), angle(complement(theta)) in float64."""
-    out = [wp.empty(len(t), dtype=float, device=device) for _ in range(5)]
-    inputs = [wp.array(values, dtype=float, device=device) for values in (t, theta)]
-    wp.launch(_evaluate, len(t), [_medium(name, device), *inputs, *out], device=device)
-    return [values.numpy().astype(np.float64) for values in out]
+    return launched(_evaluate, [_medium(name, device), t, theta], [float] * 5, device)
 
 
 def _fine_grid():
@@ -92,19 +89,15 @@ def _cdf(density):
     return lambda x: np.interp(x, np.concatenate([[0.0], edges]), np.concatenate([[0.0], total]))
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", DENSITIES)
 def test_samples_follow_what_was_tabulated(name, device):
-    t = wp.empty(COUNT, dtype=float, device=device)
-    wp.launch(_sample, COUNT, [_medium(name, device), 11, t], device=device)
-    values = t.numpy().astype(np.float64)
+    (values,) = launched(_sample, [_medium(name, device), 11], device=device, count=COUNT)
     assert values.min() >= 0.0 and values.max() <= 2.0
     assert chi2_p(values, _cdf(DENSITIES[name]), bins=100) > 1e-5
     mean = sk.sphere_integral(lambda t: t * DENSITIES[name](t)) / sk.sphere_integral(DENSITIES[name])
     assert abs(values.mean() - mean) < 5 * values.std() / math.sqrt(COUNT)
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", DENSITIES)
 def test_densities_integrate_to_one(name, device):
     edges = _fine_grid()
@@ -138,84 +131,9 @@ def test_tables_are_true_to_the_function(name):
 
 def test_the_forward_peak_is_resolved_far_below_a_tenth_of_a_degree():
     """5 % of Petzold's light turns by less than 0.1 degrees; the tables spread it over two thousand times less."""
-    t = wp.empty(COUNT, dtype=float, device="cpu")
-    wp.launch(_sample, COUNT, [_medium("fournier_forand", "cpu"), 3, t], device="cpu")
-    angle = np.degrees(np.sqrt(2.0 * t.numpy().astype(np.float64)))
+    (t,) = launched(_sample, [_medium("fournier_forand", "cpu"), 3], count=COUNT)
+    angle = np.degrees(np.sqrt(2.0 * t))
     for limit in (0.1, 0.01, 0.0015):
         expected = float(fournier_forand.cumulative(2.0 * math.sin(math.radians(limit) / 2) ** 2, 1.10, 3.5835))
         assert stats.binomtest(int((angle < limit).sum()), COUNT, expected).pvalue > 1e-4
     assert len(np.unique(angle[angle < 0.1])) > 0.9 * (angle < 0.1).sum()
-
-
-# The densities
-
-
-@pytest.mark.parametrize(
-    ("index", "slope", "fraction"),
-    [  # Mobley, Ocean Optics Web Book, table of Fournier-Forand phase functions
-        (1.021, 3.0742, 0.0001),
-        (1.040, 3.2010, 0.001),
-        (1.08, 3.483, 0.01),
-        (1.10, 3.5835, 0.0183),
-        (1.175, 4.065, 0.1),
-        (1.15, 4.874, 0.4),
-    ],
-)
-def test_fournier_forand_scatters_back_the_published_fraction(index, slope, fraction):
-    """To the published digits; to ten of the closed integral."""
-    back = sk.sphere_integral(lambda t: sk.fournier_forand_density(t, index, slope) * (t > 1))
-    assert back == pytest.approx(fraction, rel=0.035 if fraction < 0.001 else 0.005)
-    assert back == pytest.approx(1 - float(fournier_forand.cumulative(1.0, index, slope)), rel=1e-10)
-    assert sk.sphere_integral(lambda t: sk.fournier_forand_density(t, index, slope)) == pytest.approx(1, abs=1e-4)
-
-
-def test_fournier_forand_is_the_derivative_of_its_integral():
-    t = np.geomspace(1e-9, 2.0, 500)
-    t = t[np.abs(t / 0.015 - 1) > 0.02]
-    expected = fournier_forand.density(t, 1.10, 3.5835)
-    np.testing.assert_allclose(sk.fournier_forand_density(t, 1.10, 3.5835), expected, rtol=1e-9)
-    # Both brackets of the formula vanish where delta is 1: no seam there.
-    seam = np.linspace(0.0149, 0.0151, 4001)
-    assert np.abs(np.diff(np.log(sk.fournier_forand_density(seam, 1.10, 3.5835)), 2)).max() < 1e-9
-
-
-def test_henyey_greenstein_understates_what_comes_straight_back():
-    """p(180°) of Fournier-Forand is 0.00286 per steradian, 1.75 times that of Henyey-Greenstein of g = 0.924."""
-    back = float(sk.fournier_forand_density(2.0, 1.10, 3.5835))
-    assert back == pytest.approx(0.00286, abs=5e-6)
-    assert back / henyey_greenstein(-1, 0.924) == pytest.approx(1.749, abs=5e-4)
-    assert back == pytest.approx(float(fournier_forand.density(2.0, 1.10, 3.5835)), rel=1e-9)
-
-
-def test_two_terms_are_a_mixture():
-    t = np.linspace(0, 2, 9)
-    expected = 0.7 * henyey_greenstein(1 - t, 0.9) + 0.3 * henyey_greenstein(1 - t, -0.2)
-    np.testing.assert_allclose(sk.two_term_henyey_greenstein_density(t, 0.9, -0.2, 0.7), expected, rtol=1e-12)
-
-
-def test_measured_points_are_joined_by_power_laws():
-    density = sk.interpolated_density([0.1, 0.4, 3.0], [8.0, 2.0, 1.0])
-    at = [float(density(2 * math.sin(0.5 * angle) ** 2)) for angle in (0.05, 0.1, 0.2, 0.4, 3.0, 3.1)]
-    np.testing.assert_allclose(np.array(at) / at[1], [2.0, 1.0, 0.5, 0.25, 0.125, 0.125], rtol=1e-9)
-    assert sk.sphere_integral(density) == pytest.approx(1.0, rel=1e-12)
-    # Linear next to a zero; nothing below 0.
-    gap = sk.interpolated_density([0.0, 1.0, 2.0], [1.0, 0.0, 1.0])
-    at = [float(gap(2 * math.sin(0.5 * angle) ** 2)) for angle in (0.5, 1.0, 1.5, 2.5)]
-    np.testing.assert_allclose(np.array(at) / at[3], [0.5, 0.0, 0.5, 1.0], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("angles", "values", "text"),
-    [
-        ([0.1], [1.0], "two or more"),
-        ([0.1, 0.1], [1.0, 1.0], "ascending"),
-        ([0.1, 4.0], [1.0, 1.0], "outside"),
-        ([-0.1, 1.0], [1.0, 1.0], "outside"),
-        ([0.1, 1.0], [1.0, -1.0], "not negative"),
-        ([0.1, 1.0], [0.0, 0.0], "not all 0"),
-        ([0.1, 1.0], [1.0, math.nan], "finite"),
-    ],
-)
-def test_what_is_no_phase_function_is_refused(angles, values, text):
-    with pytest.raises(ValueError, match=text):
-        sk.interpolated_density(angles, values)

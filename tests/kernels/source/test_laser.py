@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.statistics_of_samples import DEVICES, chi2_p
+from helpers.launch import launched
+from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import LASER_PROFILES, Laser, emit_photon
 
-COUNT = 10_000_000
 AXIS = np.array([0.36, -0.48, 0.8])
 
 
@@ -25,12 +25,10 @@ def _photons(profile, device, spread=0.0, radius=0.0):
     laser = Laser()
     laser.position, laser.axis = wp.vec3(1.0, 2.0, 3.0), wp.vec3(*AXIS)
     laser.profile, laser.spread, laser.radius = LASER_PROFILES.index(profile), spread, radius
-    x, u = (wp.empty(COUNT, dtype=wp.vec3, device=device) for _ in range(2))
-    wp.launch(_emit, COUNT, [laser, x, u], device=device)
-    return x.numpy().astype(np.float64) - [1, 2, 3], u.numpy().astype(np.float64)
+    x, u = launched(_emit, [laser], (wp.vec3, wp.vec3), device, sample_count(device))
+    return x - [1, 2, 3], u
 
 
-@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("half_angle", [2.5, 15.0, 90.0, 180.0])
 def test_uniform_cone_is_uniform_in_solid_angle(half_angle, device):
     spread = 2 * math.sin(math.radians(half_angle) / 2) ** 2
@@ -42,7 +40,6 @@ def test_uniform_cone_is_uniform_in_solid_angle(half_angle, device):
     assert chi2_p(t, lambda t: np.minimum(t / spread, 1.0), bins=100) > 1e-4
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_gaussian_has_its_irradiance_profile_on_a_plane(device):
     tangent = math.tan(math.radians(5.0))
     _, u = _photons("gaussian", device, spread=tangent**2)
@@ -52,7 +49,6 @@ def test_gaussian_has_its_irradiance_profile_on_a_plane(device):
     assert chi2_p(radius2, lambda r2: -np.expm1(-2 * r2 / tangent**2), bins=50) > 1e-4
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_collimated_fills_a_disc_with_parallel_light(device):
     x, u = _photons("collimated", device, radius=0.02)
     np.testing.assert_allclose(u, np.broadcast_to(AXIS, u.shape), atol=1e-7)
