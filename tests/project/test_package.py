@@ -1,6 +1,10 @@
 """The house: which way its arrows point, what it says about itself, and what it does not say."""
 
 import ast
+import importlib.resources
+import importlib.util
+import inspect
+import pkgutil
 import re
 import subprocess
 import sys
@@ -72,13 +76,25 @@ def test_one_version():
     assert f"## {spadwarp.__version__}" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_is_there_whatever_was_imported():
+    """Importing a submodule must not hide a function behind it, so that no public name is that of a module."""
+    for package in (spadwarp, spadwarp_kernels):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if module.name.split(".")[-1] != "__main__":
+                importlib.import_module(module.name)
     for name in spadwarp.__all__:
         assert getattr(spadwarp, name) is not None
-        # Importing a submodule must not hide a function behind it.
-        assert type(getattr(spadwarp, name)).__name__ != "module"
+        assert not inspect.ismodule(getattr(spadwarp, name)), name
+        assert importlib.util.find_spec(f"spadwarp.{name}") is None, f"{name} is the name of a module"
+    for name in spadwarp_kernels.__all__:
+        assert not inspect.ismodule(getattr(spadwarp_kernels, name)), name
     with pytest.raises(AttributeError, match="nothing"):
         _ = spadwarp.nothing
+
+
+@pytest.mark.parametrize("package", [spadwarp, spadwarp_kernels], ids=lambda package: package.__name__)
+def test_type_hints_are_for_those_who_import_it(package):
+    assert importlib.resources.files(package).joinpath("py.typed").is_file()
 
 
 def tracked_texts():

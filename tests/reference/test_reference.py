@@ -10,6 +10,8 @@ from reference.moments import after_collisions, after_path, isotropic_radial_cdf
 from reference.single_scatter import Lidar, henyey_greenstein, lambertian_plane, single_scatter, single_scatter_total
 from reference.walk import Medium, cosine_law_on_box, isotropic, pencil, walk
 
+pytestmark = pytest.mark.physics
+
 
 @pytest.mark.parametrize(
     ("g", "albedo", "depth", "reflected", "transmitted"),

@@ -13,6 +13,8 @@ from helpers.statistics_of_samples import equal_means_p
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, pick_device, transport_spec
 
+pytestmark = pytest.mark.physics
+
 SEEDS = 32
 
 

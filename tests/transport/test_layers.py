@@ -15,6 +15,8 @@ from spadwarp.scene import Scene
 from spadwarp.units import SPEED_OF_LIGHT
 from spadwarp.water import water_optics
 
+pytestmark = pytest.mark.physics
+
 MURKY = {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5}
 CLEAR = {"start": 1.7, "extinction": 0.2, "albedo": 0.9}
 LAYERED = {"layers": [MURKY, CLEAR]}

@@ -12,6 +12,8 @@ from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_world
 
+pytestmark = pytest.mark.physics
+
 SEEDS = 32
 BENT = {
     "horizontal_fov_deg": None,

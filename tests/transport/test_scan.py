@@ -15,6 +15,8 @@ from spadwarp.scene import Camera
 from spadwarp.scene.geometry import scan_axes
 from spadwarp.transport.model import build_model, pick_device, transport_spec
 
+pytestmark = pytest.mark.physics
+
 CONFOCAL = {"scan": {"mode": "confocal"}, "laser": {"half_angle_deg": 3.0}}
 
 

@@ -20,6 +20,8 @@ from spadwarp.mesh import build_mesh
 from spadwarp.mesh.colours import srgb_to_linear
 from spadwarp.scene import Target
 
+pytestmark = pytest.mark.physics
+
 CORNERS = np.array([(-1.5, -1.5, 0.0), (1.5, -1.5, 0.0), (1.5, 1.5, 0.0), (-1.5, 1.5, 0.0)])
 SQUARE = [(0, 2, 1), (0, 3, 2)]  # faces -z, as the built-in plane does
 GREENS = (20, 80, 140, 200)  # of the corners

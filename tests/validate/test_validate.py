@@ -15,6 +15,8 @@ from spadwarp.errors import ConfigError
 from spadwarp.validate import CASES, plot_results, references, validate, write_json
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
 
+pytestmark = pytest.mark.physics
+
 # The statistics
 
 

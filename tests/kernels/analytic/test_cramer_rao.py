@@ -130,6 +130,7 @@ _HARD = [(20, 20, 50), (40, 20, 50), (20, 20, 200), (60, 200, 100)]
 _HARD += [(8, 1, 1000), (12, 1, 1000), (5, 0.1, 1000), (3, 0.03, 500)]
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("signal, level, window", _HARD)
 def test_outlier_probability_within_a_fifth_of_monte_carlo(signal, level, window):
     """Maximum likelihood with known signal and background, error over 4 σ; allowed: 20 % and two standard errors."""
@@ -140,6 +141,7 @@ def test_outlier_probability_within_a_fifth_of_monte_carlo(signal, level, window
     assert abs(predicted - measured) < 0.2 * measured + 2 * math.sqrt(measured * (1 - measured) / trials)
 
 
+@pytest.mark.physics
 def test_outliers_of_a_decaying_background_are_bounded_by_the_model():
     """Backscatter decays up to the return, dark counts follow, the fit knows both: right to twice as large."""
     step, window, delay, trials = 0.1, 200, 120.0, 800
@@ -168,6 +170,7 @@ def test_outliers_of_a_decaying_background_are_bounded_by_the_model():
         assert measured - 2 * error < predicted < 2 * (measured + 2 * error)
 
 
+@pytest.mark.physics
 def test_maximum_likelihood_meets_the_bound_where_it_is_reachable():
     """300 signal photons on 150 a σ: no outliers, and an error within 5 % of σ*."""
     trials = 3000

@@ -9,6 +9,8 @@ from scipy import stats
 from helpers.launch import on_device
 from spadwarp_kernels import analytic
 
+pytestmark = pytest.mark.physics
+
 
 def draw(device, *, frames, first=0, seed=5, probability=0.0, flat=0.0, pixels=50):
     view = np.zeros((pixels, 3))

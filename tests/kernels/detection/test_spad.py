@@ -15,6 +15,8 @@ from spadwarp_kernels.detection import (
     first_photon_probabilities,
 )
 
+pytestmark = pytest.mark.physics
+
 BINS = 24
 PERIOD = 50e-9
 

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import warp as wp
 
 from helpers.launch import launched
@@ -12,6 +13,8 @@ from spadwarp_kernels import (
     random_block,
     u01,
 )
+
+pytestmark = pytest.mark.physics
 
 
 @wp.kernel(enable_backward=False)

@@ -8,6 +8,8 @@ from helpers.launch import launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import henyey_greenstein_pdf, random_block, sample_henyey_greenstein, u01_fine
 
+pytestmark = pytest.mark.physics
+
 ANISOTROPIES = [-0.7, 0.0, 0.01, 0.5, 0.924, 0.99]
 
 

@@ -14,6 +14,8 @@ from helpers.statistics_of_samples import chi2_p
 from reference import fournier_forand
 from spadwarp_kernels import TABULATED, random_block, u01_fine
 
+pytestmark = pytest.mark.physics
+
 COUNT = 1_000_000
 FLAT = 2.0**-32  # the tables are constant up to here
 

@@ -8,6 +8,8 @@ from scipy import stats
 from helpers.launch import launched, on_device
 from spadwarp_kernels.random import binomial, expm1, log1p
 
+pytestmark = pytest.mark.physics
+
 
 @wp.kernel(enable_backward=False)
 def _draw(n: int, hazard: wp.float64, seed: wp.uint64, base: wp.uint64, counts: wp.array(dtype=int)):

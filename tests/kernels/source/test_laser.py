@@ -29,6 +29,7 @@ def _photons(profile, device, spread=0.0, radius=0.0):
     return x - [1, 2, 3], u
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("half_angle", [2.5, 15.0, 90.0, 180.0])
 def test_uniform_cone_is_uniform_in_solid_angle(half_angle, device):
     spread = 2 * math.sin(math.radians(half_angle) / 2) ** 2
@@ -40,6 +41,7 @@ def test_uniform_cone_is_uniform_in_solid_angle(half_angle, device):
     assert chi2_p(t, lambda t: np.minimum(t / spread, 1.0), bins=100) > 1e-4
 
 
+@pytest.mark.physics
 def test_gaussian_has_its_irradiance_profile_on_a_plane(device):
     tangent = math.tan(math.radians(5.0))
     _, u = _photons("gaussian", device, spread=tangent**2)

@@ -8,6 +8,8 @@ from scipy import stats
 from helpers.launch import launched
 from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
 
+pytestmark = pytest.mark.physics
+
 NORMAL = np.array([0.36, -0.48, 0.8])
 ACROSS = np.array([0.8, 0.6, 0.0])
 ASIDE = np.cross(NORMAL, ACROSS)

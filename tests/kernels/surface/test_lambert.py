@@ -1,6 +1,7 @@
 """Diffuse reflection follows Lambert's law."""
 
 import numpy as np
+import pytest
 import warp as wp
 
 from helpers.launch import launched
@@ -10,6 +11,8 @@ from spadwarp_kernels import (
     sample_lambert,
     u01,
 )
+
+pytestmark = pytest.mark.physics
 
 
 @wp.kernel(enable_backward=False)
