@@ -50,11 +50,11 @@ _HOMES = {
     "instrument_response": "frames",
     "arrival_time": "frames",
     "crlb": "frames",
-    "simulate_analytic": "analytic.model",
-    "AnalyticResult": "analytic.model",
+    "simulate_analytic": "analytic",
+    "AnalyticResult": "analytic",
     "load_truth_exr": "result",
-    "budget": "analytic.budget",
-    "sweep": "analytic.budget",
+    "budget": "analytic",
+    "sweep": "analytic",
     "export": "run",
     "save_analytic": "run",
     "view": "viz.viewer",
@@ -82,8 +82,8 @@ _ROOMS |= {"result", "run", "scene", "transport", "validate", "viz", "water"}
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
-    from spadwarp.analytic.budget import budget, sweep
-    from spadwarp.analytic.model import AnalyticResult, simulate_analytic
+    from spadwarp.analytic import AnalyticResult, simulate_analytic, sweep
+    from spadwarp.analytic.photon_budget import budget
     from spadwarp.benchmark.cases import bench
     from spadwarp.checks import check
     from spadwarp.dataset.make import make_dataset, verify_dataset

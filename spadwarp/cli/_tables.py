@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp.analytic.budget import BudgetRow
+    from spadwarp.analytic import BudgetRow
 
 
 def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
-    from spadwarp.analytic.budget import OUTLIERS
+    from spadwarp.analytic import OUTLIERS
 
     table = _table(
         title,

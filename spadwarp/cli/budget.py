@@ -48,7 +48,7 @@ def budget(
     Example:
       spadwarp budget configs/scenes/harbour_5m.toml --range 1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
     """
-    from spadwarp.analytic.budget import plot_budget
+    from spadwarp.viz import plot_budget
 
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
     if out is not None:
@@ -67,7 +67,7 @@ def budget(
 
 
 def _numbers(text: str | None) -> list[float] | None:
-    from spadwarp.analytic.budget import parse_vary
+    from spadwarp.analytic import parse_vary
 
     if text is None:
         return None

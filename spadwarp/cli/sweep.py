@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spadwarp import Scene
-    from spadwarp.analytic.budget import DepthErrorRow
+    from spadwarp.analytic import DepthErrorRow
 from spadwarp.cli._tables import _budget_table, _percent, _short, _table, _write_csv
 
 
@@ -52,7 +52,7 @@ def sweep(
     Example:
       spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
     """
-    from spadwarp.analytic.budget import plot_sweep
+    from spadwarp.viz import plot_sweep
 
     scene: Scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
     opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)

@@ -15,7 +15,7 @@ from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.scene import Scene
 
 if TYPE_CHECKING:
-    from spadwarp.analytic.model import AnalyticResult
+    from spadwarp.analytic.result import AnalyticResult
 
 __all__ = ["FORMAT", "load_analytic", "save_analytic"]
 

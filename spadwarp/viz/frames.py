@@ -12,7 +12,7 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.viz.result import image_panels, show_image, shown_limits
 
 if TYPE_CHECKING:
-    from spadwarp.analytic.model import AnalyticResult
+    from spadwarp.analytic.result import AnalyticResult
     from spadwarp.frames.frames import Frames
     from spadwarp.frames.record import Recording
     from spadwarp.result.result import Result

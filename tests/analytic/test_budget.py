@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.analytic.budget import BudgetRow, DepthErrorRow, budget, parse_vary, plot_budget, plot_sweep, sweep
-from spadwarp.analytic.model import simulate_analytic
+from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_vary, simulate_analytic, sweep
+from spadwarp.analytic.photon_budget import budget
 from spadwarp.errors import ConfigError
+from spadwarp.viz.budget import plot_budget, plot_sweep
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},

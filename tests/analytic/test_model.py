@@ -10,7 +10,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene
 from reference import crlb
-from spadwarp.analytic.model import simulate_analytic
+from spadwarp.analytic import simulate_analytic
 from spadwarp.errors import ConfigError
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.response import InstrumentResponse

@@ -1,0 +1,143 @@
+"""The photon budget, or the error of depth frames, over any field of the scene."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.analytic.model import source_name
+from spadwarp.analytic.photon_budget import BudgetRow, axis_rows
+from spadwarp.analytic.simulate import simulate_analytic
+from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.scene import parse_override
+from spadwarp.scene.geometry import pixel_directions
+from spadwarp.transport.model import truth_maps
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["DepthErrorRow", "Sweep", "parse_vary", "sweep"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthErrorRow:
+    """Summary of the depth frames of a scene; statistics run over the pixels that have an estimate.
+
+    Attributes:
+        sigma_depth: Median bound of depth [m].
+        sigma_depth_p90: 90th percentile of the bound [m].
+        outlier_probability: Mean over pixels.
+        estimate_fraction: Pixels with an estimate over pixels with a target.
+        signal_to_backscatter: Median.
+    """
+
+    sigma_depth: float
+    sigma_depth_p90: float
+    outlier_probability: float
+    estimate_fraction: float
+    signal_to_backscatter: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Curves over one field: `rows[i]` belongs to `values[i]`."""
+
+    field: str
+    values: tuple[Any, ...]
+    rows: tuple[BudgetRow, ...] | tuple[DepthErrorRow, ...]
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """One attribute of all rows."""
+        return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
+
+
+def sweep(
+    scene: Scene,
+    *,
+    vary: str | tuple[str, Sequence[Any]],
+    of: Literal["budget", "depth-error"] = "budget",
+    device: str | None = None,
+) -> Sweep:
+    """The budget, or the error of depth frames, over any field of the scene.
+
+    Args:
+        scene: The scene.
+        vary: `"medium.extinction=0.1:2:20"` (from, to, number of values), the same with `:log` at the end for a
+            geometric progression, `"laser.pulse_energy=1e-9,4e-9"`, or (field, values).
+        of: `"budget"`: `BudgetRow` at the range of the target pixel nearest to the optical axis. `"depth-error"`:
+            `DepthErrorRow` over all pixels.
+        device: Warp device; default: the first GPU, else the CPU.
+
+    Raises:
+        ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
+        ArgumentError: `vary` or `of` not of the form above.
+    """
+    if of not in ("budget", "depth-error"):
+        raise ArgumentError(f"of = {of!r} is not one of 'budget', 'depth-error'")
+    field, values = parse_vary(vary) if isinstance(vary, str) else (vary[0], list(vary[1]))
+    if not values:
+        raise ArgumentError(f"vary = {vary!r} holds no value")
+    rows: list[Any] = []
+    for value in values:
+        changed = scene.with_overrides({field: value})
+        rows.append(_central_row(changed, device) if of == "budget" else _depth_error(changed, device))
+    return Sweep(field=field, values=tuple(values), rows=tuple(rows))
+
+
+def parse_vary(text: str) -> tuple[str, list[Any]]:
+    """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ArgumentError`."""
+    field, equals, spec = (part.strip() for part in text.partition("="))
+    if not field or not equals or not spec:
+        raise ArgumentError(f"vary = {text!r} is not of the form section.field=from:to:count")
+    if ":" not in spec:
+        try:
+            return field, tomllib.loads(f"values = [{spec}]")["values"]
+        except tomllib.TOMLDecodeError:  # bare words
+            return field, [parse_override(f"{field}={value}")[1] for value in spec.split(",")]
+    parts = spec.split(":")
+    try:
+        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        geometric = len(parts) == 4 and parts[3] == "log"
+        if count < 1 or len(parts) > 3 + geometric or not (math.isfinite(low) and math.isfinite(high)):
+            raise ValueError
+        if geometric and not (low > 0 and high > 0):
+            raise ValueError
+    except (ValueError, IndexError):
+        raise ArgumentError(
+            f"vary = {text!r} is not of the form section.field=from:to:count, with :log only for positive ends"
+        ) from None
+    return field, [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
+
+
+def _central_row(scene: Scene, device: str | None) -> BudgetRow:
+    truth = truth_maps(scene)
+    hit = ~np.isnan(truth.depth)
+    if not hit.any():
+        raise ConfigError("no target is in view", source=source_name(scene))
+    off_axis = np.where(hit, -pixel_directions(scene.camera)[..., 2], np.inf)
+    pixel = np.unravel_index(np.argmin(off_axis), off_axis.shape)
+    distance = np.array([float(truth.range[pixel])])
+    return axis_rows(scene, scene.medium.preset or "scene", distance, float(truth.reflectance[pixel]), device)[0]
+
+
+def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:
+    result = simulate_analytic(scene, frames=0, device=device)
+    estimated = result.fisher > 0
+    count, targets = np.count_nonzero(estimated), np.count_nonzero(~np.isnan(result.truth.depth))
+
+    def over_pixels(values: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], Any]) -> float:
+        return float(statistic(values[estimated])) if count else math.nan
+
+    return DepthErrorRow(
+        sigma_depth=over_pixels(result.sigma_depth, np.median),
+        sigma_depth_p90=over_pixels(result.sigma_depth, lambda values: np.quantile(values, 0.9)),
+        outlier_probability=over_pixels(result.outlier_probability, np.mean),
+        estimate_fraction=float(count / targets),
+        signal_to_backscatter=over_pixels(result.signal_to_backscatter, np.median),
+    )
