@@ -128,6 +128,11 @@ class Camera(Section):
         return 0.0 if self.focus_distance is None else 1.0 / self.focus_distance
 
     @property
+    def is_posed(self) -> bool:
+        """Whether its frame is not the world's."""
+        return any((*self.position, *self.rotation_deg))
+
+    @property
     def is_plain(self) -> bool:
         """Whether it is a pinhole with square pixels about the optical axis and without distortion."""
         fx, fy = self.focal_pixels

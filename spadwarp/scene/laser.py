@@ -64,6 +64,11 @@ class Laser(Section):
         return (x / length, y / length, z / length)
 
     @property
+    def is_visible(self) -> bool:
+        """Whether its wavelength is one for which the optics of water are known, 400 to 700 nm."""
+        return 400.0 <= self.wavelength_nm <= 700.0
+
+    @property
     def photons_per_pulse(self) -> float:
         """E0·λ/(hc)."""
         return self.pulse_energy * self.wavelength_nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)

@@ -120,9 +120,6 @@ class Medium(Water):
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
-        temperature = 20.0 if self.temperature is None else self.temperature
-        salinity = 35.0 if self.salinity is None else self.salinity
-
         self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
         for water in self.waters:
             names = [] if water.chlorophyll is None else [*COEFFICIENTS]
@@ -130,12 +127,18 @@ class Medium(Water):
                 names += [name for name in ("phase_index", "group_index") if name not in self.model_fields_set]
             if not names:
                 continue
-            optics = water_optics(
-                wavelength_nm, chlorophyll=water.chlorophyll or 0.0, temperature=temperature, salinity=salinity
-            )
+            optics = water_optics(wavelength_nm, chlorophyll=water.chlorophyll or 0.0, **self.state)
             water.__dict__.update({name: getattr(optics, name) for name in names})
             if water is self and self.chlorophyll is not None and not self.layers:
                 self._molecular_share = optics.water_scattering / optics.scattering
+
+    @property
+    def state(self) -> dict[str, float]:
+        """`temperature` [°C] and `salinity` [g/kg], 20 and 35 where they are not given."""
+        return {
+            "temperature": 20.0 if self.temperature is None else self.temperature,
+            "salinity": 35.0 if self.salinity is None else self.salinity,
+        }
 
     @property
     def pulse_speed(self) -> float:

@@ -79,7 +79,7 @@ class Scene(BaseModel):
     def beam(self) -> Laser:
         """The laser with position and direction in the camera frame."""
         laser, camera = self.laser, self.camera
-        if laser.frame == "camera" or not any((*camera.position, *camera.rotation_deg)):
+        if laser.frame == "camera" or not camera.is_posed:
             return laser
         place, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
         moved = {"position": tuple(map(float, place)), "direction": tuple(map(float, axis)), "frame": "camera"}
@@ -87,7 +87,7 @@ class Scene(BaseModel):
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds on the straight way between two points of the camera frame [m]."""
-        if self.medium.layers and any((*self.camera.position, *self.camera.rotation_deg)):
+        if self.medium.layers and self.camera.is_posed:
             begin, end = to_world(self.camera, [begin, end]).tolist()
         return self.medium.optical_depth(begin, end)
 

@@ -102,7 +102,7 @@ def trace(
         if progress is not None:
             progress("trace", stop, photons)
     ledger, _ = sk.read_ledger(lane.data)
-    if any((*scene.camera.position, *scene.camera.rotation_deg)):
+    if scene.camera.is_posed:
         for part in parts:
             part["position"] = to_world(scene.camera, part["position"]).astype(np.float32)
             part["direction"] = (part["direction"] @ rotation_matrix(scene.camera.rotation_deg).T).astype(np.float32)

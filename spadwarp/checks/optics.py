@@ -1,0 +1,62 @@
+"""The thin lens and the confocal scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from spadwarp.checks.message import CheckMessage, note, warning
+from spadwarp.checks.survey import Survey
+from spadwarp.scene import Laser
+
+
+def check_focus(survey: Survey) -> Iterator[CheckMessage]:
+    """How far a thin lens is out of focus on what it sees."""
+    camera = survey.scene.camera
+    if camera.focus_distance is None or survey.target_range is None or survey.distance is None:
+        return
+    blur = {
+        distance: 2.0 * camera.aperture_radius * abs(1.0 / distance - camera.inverse_focus) / camera.pixel_tangent
+        for distance in survey.target_range
+    }
+    worst = max(blur, key=blur.__getitem__)
+    if blur[worst] > 1.0:
+        text = (
+            f"a point at {worst:.4g} m is blurred over {blur[worst]:.3g} pixels; truth maps and the analytic simulator "
+            "are sharp"
+        )
+        yield note("camera.focus_distance", text, distance=worst, pixels=blur[worst])
+
+
+def check_scan(survey: Survey) -> Iterator[CheckMessage]:
+    """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
+    scene = survey.scene
+    if scene.scan_positions == 1:
+        return
+    detector, laser = scene.detector, scene.beam
+    if scene.laser.direction != Laser().direction:
+        yield note("laser.direction", f"direction = {list(scene.laser.direction)} is not used: a scan aims the laser")
+    snapped = math.degrees(math.acos(scene.transport.axis_threshold))
+    pixel_deg = math.degrees(math.atan(scene.camera.pixel_tangent))
+    if snapped > pixel_deg:
+        text = (
+            f"axis_threshold = {scene.transport.axis_threshold:g} scatters light within {snapped:.3g}° of the optical "
+            f"axis as if it went along it, and a pixel sees {pixel_deg:.3g}°: 1 is exact"
+        )
+        yield warning("transport.axis_threshold", text, degrees=snapped, pixel_deg=pixel_deg)
+    for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
+        if value := getattr(detector, name):
+            text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
+            yield note(f"detector.{name}", text, **{name: value})
+    if survey.distance is None:
+        return
+    distance = survey.distance
+    aside = math.hypot(*laser.position[:2]) * abs(1.0 - distance / scene.scan.distance)
+    spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * distance
+    pixel = scene.camera.pixel_tangent * distance
+    if aside > spot + pixel:
+        text = (
+            f"at {distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, the spot's "
+            f"radius is {spot:.3g} m): scan.distance makes them cross"
+        )
+        yield warning("scan.distance", text, aside=aside, spot=spot, pixel=pixel)
