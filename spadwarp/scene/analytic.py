@@ -13,23 +13,19 @@ class Analytic(Section):
     """Settings of the analytic simulator; transport does not read them."""
 
     section: ClassVar[str] = "analytic"
-    form: Literal["radiometric", "lu2024"] = Field(
-        "radiometric", description="constants of the lidar equation: radiometry, or eq 7 as printed"
-    )
-    backscatter: Literal["constant", "single_scatter", "monte_carlo"] = Field(
-        "single_scatter", description="time course of the backscatter"
-    )
-    backscatter_rate: float = Field(
-        0.0, ge=0, description="constant backscatter, detections per second in the gate [1/s]"
-    )
-    backscatter_fraction: float | None = Field(
-        None, ge=0, le=1, description="part of the pixels that report backscatter (BS); from the rates if not given"
-    )
-    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = Field(
-        "per_pulse", description="at most one count a pulse, or a frame"
-    )
-    pulses_per_depth_frame: Whole = Field(
-        20_000, ge=1, le=2**63 - 1, description="pulses of one depth frame, for per_pulse"
-    )
-    frames: Whole = Field(1000, ge=1, le=2**63 - 1, description="detector frames of one depth frame, for per_frame")
-    exposure: float = Field(1e-5, gt=0, description="exposure of one detector frame [s]")
+    form: Literal["radiometric", "lu2024"] = "radiometric"
+    """constants of the lidar equation: radiometry, or eq 7 as printed"""
+    backscatter: Literal["constant", "single_scatter", "monte_carlo"] = "single_scatter"
+    """time course of the backscatter"""
+    backscatter_rate: float = Field(0.0, ge=0)
+    """constant backscatter, detections per second in the gate [1/s]"""
+    backscatter_fraction: float | None = Field(None, ge=0, le=1)
+    """part of the pixels that report backscatter (BS); from the rates if not given"""
+    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = "per_pulse"
+    """at most one count a pulse, or a frame"""
+    pulses_per_depth_frame: Whole = Field(20_000, ge=1, le=2**63 - 1)
+    """pulses of one depth frame, for per_pulse"""
+    frames: Whole = Field(1000, ge=1, le=2**63 - 1)
+    """detector frames of one depth frame, for per_frame"""
+    exposure: float = Field(1e-5, gt=0)
+    """exposure of one detector frame [s]"""

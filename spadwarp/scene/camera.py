@@ -22,37 +22,40 @@ class Camera(Section):
     """
 
     section: ClassVar[str] = "camera"
-    preset: str | None = Field(None, description="a named camera, see `spadwarp presets camera`")
-    width: Whole = Field(..., ge=1, le=16384, description="pixels in a row")
-    height: Whole = Field(..., ge=1, le=16384, description="rows")
-    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180, description="full horizontal field of view [°]")
-    focal_length: float | None = Field(None, gt=0, description="focal length [m]")
-    pixel_pitch_um: float | None = Field(None, gt=0, description="side of a pixel [µm]")
-    fx: float | None = Field(None, gt=0, description="focal length along rows [pixels], as OpenCV writes it")
-    fy: float | None = Field(None, gt=0, description="focal length along columns [pixels]; fx if not given")
-    cx: float | None = Field(
-        None,
-        description="column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle",
-    )
-    cy: float | None = Field(None, description="row of the optical axis, likewise")
-    distortion: Brown = Field((0.0,) * 5, description="Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
-    calibration: str | None = Field(
-        None,
-        description="OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place",
-    )
-    aperture_diameter: float | None = Field(None, gt=0, description="diameter of the entrance aperture [m]")
-    f_number: float | None = Field(None, gt=0, description="focal length over aperture diameter")
-    focus_distance: float | None = Field(
-        None,
-        gt=0,
-        le=math.inf,
-        allow_inf_nan=True,
-        description="thin lens: depth that is imaged sharply [m], inf is infinity; not given: pinhole, all of it sharp",
-    )
-    position: Vector = Field((0.0, 0.0, 0.0), description="lens centre in the world [m]")
-    rotation_deg: Vector = Field(
-        (0.0, 0.0, 0.0), description="turns from the world's axes about x, the turned y, then z [°]"
-    )
+    preset: str | None = None
+    """a named camera, see `spadwarp presets camera`"""
+    width: Whole = Field(..., ge=1, le=16384)
+    """pixels in a row"""
+    height: Whole = Field(..., ge=1, le=16384)
+    """rows"""
+    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180)
+    """full horizontal field of view [°]"""
+    focal_length: float | None = Field(None, gt=0)
+    """focal length [m]"""
+    pixel_pitch_um: float | None = Field(None, gt=0)
+    """side of a pixel [µm]"""
+    fx: float | None = Field(None, gt=0)
+    """focal length along rows [pixels], as OpenCV writes it"""
+    fy: float | None = Field(None, gt=0)
+    """focal length along columns [pixels]; fx if not given"""
+    cx: float | None = None
+    """column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle"""
+    cy: float | None = None
+    """row of the optical axis, likewise"""
+    distortion: Brown = (0.0,) * 5
+    """Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order"""
+    calibration: str | None = None
+    """OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place"""
+    aperture_diameter: float | None = Field(None, gt=0)
+    """diameter of the entrance aperture [m]"""
+    f_number: float | None = Field(None, gt=0)
+    """focal length over aperture diameter"""
+    focus_distance: float | None = Field(None, gt=0, le=math.inf, allow_inf_nan=True)
+    """thin lens: depth that is imaged sharply [m], inf is infinity; not given: pinhole, all of it sharp"""
+    position: Vector = (0.0, 0.0, 0.0)
+    """lens centre in the world [m]"""
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+    """rotations from the world's axes about x, then the new y, then the new z [°]"""
 
     @model_validator(mode="before")
     @classmethod

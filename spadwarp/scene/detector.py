@@ -13,36 +13,44 @@ class Detector(Section):
     """The SPAD array and its timing electronics."""
 
     section: ClassVar[str] = "detector"
-    preset: str | None = Field(None, description="a named detector, see `spadwarp presets detector`")
-    pdp: float = Field(0.247, ge=0, le=1, description="photon detection probability of the active area")
-    fill_factor: float = Field(0.2, gt=0, le=1, description="active part of a pixel's area, microlenses included")
-    jitter_fwhm_ps: float = Field(200.0, ge=0, description="timing jitter, full width at half maximum [ps]")
-    irf: str = Field(
-        "gaussian",
-        description='instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file',
-    )
-    irf_tail_ps: float = Field(100.0, gt=0, description="time constant of the exponential tail [ps]")
-    dark_count_rate: float = Field(100.0, ge=0, description="median dark counts per second and pixel [1/s]")
-    dark_count_spread: float = Field(
-        0.0, ge=0, description="relative (log-normal) spread of the dark count rate over pixels"
-    )
-    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="part of the pixels that are hot")
-    hot_pixel_rate: float = Field(1e4, ge=0, description="dark count rate of a hot pixel [1/s]")
-    ambient_rate: float = Field(0.0, ge=0, description="detected background counts per second and pixel [1/s]")
-    mode: Literal["first_photon", "free_running"] = Field(
-        "first_photon", description="one count a pulse, or as many as come"
-    )
-    dead_time_ns: float = Field(0.0, ge=0, description="dead time after a count, free-running [ns]")
-    afterpulsing_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count causes another")
-    afterpulsing_time_constant_ns: float = Field(50.0, gt=0, description="decay time of afterpulsing [ns]")
-    crosstalk_probability: float = Field(0.0, ge=0, lt=1, description="probability that a count fires a neighbour")
-    wrap: bool = Field(
-        True, description="time of flight modulo the pulse period (range aliasing), as a detector sees it"
-    )
-    pulses_per_frame: Whole = Field(20_000, ge=1, le=2**63 - 1, description="laser pulses in one frame of counts")
-    counter_depth: Whole = Field(
-        0, ge=0, le=2**31 - 1, description="largest count a histogram bin holds; 0 is unlimited"
-    )
+    preset: str | None = None
+    """a named detector, see `spadwarp presets detector`"""
+    pdp: float = Field(0.247, ge=0, le=1)
+    """photon detection probability of the active area"""
+    fill_factor: float = Field(0.2, gt=0, le=1)
+    """active part of a pixel's area, microlenses included"""
+    jitter_fwhm_ps: float = Field(200.0, ge=0)
+    """timing jitter, full width at half maximum [ps]"""
+    irf: str = "gaussian"
+    """instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file"""
+    irf_tail_ps: float = Field(100.0, gt=0)
+    """time constant of the exponential tail [ps]"""
+    dark_count_rate: float = Field(100.0, ge=0)
+    """median dark counts per second and pixel [1/s]"""
+    dark_count_spread: float = Field(0.0, ge=0)
+    """relative (log-normal) spread of the dark count rate over pixels"""
+    hot_pixel_fraction: float = Field(0.0, ge=0, le=1)
+    """part of the pixels that are hot"""
+    hot_pixel_rate: float = Field(1e4, ge=0)
+    """dark count rate of a hot pixel [1/s]"""
+    ambient_rate: float = Field(0.0, ge=0)
+    """detected background counts per second and pixel [1/s]"""
+    mode: Literal["first_photon", "free_running"] = "first_photon"
+    """one count a pulse, or as many as come"""
+    dead_time_ns: float = Field(0.0, ge=0)
+    """dead time after a count, free-running [ns]"""
+    afterpulsing_probability: float = Field(0.0, ge=0, lt=1)
+    """probability that a count causes another"""
+    afterpulsing_time_constant_ns: float = Field(50.0, gt=0)
+    """decay time of afterpulsing [ns]"""
+    crosstalk_probability: float = Field(0.0, ge=0, lt=1)
+    """probability that a count fires a neighbour"""
+    wrap: bool = True
+    """time of flight modulo the pulse period (range aliasing), as a detector sees it"""
+    pulses_per_frame: Whole = Field(20_000, ge=1, le=2**63 - 1)
+    """laser pulses in one frame of counts"""
+    counter_depth: Whole = Field(0, ge=0, le=2**31 - 1)
+    """largest count a histogram bin holds; 0 is unlimited"""
 
     @field_validator("irf")
     @classmethod

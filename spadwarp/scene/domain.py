@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from spadwarp.scene.sections import Corner, Section
 
@@ -14,15 +14,12 @@ class Domain(Section):
     """Where the water is, in the world. A photon that leaves it is gone; camera and laser must be inside."""
 
     section: ClassVar[str] = "domain"
-    shape: Literal["unbounded", "slab", "box"] = Field(
-        "unbounded", description="slab: bounded in z; box: in x, y and z"
-    )
-    lower: Corner = Field(
-        (-math.inf,) * 3, description="lower corner [m]; one number stands for all three, a slab uses z"
-    )
-    upper: Corner = Field(
-        (math.inf,) * 3, description="upper corner [m]; one number stands for all three, a slab uses z"
-    )
+    shape: Literal["unbounded", "slab", "box"] = "unbounded"
+    """slab: bounded in z; box: in x, y and z"""
+    lower: Corner = (-math.inf,) * 3
+    """lower corner [m]; one number stands for all three, a slab uses z"""
+    upper: Corner = (math.inf,) * 3
+    """upper corner [m]; one number stands for all three, a slab uses z"""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -13,10 +13,14 @@ class Gate(Section):
     """The time bins after the pulse leaves the laser."""
 
     section: ClassVar[str] = "gate"
-    preset: str | None = Field(None, description="named electronics, see `spadwarp presets gate`")
-    start_ns: float = Field(0.0, ge=0, description="begin of the first bin [ns]")
-    bin_width_ps: float = Field(..., gt=0, description="width of a bin [ps]")
-    bins: Whole = Field(..., ge=1, le=1_000_000, description="number of bins")
+    preset: str | None = None
+    """named electronics, see `spadwarp presets gate`"""
+    start_ns: float = Field(0.0, ge=0)
+    """begin of the first bin [ns]"""
+    bin_width_ps: float = Field(..., gt=0)
+    """width of a bin [ps]"""
+    bins: Whole = Field(..., ge=1, le=1_000_000)
+    """number of bins"""
 
     @property
     def start(self) -> float:

@@ -15,29 +15,30 @@ class Laser(Section):
     """The pulsed source. Photons leave it at the middle of the pulse, time 0."""
 
     section: ClassVar[str] = "laser"
-    preset: str | None = Field(None, description="a named laser, see `spadwarp presets laser`")
-    position: Vector = Field((0.0, 0.0, 0.0), description="place [m]")
-    direction: Vector = Field((0.0, 0.0, 1.0), description="axis of the beam; any length but 0; a scan aims it itself")
-    frame: Literal["camera", "world"] = Field(
-        "camera", description="frame of position and direction: a laser moves with the camera, or stands in the world"
-    )
-    profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = Field(
-        "uniform_cone", description="even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"
-    )
-    profile_image: str | None = Field(
-        None, description="irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"
-    )
-    half_angle_deg: float = Field(
-        15.0,
-        gt=0,
-        le=180,
-        description="half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]",
-    )
-    beam_radius: float = Field(0.0, ge=0, description="radius of the collimated beam [m]; 0 is a pencil beam")
-    wavelength_nm: float = Field(532.0, gt=0, description="vacuum wavelength [nm]")
-    pulse_energy: float = Field(37.5e-9, gt=0, description="energy of one pulse [J]")
-    repetition_rate: float = Field(20e6, gt=0, description="pulses per second [Hz]")
-    pulse_fwhm_ps: float = Field(85.0, ge=0, description="pulse duration, full width at half maximum [ps]")
+    preset: str | None = None
+    """a named laser, see `spadwarp presets laser`"""
+    position: Vector = (0.0, 0.0, 0.0)
+    """place [m]"""
+    direction: Vector = (0.0, 0.0, 1.0)
+    """axis of the beam; any length but 0; a scan aims it itself"""
+    frame: Literal["camera", "world"] = "camera"
+    """frame of position and direction: a laser moves with the camera, or stands in the world"""
+    profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
+    """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
+    profile_image: str | None = None
+    """irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"""
+    half_angle_deg: float = Field(15.0, gt=0, le=180)
+    """half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]"""
+    beam_radius: float = Field(0.0, ge=0)
+    """radius of the collimated beam [m]; 0 is a pencil beam"""
+    wavelength_nm: float = Field(532.0, gt=0)
+    """vacuum wavelength [nm]"""
+    pulse_energy: float = Field(37.5e-9, gt=0)
+    """energy of one pulse [J]"""
+    repetition_rate: float = Field(20e6, gt=0)
+    """pulses per second [Hz]"""
+    pulse_fwhm_ps: float = Field(85.0, ge=0)
+    """pulse duration, full width at half maximum [ps]"""
 
     @model_validator(mode="after")
     def _has_a_beam(self) -> Self:

@@ -16,17 +16,18 @@ class Water(Section):
     """What water does to light: two of four coefficients, or chlorophyll, from which they follow."""
 
     section: ClassVar[str] = "medium"
-    preset: str | None = Field(None, description="a named water, see `spadwarp presets medium`")
-    absorption: float = Field(0.0, ge=0, description="absorption coefficient a [1/m]")
-    scattering: float = Field(0.0, ge=0, description="scattering coefficient b [1/m]")
-    extinction: float = Field(0.0, gt=0, description="extinction (beam attenuation) coefficient c = a + b [1/m]")
-    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = Field(
-        0.0,
-        description='single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision',
-    )
-    chlorophyll: float | None = Field(
-        None, ge=0, le=30, description="chlorophyll of the open ocean, in place of coefficients [mg/m³]"
-    )
+    preset: str | None = None
+    """a named water, see `spadwarp presets medium`"""
+    absorption: float = Field(0.0, ge=0)
+    """absorption coefficient a [1/m]"""
+    scattering: float = Field(0.0, ge=0)
+    """scattering coefficient b [1/m]"""
+    extinction: float = Field(0.0, gt=0)
+    """extinction (beam attenuation) coefficient c = a + b [1/m]"""
+    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
+    """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
+    chlorophyll: float | None = Field(None, ge=0, le=30)
+    """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -56,13 +57,10 @@ class Water(Section):
 class Layer(Water):
     """Water from a plane on, up to the next layer; given as a medium is."""
 
-    start: float = Field(..., description="where it begins along `layer_axis`, the world's z if not given [m]")
-    anisotropy: float | None = Field(
-        None,
-        gt=-1,
-        lt=1,
-        description="henyey_greenstein: mean cosine of the scattering angle; default: the medium's",
-    )
+    start: float
+    """where it begins along `layer_axis`, the world's z if not given [m]"""
+    anisotropy: float | None = Field(None, gt=-1, lt=1)
+    """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""
 
     @model_validator(mode="before")
     @classmethod

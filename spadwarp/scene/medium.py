@@ -29,44 +29,36 @@ class Medium(Water):
     `layers` it is the water before the first of them.
     """
 
-    phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = Field(
-        "henyey_greenstein", description="law of the scattering angle"
+    phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = (
+        "henyey_greenstein"
     )
-    anisotropy: float = Field(
-        0.924, gt=-1, lt=1, description="henyey_greenstein: mean cosine g of the scattering angle"
-    )
-    g1: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the first term")
-    g2: float | None = Field(None, gt=-1, lt=1, description="two_term_henyey_greenstein: g of the second term")
-    alpha: float | None = Field(None, ge=0, le=1, description="two_term_henyey_greenstein: weight of the first term")
-    particle_index: float = Field(
-        1.10, gt=1, le=1.35, description="fournier_forand: index n of the particles over that of the water"
-    )
-    junge_slope: float = Field(3.5835, ge=3.05, lt=5, description="fournier_forand: slope µ of the size distribution")
-    phase_table: str | None = Field(
-        None,
-        description="tabulated: the path of a .csv file of angle [°] and value of any scale, or "
-        + " or ".join(f'"{name}"' for name in PHASE_TABLES),
-    )
-    group_index: float = Field(
-        WATER_INDICES["seawater"][1],
-        ge=1,
-        le=3,
-        description='index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566',
-    )
-    phase_index: float = Field(
-        WATER_INDICES["seawater"][0],
-        ge=1,
-        le=3,
-        description='refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350',
-    )
-    temperature: float | None = Field(
-        None, ge=0, le=30, description="gives the indices that are not given, with salinity 35 [°C]"
-    )
-    salinity: float | None = Field(None, ge=0, le=40, description="the same, with temperature 20 [g/kg]")
-    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = Field(
-        (), description="other waters further along `layer_axis`, in its order"
-    )
-    layer_axis: Vector = Field((0.0, 0.0, 1.0), description="direction across the layers, in the world; not 0")
+    """law of the scattering angle"""
+    anisotropy: float = Field(0.924, gt=-1, lt=1)
+    """henyey_greenstein: mean cosine g of the scattering angle"""
+    g1: float | None = Field(None, gt=-1, lt=1)
+    """two_term_henyey_greenstein: g of the first term"""
+    g2: float | None = Field(None, gt=-1, lt=1)
+    """two_term_henyey_greenstein: g of the second term"""
+    alpha: float | None = Field(None, ge=0, le=1)
+    """two_term_henyey_greenstein: weight of the first term"""
+    particle_index: float = Field(1.10, gt=1, le=1.35)
+    """fournier_forand: index n of the particles over that of the water"""
+    junge_slope: float = Field(3.5835, ge=3.05, lt=5)
+    """fournier_forand: slope µ of the size distribution"""
+    phase_table: str | None = None
+    """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
+    group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
+    """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
+    phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
+    """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
+    temperature: float | None = Field(None, ge=0, le=30)
+    """gives the indices that are not given, with salinity 35 [°C]"""
+    salinity: float | None = Field(None, ge=0, le=40)
+    """the same, with temperature 20 [g/kg]"""
+    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
+    """other waters further along `layer_axis`, in its order"""
+    layer_axis: Vector = (0.0, 0.0, 1.0)
+    """direction across the layers, in the world; not 0"""
     _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")

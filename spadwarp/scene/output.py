@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from pydantic import Field
-
 from spadwarp.scene.sections import Section
 
 
@@ -13,10 +11,13 @@ class Output(Section):
     """What a run writes into its directory."""
 
     section: ClassVar[str] = "output"
-    result: bool = Field(True, description="everything, as HDF5")
-    exr: bool = Field(True, description="truth and depth, as EXR")
-    png: bool = Field(True, description="pictures for a first look")
-    pdf: bool = Field(False, description="the same pictures as vectors, for print")
-    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = Field(
-        "centroid", description="how the depth frame is made"
-    )
+    result: bool = True
+    """everything, as HDF5"""
+    exr: bool = True
+    """truth and depth, as EXR"""
+    png: bool = True
+    """pictures for a first look"""
+    pdf: bool = False
+    """the same pictures as vectors, for print"""
+    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = "centroid"
+    """how the depth frame is made"""

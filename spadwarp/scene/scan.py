@@ -14,13 +14,7 @@ class Scan(Section):
     """How the beam moves over the scene."""
 
     section: ClassVar[str] = "scan"
-    mode: Literal["none", "confocal"] = Field(
-        "none", description="confocal: the beam visits the pixels in turn and each sees its own light alone"
-    )
-    distance: float = Field(
-        math.inf,
-        gt=0,
-        le=math.inf,
-        allow_inf_nan=True,
-        description="range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel",
-    )
+    mode: Literal["none", "confocal"] = "none"
+    """confocal: the beam visits the pixels in turn and each sees its own light alone"""
+    distance: float = Field(math.inf, gt=0, le=math.inf, allow_inf_nan=True)
+    """range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel"""

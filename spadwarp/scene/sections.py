@@ -48,7 +48,14 @@ Scale = Annotated[tuple[float, float, float], BeforeValidator(_three)]
 class Section(BaseModel):
     """One table of a scene: frozen, strict about types, unknown keys refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, protected_namespaces=())
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        protected_namespaces=(),
+        use_attribute_docstrings=True,
+    )
     section: ClassVar[str] = ""
 
     @model_validator(mode="before")

@@ -13,30 +13,30 @@ class Target(Section):
     """One mesh: sized and scaled, then rotated, then moved."""
 
     section: ClassVar[str] = "targets"
-    builtin: str | None = Field(None, min_length=1, description='a mesh that comes with spadwarp, such as "staircase"')
-    mesh: str | None = Field(None, description="path of a mesh file, relative to the scene file")
-    size: Size | None = Field(
-        None, description="extent of plane, box, sphere; one number, two for x and y, or three [m]"
-    )
-    subdivisions: Whole = Field(0, ge=0, le=12, description="times that every face is split into four")
-    scale: Scale = Field((1.0, 1.0, 1.0), description="factor, one or three; mesh units to metres")
-    rotation_deg: Vector = Field(
-        (0.0, 0.0, 0.0), description="turns about the target's own x, then the turned y, then z [°]"
-    )
-    translation: Vector = Field(
-        (0.0, 0.0, 0.0), description="shift in the world [m], the camera's frame if it has no pose"
-    )
-    reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = Field(
-        0.5, description='Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file'
-    )
-    reflectance_scale: float = Field(1.0, gt=0, description='factor on the reflectance "from_file"')
-    colour_encoding: Literal["srgb", "linear"] = Field(
-        "srgb", description='how the file\'s colours and images stand for reflectance; "linear" is proportional'
-    )
-    specular: float = Field(
-        0.0, ge=0, le=1, description="reflectance of the facets of a rough specular lobe; 0 is none"
-    )
-    roughness: float = Field(0.2, ge=0.01, le=1, description="width of that lobe: GGX parameter α")
+    builtin: str | None = Field(None, min_length=1)
+    """a built-in mesh, such as "staircase"; see `spadwarp targets`"""
+    mesh: str | None = None
+    """path of a mesh file, relative to the scene file"""
+    size: Size | None = None
+    """extent of plane, box, sphere; one number, two for x and y, or three [m]"""
+    subdivisions: Whole = Field(0, ge=0, le=12)
+    """times that every face is split into four"""
+    scale: Scale = (1.0, 1.0, 1.0)
+    """factor, one or three; mesh units to metres"""
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+    """rotations about the target's own x, then its new y, then its new z [°]"""
+    translation: Vector = (0.0, 0.0, 0.0)
+    """shift in the world [m], the camera's frame if it has no pose"""
+    reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = 0.5
+    """Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file"""
+    reflectance_scale: float = Field(1.0, gt=0)
+    """factor on a reflectance that is "from_file", the file's"""
+    colour_encoding: Literal["srgb", "linear"] = "srgb"
+    """how the file's colours and images stand for reflectance; "linear" is proportional"""
+    specular: float = Field(0.0, ge=0, le=1)
+    """reflectance of the facets of a rough specular lobe; 0 is none"""
+    roughness: float = Field(0.2, ge=0.01, le=1)
+    """width of that lobe: GGX parameter α"""
 
     @model_validator(mode="after")
     def _one_mesh(self) -> Self:

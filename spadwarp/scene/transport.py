@@ -14,23 +14,21 @@ class Transport(Section):
     """How photons are traced."""
 
     section: ClassVar[str] = "transport"
-    photons: Whole = Field(1_000_000, ge=1, le=10**12, description="photons to emit")
-    seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of the random numbers; one seed gives the same bits")
-    estimator: Literal["analog", "next_event", "guided"] = Field(
-        "guided", description="what scores: the photon itself, every event, or guided flights"
-    )
-    termination: Literal["cutoff", "roulette"] = Field(
-        "cutoff", description="drop light photons (biased), or Russian roulette"
-    )
-    weight_cutoff: float = Field(2e-4, ge=0, lt=1, description="analog weight below which a photon ends; 0 is never")
-    max_collisions: Whole = Field(64, ge=1, le=2**31 - 1, description="events of one photon, surfaces included")
-    max_path: float | None = Field(None, gt=0, description="longest geometric path [m]; the gate's end if not given")
-    lateral_limit: float = Field(
-        math.inf,
-        gt=0,
-        allow_inf_nan=True,
-        description="photons end where |x| or |y| in the camera frame reaches this [m]; inf is no limit",
-    )
-    axis_threshold: float = Field(
-        0.9998, gt=0, le=1, description="|u_z| from which the near-axis rule acts; 1 turns it off (exact)"
-    )
+    photons: Whole = Field(1_000_000, ge=1, le=10**12)
+    """photons to emit"""
+    seed: Whole = Field(0, ge=0, le=2**64 - 1)
+    """key of the random numbers; one seed gives the same bits"""
+    estimator: Literal["analog", "next_event", "guided"] = "guided"
+    """what scores: the photon itself, every event, or guided flights"""
+    termination: Literal["cutoff", "roulette"] = "cutoff"
+    """drop light photons (biased), or Russian roulette"""
+    weight_cutoff: float = Field(2e-4, ge=0, lt=1)
+    """analog weight below which a photon ends; 0 is never"""
+    max_collisions: Whole = Field(64, ge=1, le=2**31 - 1)
+    """events of one photon, surfaces included"""
+    max_path: float | None = Field(None, gt=0)
+    """longest geometric path [m]; the gate's end if not given"""
+    lateral_limit: float = Field(math.inf, gt=0, allow_inf_nan=True)
+    """photons end where |x| or |y| in the camera frame reaches this [m]; inf is no limit"""
+    axis_threshold: float = Field(0.9998, gt=0, le=1)
+    """|u_z| from which the near-axis rule acts; 1 turns it off (exact)"""
