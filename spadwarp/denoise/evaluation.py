@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -135,85 +135,121 @@ def evaluate(
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
-    plan = _plan(data, models, split, frames, bm3d_frames, crop, weights)
-    windows = _best_windows(plan) if "median" in plan.methods else {}
-    tables = _Tables()
-    done, total = 0, sum(map(len, plan.chosen.values()))
-    for (target, level), indices in plan.chosen.items():
+    comparison = _Comparison(data, models, split, frames, bm3d_frames, crop, weights, device)
+    done, total = 0, sum(map(len, comparison.chosen.values()))
+    for (target, level), indices in comparison.chosen.items():
         for index in indices:
-            _score_frame(plan, tables, index, target, level, windows.get(level, 5), device)
+            comparison.score_frame(index, target, level)
             done += 1
             if progress is not None:
                 progress("frames", done, total)
-    if not tables.scores:
-        raise FileError(f"{data}: no frame of {split} sees a target")
-    return Evaluation(
-        data=f"{plan.reader.manifest['name']} ({data})",
-        summary=plan.summary,
-        methods=plan.methods,
-        targets=tuple(dict.fromkeys(target for target, _ in tables.frames)),
-        levels=tuple(sorted(dict.fromkeys(level for _, level in tables.frames), key=_level_order)),
-        scores={key: Scores.mean(values) for key, values in tables.scores.items()},
-        frames=tables.frames,
-        windows=windows,
-        steps={key: steps for key, steps in tables.steps.items() if steps.total},
-        samples=tables.samples,
-    )
+    return comparison.collect()
 
 
-# Plan
+class _Comparison:
+    """Which frames are scored by which methods, and their scores, with the keys of `Evaluation`."""
 
+    def __init__(
+        self,
+        data: str | os.PathLike[str],
+        models: Sequence[str],
+        split: str,
+        frames: int,
+        bm3d_frames: int,
+        crop: tuple[int, int] | None,
+        weights: str | os.PathLike[str] | None,
+        device: str | None,
+    ) -> None:
+        wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
+        if unknown := [name for name in models if name not in METHODS]:
+            raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+        if "histograms" in wanted:
+            raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
+        if frames < 1:
+            raise ArgumentError(f"frames = {frames} is outside [1, inf)")
+        self.data, self.split, self.device, self.methods = data, split, device, ("input", *wanted)
+        self.weights = own_weights(wanted, None if weights is None else Path(weights))
+        self.chosen, self.photons, self.summary = _choose(data, split, frames)
+        self.reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
+        self.bm3d_frames = math.ceil(bm3d_frames / len({target for target, _ in self.chosen}))  # of a target and level
+        rows, columns = self.reader.shape
+        width, height = crop or (columns, rows)
+        if not (8 <= width <= columns and 8 <= height <= rows):
+            raise ArgumentError(f"crop = ({width}, {height}) is outside (8, 8) to ({columns}, {rows})")
+        top, left = (rows - height) // 2, (columns - width) // 2
+        self.part = slice(top, top + height), slice(left, left + width)
+        if crop is not None:
+            self.summary += f"; the middle {width} x {height} pixels of each frame"
+        self.summary += "".join(f"; {name} with weights {path}" for name, path in self.weights.items())
+        self.scores: dict[tuple[str, str, str], list[Scores]] = {}
+        self.steps: dict[tuple[str, str], Steps] = {}
+        self.frames: dict[tuple[str, str], int] = {}
+        self.samples: dict[tuple[str, str], Sample] = {}
+        self.windows = self._best_windows() if "median" in wanted else {}
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Plan:
-    """What is evaluated: the methods, the frames by (target, level), and which part of each frame."""
+    def _frame(self, index: int) -> tuple[dict[str, Any], DepthFrames, NDArray[np.float32], NDArray[np.bool_] | None]:
+        """The item, its noisy frame, true depth where its light is within the gate, and which pixels see the target."""
+        item = self.reader[index]
+        noisy, prior, bound, clean = (item[name][0][self.part] for name in ("noisy", "prior", "bound", "clean"))
+        gate = (float(item["gate"][0]), float(item["gate"][1]))  # in range; only light within it has a bound
+        clean = np.where(np.isfinite(bound), clean, np.float32(np.nan))
+        seen = np.isfinite(clean) & (clean >= gate[0]) & (clean < gate[1])
+        return item, depth_frames(noisy, gate=gate, density=prior), clean, seen if seen.mean() > 0.01 else None
 
-    methods: tuple[str, ...]
-    weights: dict[str, Path]
-    reader: FrameReader
-    chosen: dict[tuple[str, str], list[int]]
-    photons: NDArray[np.float64]  # signal photons of every scene
-    bm3d_quota: int  # frames of each target and level
-    part: tuple[slice, slice]
-    summary: str
+    def _best_windows(self) -> dict[str, int]:
+        """The window of the highest mean PSNR at each level."""
+        quality: dict[tuple[str, int], list[float]] = {}
+        for (_, level), indices in self.chosen.items():
+            for index in indices:
+                _, frames, clean, seen = self._frame(index)
+                for window in MEDIAN_WINDOWS if seen is not None else ():
+                    found, _ = denoise_frames(frames, model="median", window=window)
+                    square = float(np.mean((found[0] - clean)[seen] ** 2))
+                    quality.setdefault((level, window), []).append(-math.log10(max(square, 1e-12)))
+        levels = dict.fromkeys(level for level, _ in quality)
+        return {level: max(MEDIAN_WINDOWS, key=lambda window: np.mean(quality[level, window])) for level in levels}
 
+    def score_frame(self, index: int, target: str, level: str) -> None:
+        """Scores a frame by every method; a frame in which less than 1 % of the pixels see a target is left out."""
+        item, noisy, clean, seen = self._frame(index)
+        if seen is None:
+            return
+        count = self.frames[target, level] = self.frames.get((target, level), 0) + 1
+        images: dict[str, NDArray[np.float32]] = {}
+        for method in self.methods:
+            if method == "bm3d" and count > self.bm3d_frames:
+                continue
+            window, weights = self.windows.get(level, 5), self.weights.get(method)
+            found, _ = denoise_frames(noisy, model=method, window=window, weights=weights, device=self.device)
+            images[method] = found[0]
+            self.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
+            if target == _STAIRCASE:
+                steps = self.steps.get((method, level), Steps())
+                self.steps[method, level] = steps + staircase_steps(clean, found[0])
+        if count == 1:
+            caption = (
+                f"{target}, {level if 'photons' in level else f'backscatter fraction {level}'}; "
+                f"{self.photons[int(item['scene'])]:.3g} signal photons, {float(item['attenuation_lengths']):.2g} "
+                f"attenuation lengths one way, sample {int(item['sample'])}"
+            )
+            self.samples[target, level] = Sample(clean, noisy.gate, {**images, "input": noisy.depth[0]}, caption)
 
-def _plan(
-    data: str | os.PathLike[str],
-    models: Sequence[str],
-    split: str,
-    frames: int,
-    bm3d_frames: int,
-    crop: tuple[int, int] | None,
-    weights: str | os.PathLike[str] | None,
-) -> _Plan:
-    wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + (["bm3d"] if bm3d_frames > 0 else [])
-    if unknown := [name for name in models if name not in METHODS]:
-        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
-    if "histograms" in wanted:
-        raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
-    if frames < 1:
-        raise ArgumentError(f"frames = {frames} is outside [1, inf)")
-    own = own_weights(wanted, None if weights is None else Path(weights))
-    chosen, photons, summary = _choose(data, split, frames)
-    reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
-    rows, columns = reader.shape
-    width, height = crop or (columns, rows)
-    if not (8 <= width <= columns and 8 <= height <= rows):
-        raise ArgumentError(f"crop = ({width}, {height}) is outside (8, 8) to ({columns}, {rows})")
-    top, left = (rows - height) // 2, (columns - width) // 2
-    if crop is not None:
-        summary += f"; the middle {width} x {height} pixels of each frame"
-    return _Plan(
-        methods=("input", *wanted),
-        weights=own,
-        reader=reader,
-        chosen=chosen,
-        photons=photons,
-        bm3d_quota=math.ceil(bm3d_frames / len({target for target, _ in chosen})),
-        part=(slice(top, top + height), slice(left, left + width)),
-        summary=summary + "".join(f"; {name} with weights {path}" for name, path in own.items()),
-    )
+    def collect(self) -> Evaluation:
+        """Means over the frames."""
+        if not self.scores:
+            raise FileError(f"{self.data}: no frame of {self.split} sees a target")
+        return Evaluation(
+            data=f"{self.reader.manifest['name']} ({self.data})",
+            summary=self.summary,
+            methods=self.methods,
+            targets=tuple(dict.fromkeys(target for target, _ in self.frames)),
+            levels=tuple(sorted(dict.fromkeys(level for _, level in self.frames), key=_level_order)),
+            scores={key: Scores.mean(values) for key, values in self.scores.items()},
+            frames=self.frames,
+            windows=self.windows,
+            steps={key: steps for key, steps in self.steps.items() if steps.total},
+            samples=self.samples,
+        )
 
 
 def _choose(
@@ -256,71 +292,3 @@ def _photon_level(photons: float) -> str:
 
 def _level_order(level: str) -> float:
     return float(level.removeprefix("over ").split()[0])
-
-
-# Execute
-
-
-@dataclass(frozen=True, eq=False)
-class _Tables:
-    """What the frames add up to, with the keys of `Evaluation`."""
-
-    scores: dict[tuple[str, str, str], list[Scores]] = field(default_factory=dict)
-    steps: dict[tuple[str, str], Steps] = field(default_factory=dict)
-    frames: dict[tuple[str, str], int] = field(default_factory=dict)
-    samples: dict[tuple[str, str], Sample] = field(default_factory=dict)
-
-
-def _frame(plan: _Plan, index: int) -> tuple[dict[str, Any], DepthFrames, NDArray[np.float32], NDArray[np.bool_]]:
-    """The item, its noisy frame, true depth where its light is within the gate, and which pixels see the target."""
-    item = plan.reader[index]
-    noisy, prior, bound, clean = (item[name][0][plan.part] for name in ("noisy", "prior", "bound", "clean"))
-    gate = (float(item["gate"][0]), float(item["gate"][1]))  # in range; light within it has a bound
-    clean = np.where(np.isfinite(bound), clean, np.float32(np.nan))
-    seen = np.isfinite(clean) & (clean >= gate[0]) & (clean < gate[1])
-    return item, depth_frames(noisy, gate=gate, density=prior), clean, seen
-
-
-def _has_target(seen: NDArray[np.bool_]) -> bool:
-    return bool(seen.mean() > 0.01)
-
-
-def _best_windows(plan: _Plan) -> dict[str, int]:
-    """The window of the highest mean PSNR at each level."""
-    quality: dict[tuple[str, int], list[float]] = {}
-    for (_, level), indices in plan.chosen.items():
-        for index in indices:
-            _, frames, clean, seen = _frame(plan, index)
-            for window in MEDIAN_WINDOWS if _has_target(seen) else ():
-                found, _ = denoise_frames(frames, model="median", window=window)
-                square = float(np.mean((found[0] - clean)[seen] ** 2))
-                quality.setdefault((level, window), []).append(-math.log10(max(square, 1e-12)))
-    levels = dict.fromkeys(level for level, _ in quality)
-    return {level: max(MEDIAN_WINDOWS, key=lambda window: np.mean(quality[level, window])) for level in levels}
-
-
-def _score_frame(
-    plan: _Plan, tables: _Tables, index: int, target: str, level: str, window: int, device: str | None
-) -> None:
-    """Adds one frame to the tables, by every method; a frame without a target is left out."""
-    item, noisy, clean, seen = _frame(plan, index)
-    if not _has_target(seen):
-        return
-    count = tables.frames[target, level] = tables.frames.get((target, level), 0) + 1
-    images: dict[str, NDArray[np.float32]] = {}
-    for method in plan.methods:
-        if method == "bm3d" and count > plan.bm3d_quota:
-            continue
-        found, _ = denoise_frames(noisy, model=method, window=window, weights=plan.weights.get(method), device=device)
-        images[method] = found[0]
-        tables.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
-        if target == _STAIRCASE:
-            steps = tables.steps.get((method, level), Steps())
-            tables.steps[method, level] = steps + staircase_steps(clean, found[0])
-    if count == 1:
-        caption = (
-            f"{target}, {level if 'photons' in level else f'backscatter fraction {level}'}; "
-            f"{plan.photons[int(item['scene'])]:.3g} signal photons, {float(item['attenuation_lengths']):.2g} "
-            f"attenuation lengths one way, sample {int(item['sample'])}"
-        )
-        tables.samples[target, level] = Sample(clean, noisy.gate, {**images, "input": noisy.depth[0]}, caption)

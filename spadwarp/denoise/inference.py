@@ -169,11 +169,9 @@ def features_of_histograms(
     levels, taps = (np.array(given, np.float32) for given in (background, response))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
-    shapes = cubes.shape[-1:], cubes.shape[-3:]
-    if levels.shape not in shapes or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ArgumentError(
-            f"background has shape {levels.shape}; {shapes[0]} or {shapes[1]} is needed, of numbers >= 0"
-        )
+    one, each = cubes.shape[-1:], cubes.shape[-3:]
+    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
+        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
     place = torch_device(device)
@@ -204,6 +202,8 @@ def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str,
 def load_network(model: str, weights: str | Path | None = None, device: str = "cpu") -> Any:
     """A network with its weights, ready to run."""
     torch = require_torch()
+    from safetensors.torch import load_file
+
     from spadwarp.denoise.networks import build_network
 
     path = _weights_path(model, weights)
@@ -211,14 +211,9 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
     if named != model:
         raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
     try:
-        from safetensors.torch import load_file
-
         network: Any = build_network(model)
-        network.load_state_dict(
-            {name: value.float() if value.is_floating_point() else value for name, value in load_file(path).items()}
-        )
-    except ImportError:
-        raise
+        values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
+        network.load_state_dict(values)
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
     network = network.to(torch.device(device)).to(memory_format=torch.channels_last)
@@ -235,9 +230,7 @@ def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, 
     if model not in MODELS:
         raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
     if model not in models:
-        raise ArgumentError(
-            f"weights = {str(weights)!r} are of {model!r}, which is not among models: {', '.join(models)}"
-        )
+        raise ArgumentError(f"weights = '{weights}' are of {model!r}, which is not among models: {', '.join(models)}")
     return {model: Path(weights)}
 
 
@@ -275,12 +268,12 @@ def _weights_path(model: str, weights: str | Path | None) -> Path:
 
 
 def _header(path: Path) -> dict[str, str]:
-    """Metadata in the header of a safetensors file: 8 bytes of length, then JSON."""
+    """Metadata in the header of a safetensors file."""
+    require_torch()
+    from safetensors import SafetensorError, safe_open
+
     try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            if length > 1 << 26:
-                raise ValueError("its header is too long")
-            return dict(json.loads(file.read(length)).get("__metadata__", {}))
-    except (OSError, ValueError) as error:
+        with safe_open(path, framework="np") as file:
+            return dict(file.metadata() or {})
+    except (OSError, SafetensorError) as error:
         raise FileError(f"{path}: not a safetensors file: {error}") from error

@@ -293,21 +293,12 @@ def reads_histograms(network: nn.Module) -> bool:
 
 def multiply_adds(network: nn.Module, height: int, width: int) -> int:
     """Multiplications of all convolutions for one frame of `height` × `width`; other operations cost little."""
-    total = 0
+    from torch.utils.flop_counter import FlopCounterMode
 
-    def count(layer: nn.Module, _: object, output: Tensor) -> None:
-        nonlocal total
-        assert isinstance(layer, nn.Conv2d)
-        total += layer.weight[0].numel() * output[0].numel()
-
-    hooks = [layer.register_forward_hook(count) for layer in network.modules() if isinstance(layer, nn.Conv2d)]
+    channels = 3 + FEATURES * reads_histograms(network)
+    frame = torch.zeros(1, channels, height, width, device=next(network.parameters()).device)
     mode = network.training
-    try:
-        with torch.inference_mode():
-            channels = 3 + FEATURES * reads_histograms(network)
-            network.eval()(torch.zeros(1, channels, height, width, device=next(network.parameters()).device))
-    finally:
-        network.train(mode)
-        for hook in hooks:
-            hook.remove()
-    return total
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network.eval()(frame)
+    network.train(mode)
+    return counter.get_total_flops() // 2

@@ -17,40 +17,25 @@ from numpy.typing import NDArray
 
 from spadwarp.io.atomic import atomic_path
 
-__all__ = [
-    "COLOURS",
-    "SCORES",
-    "TITLES",
-    "draw_denoised",
-    "draw_photon_sweep",
-    "draw_ranking",
-    "draw_samples",
-    "draw_scores",
-]
+__all__ = ["COLOURS", "SCORES", "TITLES", "draw_denoised", "draw_photon_sweep", "draw_ranking", "draw_samples"]
+__all__ += ["draw_scores"]
 
-TITLES = {
-    "input": "noisy input",
-    "median": "median, best window",
-    "gating": "backscatter gating",
-    "bm3d": "BM3D",
-    "usdn": "USDN",
-    "dncnn": "DnCNN",
-    "pyramid": "PyramidNet",
-    "histograms": "PyramidNet, histograms",
+_METHODS = {
+    "input": ("noisy input", "0.55"),
+    "median": ("median, best window", "#E69F00"),
+    "gating": ("backscatter gating", "#56B4E9"),
+    "bm3d": ("BM3D", "#CC79A7"),
+    "usdn": ("USDN", "#009E73"),
+    "dncnn": ("DnCNN", "#D55E00"),
+    "pyramid": ("PyramidNet", "#0072B2"),
+    "histograms": ("PyramidNet, histograms", "black"),
 }
+
+TITLES = {method: title for method, (title, _) in _METHODS.items()}
 """Names of methods in tables and figures."""
 
-COLOURS = {
-    "input": "0.55",
-    "median": "#E69F00",
-    "gating": "#56B4E9",
-    "bm3d": "#CC79A7",
-    "usdn": "#009E73",
-    "dncnn": "#D55E00",
-    "pyramid": "#0072B2",
-    "histograms": "black",
-}
-"""Colours of methods."""
+COLOURS = {method: colour for method, (_, colour) in _METHODS.items()}
+"""Colours of methods in figures."""
 
 SCORES = {
     "psnr": ("PSNR [dB]", "{:.2f}"),
@@ -228,13 +213,8 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _line(method: str, bold: bool) -> dict[str, Any]:
-    return {
-        "color": COLOURS[method],
-        "marker": "o",
-        "markersize": 3.5,
-        "linewidth": 2.2 if bold else 1.2,
-        "linestyle": "--" if method == "input" else "-",
-    }
+    line = {"linewidth": 2.2 if bold else 1.2, "linestyle": "--" if method == "input" else "-"}
+    return {"color": COLOURS[method], "marker": "o", "markersize": 3.5, **line}
 
 
 def _plain_axis(axis: Any, *, grid: str = "major") -> None:

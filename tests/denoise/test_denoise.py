@@ -13,21 +13,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 from skimage.metrics import structural_similarity
 from typer.testing import CliRunner
 
 import spadwarp
 from helpers.stepped_frames import GATE, noisy_frame, scene
-from spadwarp import ConfigError, FileError
+from spadwarp import ArgumentError, ConfigError, FileError
 from spadwarp.cli import app
-from spadwarp.denoise import baselines, inference, metrics
-from spadwarp.denoise import files as depth_files
-from spadwarp.denoise import photon_counts as photons
+from spadwarp.dataset.sampling import Plan
+from spadwarp.denoise import baselines, files, inference, metrics, photon_counts, training
 from spadwarp.denoise.frames import depth_frames, fill_missing
+from spadwarp.denoise.recipe import load_training_recipe
+from spadwarp.denoise.training_run import read_scenes
 from spadwarp.frames import record_frames
 from spadwarp.io.exr import write_exr
 
-torch.set_num_threads(1)
+
+def invoke(*arguments, code=0):
+    """Runs a command; its output."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
 
 
 # Baselines
@@ -73,26 +84,26 @@ def test_scores_are_those_of_their_definitions():
     clean[:, 16:] = 14.5
     estimate = clean.copy()
     estimate[::2] += 0.02
-    one = metrics.score(clean, estimate, gate=GATE)
-    assert one.rmse_mm == pytest.approx(20.0 / np.sqrt(2), rel=1e-4)
-    assert one.within_1cm == 0.5 and one.within_5cm == 1.0
-    assert one.edge_mm == pytest.approx(10.0, rel=1e-3)
+    found = metrics.score(clean, estimate, gate=GATE)
+    assert found.rmse_mm == pytest.approx(20.0 / np.sqrt(2), rel=1e-4)
+    assert found.within_1cm == 0.5 and found.within_5cm == 1.0
+    assert found.edge_mm == pytest.approx(10.0, rel=1e-3)
     step = 255 * 0.02 / 2.5  # 2 of 255
-    assert one.psnr == pytest.approx(10 * np.log10(255**2 / (0.5 * round(step) ** 2)), abs=1e-6)
+    assert found.psnr == pytest.approx(10 * np.log10(255**2 / (0.5 * round(step) ** 2)), abs=1e-6)
 
     def eight(image):
         return np.round((image - 13.5) / 2.5 * 255).astype(np.uint8)
 
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "win_size": 11}
     _, full = structural_similarity(eight(clean), eight(estimate), full=True, **options)
-    assert one.ssim == pytest.approx(full.mean(), abs=1e-9)
+    assert found.ssim == pytest.approx(full.mean(), abs=1e-9)
 
 
 def test_pixels_without_a_target_do_not_count():
     clean = scene()
     estimate = np.nan_to_num(clean, nan=13.5)
-    one = metrics.score(clean, estimate, gate=GATE)
-    assert one.rmse_mm == 0.0 and one.psnr == 100.0 and one.ssim == pytest.approx(1.0)
+    found = metrics.score(clean, estimate, gate=GATE)
+    assert found.rmse_mm == 0.0 and found.psnr == 100.0 and found.ssim == pytest.approx(1.0)
     with pytest.raises(ValueError, match="no pixel sees a target"):
         metrics.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
 
@@ -108,33 +119,34 @@ def test_steps_of_a_staircase():
 
 
 def test_files_of_every_kind(tmp_path):
-    clean = np.nan_to_num(scene(), nan=15.0)
-    noisy = noisy_frame(clean)
-    folder = tmp_path / "in"
+    noisy = noisy_frame(np.nan_to_num(scene(), nan=15.0))
+    folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     np.save(folder / "one.npy", noisy)
     write_exr(folder / "engine.exr", {"A": np.ascontiguousarray(100.0 * noisy)})
+    savemat(folder / "matlab.mat", {"depth": noisy, "name": "a text", "scalar": 3.0})
+    common = ["--model", "median", "--gate", 13.5, 16, "--out", out]
+    invoke("denoise", folder / "engine.exr", "--scale", 0.01, *common)
+    invoke("denoise", folder / "matlab.mat", *common, "--overwrite")
+    invoke("denoise", folder / "one.npy", "--json", tmp_path / "one.json", *common, "--overwrite")
+    found = np.load(out / "one.npy")
+    for name in ("engine", "matlab"):
+        assert np.nanmax(np.abs(np.load(out / f"{name}.npy") - found)) < 1e-4
+    assert (out / "one.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "one.json").read_text())["files"][0]["gate"] == [13.5, 16.0]
 
-    def run(name, *options):
-        common = ["--gate", "13.5", "16", "--model", "median", "--out", str(tmp_path / name)]
-        result = CliRunner().invoke(app, ["denoise", *options, *common])
-        assert result.exit_code == 0, result.output
 
-    run("a", str(folder / "engine.exr"), "--scale", "0.01")
-    run("b", str(folder / "one.npy"), "--json", str(tmp_path / "b.json"))
-    first, second = np.load(tmp_path / "a" / "engine.npy"), np.load(tmp_path / "b" / "one.npy")
-    assert np.nanmax(np.abs(first - second)) < 1e-4
-    assert (tmp_path / "b" / "one.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "b.json").read_text())["files"][0]["gate"] == [13.5, 16.0]
-    folder_of_both = CliRunner().invoke(
-        app, ["denoise", str(folder), "--model", "median", "--out", str(tmp_path / "c")]
-    )
-    assert folder_of_both.exit_code == 0, folder_of_both.output
-    assert {one.name for one in (tmp_path / "c").glob("*.npy")} == {"engine.npy", "one.npy"}
+def test_a_folder_is_denoised_file_by_file(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in ("first", "second"):
+        np.save(folder / f"{name}.npy", noisy_frame(scene()))
+    invoke("denoise", folder, "--model", "median", "--out", tmp_path / "both")
     (folder / "bad.npy").write_bytes(b"junk")
-    rest = CliRunner().invoke(app, ["denoise", str(folder), "--model", "median", "--out", str(tmp_path / "d")])
-    assert rest.exit_code == 1 and "1 of 3 files could not be denoised" in rest.output
-    assert {one.name for one in (tmp_path / "d").glob("*.npy")} == {"engine.npy", "one.npy"}
+    output = invoke("denoise", folder, "--model", "median", "--out", tmp_path / "rest", code=1)
+    assert "1 of 3 files could not be denoised" in output
+    for out in ("both", "rest"):
+        assert {path.stem for path in (tmp_path / out).glob("*.npy")} == {"first", "second"}
 
 
 def test_histograms_become_depth_first(tmp_path):
@@ -146,40 +158,39 @@ def test_histograms_become_depth_first(tmp_path):
     edges = np.arange(257) * width + 10e-9
     counts = np.apply_along_axis(lambda one: np.histogram(one, edges)[0], -1, arrivals)
     np.save(tmp_path / "counts.npy", counts.astype(np.uint16))
-    found = depth_files.denoise_file(
-        tmp_path / "counts.npy",
-        tmp_path / "out",
-        model="median",
-        bin_width_ps=100.0,
-        gate_start_ns=10.0,
-        group_index=index,
-    )
+    options = {"bin_width_ps": 100.0, "gate_start_ns": 10.0, "group_index": index}
+    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", model="median", **options)
     assert abs(np.median(found.depth) - 2.0) < 0.005
     assert found.gate == pytest.approx((299_792_458 / index / 2 * 10e-9, 299_792_458 / index / 2 * 35.6e-9))
-    with pytest.raises(ValueError, match="another is needed"):
-        depth_files.denoise_file(tmp_path / "counts.npy", tmp_path)
-    with pytest.raises(ValueError, match="bin width is missing"):
-        depth_files.read_depth(tmp_path / "counts.npy", group_index=index)
+    with pytest.raises(ArgumentError, match="another is needed"):
+        files.denoise_file(tmp_path / "counts.npy", tmp_path)
+    with pytest.raises(ArgumentError, match="bin width is missing"):
+        files.read_depth(tmp_path / "counts.npy", group_index=index)
 
 
 def test_what_cannot_be_read(tmp_path):
-    with pytest.raises(FileError, match="no such file"):
-        depth_files.read_depth(tmp_path / "none.npy")
-    (tmp_path / "bad.npy").write_bytes(b"junk")
-    with pytest.raises(FileError, match="damaged"):
-        depth_files.read_depth(tmp_path / "bad.npy")
-    np.save(tmp_path / "complex.npy", np.full((16, 16), 15.0 + 1.0j))
-    with pytest.raises(FileError, match=r"complex128 \(16, 16\); depth is real numbers"):
-        depth_files.read_depth(tmp_path / "complex.npy")
-    np.save(tmp_path / "marked.npy", np.where(np.eye(16) > 0, -1.0, 15.0))
-    marked = depth_files.read_depth(tmp_path / "marked.npy")
-    assert "16 values below 0" in marked.source and np.isnan(marked.depth).sum() == 16
-    (tmp_path / "text.txt").write_text("1")
-    with pytest.raises(FileError, match=r"'.txt' is not one of"):
-        depth_files.read_depth(tmp_path / "text.txt")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.npy").write_bytes(b"junk")
+    (tmp_path / "text.txt").write_text("1")
+    np.save(tmp_path / "complex.npy", np.full((16, 16), 15.0 + 1.0j))
+    savemat(tmp_path / "scalar.mat", {"scalar": 3.0})
+    for name, message in (
+        ("none.npy", "no such file"),
+        ("bad.npy", "damaged"),
+        ("complex.npy", r"complex128 \(16, 16\); depth is real numbers"),
+        ("text.txt", r"'.txt' is not one of"),
+        ("scalar.mat", r"no array of 2 or 3 or 4 dimensions; it holds scalar \(1, 1\)"),
+    ):
+        with pytest.raises(FileError, match=message):
+            files.read_depth(tmp_path / name)
     with pytest.raises(FileError, match="no file that ends in"):
-        depth_files.depth_files(tmp_path / "empty")
+        files.depth_files(tmp_path / "empty")
+
+
+def test_depths_below_zero_count_as_not_reported(tmp_path):
+    np.save(tmp_path / "marked.npy", np.where(np.eye(16) > 0, -1.0, 15.0))
+    marked = files.read_depth(tmp_path / "marked.npy")
+    assert "16 values below 0" in marked.source and np.isnan(marked.depth).sum() == 16
 
 
 # Evaluation on a dataset
@@ -219,10 +230,7 @@ def test_evaluation_and_report(dataset, tmp_path):
     middle = spadwarp.denoise.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
     assert "the middle 32 x 24 pixels" in middle.summary
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
-    result = CliRunner().invoke(
-        app, ["evaluate", str(dataset), "--models", "median", "--frames", "1", "--report", str(tmp_path)]
-    )
-    assert result.exit_code == 0, result.output
+    invoke("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5 and "http" not in page
     assert re.search(r"[+-]\d+\.\d\d\u00a0dB, [+-]\d+\u00a0%", page)
@@ -230,47 +238,49 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert {row["method"] for row in scores["scores"]} == {"input", "median"}
 
 
-def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
-    with pytest.raises(ValueError, match="'unet' is not one of"):
-        spadwarp.denoise.evaluate(dataset, models=("unet",))
-    with pytest.raises(ValueError, match="'histograms' needs histograms, which datasets do not keep"):
-        spadwarp.denoise.evaluate(dataset, models=("histograms",))
-    with pytest.raises(ValueError, match=r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"):
-        spadwarp.denoise.evaluate(dataset, models=("median",), crop=(65, 48))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"models": ("unet",)}, "'unet' is not one of"),
+        ({"models": ("histograms",)}, "'histograms' needs histograms, which datasets do not keep"),
+        ({"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
+        ({"models": ("dncnn",), "weights": inference.WEIGHTS / "usdn.safetensors"}, "not among models: dncnn"),
+    ],
+)
+def test_evaluation_refuses_what_it_cannot_do(dataset, options, message):
+    with pytest.raises(ArgumentError, match=message):
+        spadwarp.denoise.evaluate(dataset, **options)
+
+
+def test_evaluation_needs_a_dataset(tmp_path):
     with pytest.raises(FileError, match="no dataset there"):
         spadwarp.denoise.evaluate(tmp_path)
 
 
 def test_training_from_a_dataset(dataset, tmp_path):
-    recipe = tmp_path / "recipe.toml"
+    recipe, run, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
     recipe.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
-    result = CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "run"), "--device", "cpu"])
-    assert result.exit_code == 0, result.output
-    assert {one.name for one in (tmp_path / "run").iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
-    assert inference.weights_metadata("usdn", tmp_path / "run" / "usdn.safetensors")["seed"] == "0"
-    own = tmp_path / "run" / "usdn.safetensors"
-    trained = spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
-    shipped = spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, device="cpu")
+    invoke("train", recipe, "--out", run, "--device", "cpu")
+    assert names(run) >= {"usdn.safetensors", "log.jsonl", "curves.png"}
+    assert inference.weights_metadata("usdn", own)["seed"] == "0"
+    trained, shipped = (
+        spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=weights, device="cpu")
+        for weights in (own, None)
+    )
     assert trained.mean("usdn").psnr < shipped.mean("usdn").psnr  # two steps against a whole training
     assert trained.mean("input") == shipped.mean("input") and str(own) in trained.summary
-    with pytest.raises(ValueError, match="'usdn', which is not among models: dncnn"):
-        spadwarp.denoise.evaluate(dataset, models=("dncnn",), weights=own)
     recipe.write_text('model = "usdn"\n')
-    assert CliRunner().invoke(app, ["train", str(recipe), "--out", str(tmp_path / "other")]).exit_code == 2
+    invoke("train", recipe, "--out", tmp_path / "other", code=2)
     with pytest.raises(ConfigError, match="data"):
         spadwarp.denoise.train(recipe, tmp_path / "other")
 
 
-def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, monkeypatch):
+def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, monkeypatch):
     """torchrun, stopped in the middle and started again, against one process that takes both halves of each batch.
 
-    They add up the same gradients in another order. Weights agree to a thousandth of the way they went, since Adam and
-    the maxima in the network enlarge differences of rounding; half the batch alone would send them another way.
+    They add up the same gradients in another order. Weights agree to a thousandth of their change, since Adam and the
+    maxima in the network enlarge differences of rounding; half the batch alone would change them in another way.
     """
-    from spadwarp.denoise import training
-    from spadwarp.denoise.recipe import load_training_recipe
-    from spadwarp.denoise.training_run import read_scenes
-
     place, out = tmp_path / "recipe.toml", tmp_path / "two"
     optimiser = "steps = 16\nbatch = 4\ncrop = 32\nreport_every = 4\nwarm_up = 2\naveraging = 0.5"
     place.write_text(
@@ -284,16 +294,16 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, mo
         while run.poll() is None and not (out / "checkpoint.pt").is_file():
             time.sleep(0.02)
         run.terminate()
-        said = run.communicate(timeout=240)[1]
-    assert (out / "checkpoint.pt").is_file(), said
+        errors = run.communicate(timeout=240)[1]
+    assert (out / "checkpoint.pt").is_file(), errors
     assert not (out / "usdn.safetensors").exists()
     with (out / "log.jsonl").open("a") as file:
         file.write('{"step": 1')  # of a kill between a line and its checkpoint
     again = subprocess.run(command, capture_output=True, timeout=240, **options)
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("written") == 1 and "strides" not in again.stderr
-    names = sorted(one.name for one in out.iterdir() if one.name[0] != ".")  # hidden: what was half written
-    assert names == ["checkpoint.pt", "curves.png", "log.jsonl", "usdn.safetensors"]
+    visible = {name for name in names(out) if name[0] != "."}  # hidden: what was half written
+    assert visible == {"checkpoint.pt", "curves.png", "log.jsonl", "usdn.safetensors"}
     steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
     assert steps == [4, 8, 12, 16]
 
@@ -315,8 +325,8 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, mo
     scenes = [read_scenes(dataset, split) for split in ("train", "validation")]
     training.fit(load_training_recipe(place), *scenes, tmp_path / "one", device="cpu")
     torch.manual_seed(3)
-    networks = training.build_network("usdn"), *(torch.load(one / "checkpoint.pt") for one in (out, tmp_path / "one"))
-    states = [networks[0].state_dict(), *(one["network"] for one in networks[1:])]
+    checkpoints = [torch.load(folder / "checkpoint.pt")["network"] for folder in (out, tmp_path / "one")]
+    states = [training.build_network("usdn").state_dict(), *checkpoints]
     new, two, one = (torch.cat([values.flatten() for values in state.values()]) for state in states)
     assert (one - two).norm() < 1e-3 * (one - new).norm()
 
@@ -324,7 +334,8 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill(dataset, tmp_path, mo
 # Few photons
 
 
-def wall(reflectance=0.5):
+@pytest.fixture(scope="module")
+def wall():
     """A Monte Carlo result of a plane at 3 m, 16 x 12 pixels."""
     scene = spadwarp.Scene.from_dict(
         {
@@ -332,44 +343,43 @@ def wall(reflectance=0.5):
             "laser": {"half_angle_deg": 12.0, "pulse_fwhm_ps": 300.0},
             "camera": {"width": 16, "height": 12, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
             "gate": {"start_ns": 18.0, "bin_width_ps": 200.0, "bins": 64},
-            "targets": [
-                {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0], "reflectance": reflectance}
-            ],
+            "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0], "reflectance": 0.5}],
         }
     )
     return spadwarp.simulate(scene, photons=200_000, seed=2, device="cpu")
 
 
-def test_counts_are_denoised_with_their_histograms(tmp_path):
-    """One detection in five pixels: 2 cm with the histograms, of which depth alone is far."""
-    result = wall()
-    result = dataclasses.replace(result, scene=result.scene.with_overrides({"laser.pulse_energy": 1e-13}))
+def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
+    """One detection in five pixels: an error below 2 cm with the histograms, above 10 cm from depth alone."""
+    result = dataclasses.replace(wall, scene=wall.scene.with_overrides({"laser.pulse_energy": 1e-13}))
     recorded = record_frames(result, tmp_path / "frames.h5", pulses=2000, frames=4, seed=1, device="cpu")
     assert 0.1 < recorded.detections / (4 * 16 * 12) < 0.4
     errors = []
     for weights in (None, inference.WEIGHTS / "pyramid.safetensors"):
-        found = depth_files.denoise_file(tmp_path / "frames.h5", tmp_path / "out", weights=weights, device="cpu")
+        found = files.denoise_file(tmp_path / "frames.h5", tmp_path / "out", weights=weights, device="cpu")
         assert ("denoised with its histograms" in found.notes) == (weights is None)
         errors.append(np.nan_to_num(found.depth, nan=0.5 * sum(found.gate)) - result.truth.depth)
     rmse = np.sqrt(np.mean(np.square(errors), axis=(1, 2, 3)))
     assert rmse[0] < 0.02 < 0.1 < rmse[1]
 
 
-def test_frames_of_few_photons_meet_the_bound_where_they_are_many(tmp_path):
-    result = wall()
-    frames = [photons.photon_frame(result, photons=2000.0, sbr=20.0, seed=seed) for seed in range(8)]
+def test_frames_of_many_photons_meet_the_bound(wall):
+    frames = [photon_counts.photon_frame(wall, photons=2000.0, sbr=20.0, seed=seed) for seed in range(8)]
     sigma = frames[0][1]
     spread = np.std([frame.depth[0] for frame, _ in frames], axis=0, ddof=1) / sigma
     # 192 pixels, each with 7 degrees of freedom; the estimator treats scattered light as a Gaussian return, too.
     assert 0.8 < np.sqrt(np.nanmedian(spread**2)) < 1.6
-    sweep = photons.photon_sweep(result, photons=(1, 30), sbr=(0.3,), models=("median",), seed=3)
+
+
+def test_a_sweep_over_photons(wall, tmp_path):
+    sweep = photon_counts.photon_sweep(wall, photons=(1, 30), sbr=(0.3,), models=("median",), seed=3)
     assert (sweep.rmse["median"] < sweep.rmse["input"]).all()
     assert (sweep.bound < sweep.rmse["input"]).all()
     assert (np.diff(sweep.rmse["input"]) < 0).all()
     assert sweep.saving("input")[0, 0] == pytest.approx(1.0)
-    assert photons.draw_photon_sweep(sweep, tmp_path / "photons.png").stat().st_size > 10_000
+    assert photon_counts.draw_photon_sweep(sweep, tmp_path / "photons.png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="sbr"):
-        photons.photon_sweep(result, sbr=(0.0,))
+        photon_counts.photon_sweep(wall, sbr=(0.0,))
 
 
 # No leakage
@@ -377,12 +387,10 @@ def test_frames_of_few_photons_meet_the_bound_where_they_are_many(tmp_path):
 
 @pytest.mark.parametrize("test_recipe", ["lu2024", "small"])
 def test_training_and_test_share_no_target_and_no_seed(test_recipe):
-    from spadwarp.dataset.sampling import Plan
-
-    training = Plan(spadwarp.load_recipe("configs/datasets/training.toml"))
+    trained = Plan(spadwarp.load_recipe("configs/datasets/training.toml"))
     tested = Plan(spadwarp.load_recipe(f"configs/datasets/{test_recipe}.toml"))
-    learnt = {one.name for one in training.targets if one.split in ("train", "validation")}
-    judged = {one.name for one in tested.targets if one.split == "test"}
-    assert "staircase" in judged and learnt.isdisjoint(judged)
-    seeds = [plan.split_seeds[split] for plan in (training, tested) for split in ("train", "validation", "test")]
+    seen = {target.name for target in trained.targets if target.split in ("train", "validation")}
+    unseen = {target.name for target in tested.targets if target.split == "test"}
+    assert "staircase" in unseen and seen.isdisjoint(unseen)
+    seeds = [plan.split_seeds[split] for plan in (trained, tested) for split in ("train", "validation", "test")]
     assert len(set(seeds)) == 6

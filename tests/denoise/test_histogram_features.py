@@ -1,17 +1,16 @@
-"""What histograms tell beyond the depth of each pixel, and the scattered light that networks learn from."""
+"""Features of histograms, and the scattered light that networks are trained on."""
 
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import toeplitz
 from scipy.stats import exponnorm, norm
 
-import spadwarp
-from spadwarp.denoise import inference
-from spadwarp.denoise import synthetic_noise as noise
+from helpers.stepped_frames import denoised
+from spadwarp import ArgumentError
+from spadwarp.denoise import inference, synthetic_noise
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, WINDOWS, extract_features
 from spadwarp.denoise.recipe import Noise
-
-torch.set_num_threads(1)
 
 BINS, SIGMA = 128, 1.2  # bins of the gate, response [bins]
 TAPS = norm.pdf(np.arange(-6, 7), scale=SIGMA)
@@ -28,20 +27,25 @@ def histograms(place, photons, background, *, law=None, side=32, bins=BINS, seed
     return counts.astype(np.float32), level.astype(np.float32)
 
 
-def clues_of(counts, level, taps=TAPS):
+def features_of(counts, level, taps=TAPS):
     level = np.reshape(level, (1, 1, -1)) if np.ndim(level) == 1 else level
-    arrays = (torch.tensor(np.asarray(one, np.float32))[None] for one in (counts, level, taps / taps.sum()))
+    arrays = (torch.tensor(np.asarray(values, np.float32))[None] for values in (counts, level, taps / taps.sum()))
     return extract_features(*arrays)[0].numpy()
+
+
+def best_bin(counts, level):
+    """Place of the largest log-likelihood of a return of one photon, pixel by pixel [bins]."""
+    template = np.log1p(norm.pdf(toeplitz(np.arange(BINS)), scale=SIGMA) / level[:, None])
+    return (counts @ template).argmax(axis=-1) + 0.5
 
 
 def test_pooled_histograms_find_what_pixels_cannot():
     """One signal photon among twenty of the background: nine and 49 pixels have 9 and 49 of them in a few bins."""
     counts, level = histograms(70.3, 1.0, 20.0)
-    found = clues_of(counts, level)
+    found = features_of(counts, level)
     assert found.shape == (FEATURES, 32, 32) and len(WINDOWS) == 3
-    template = np.log1p(np.array([[norm.pdf(j - k, scale=SIGMA) / level[j] for k in range(BINS)] for j in range(BINS)]))
-    alone = ((counts - level) @ template).argmax(axis=-1) + 0.5
-    right = [np.mean(np.abs(place - 70.3) < 2) for place in (alone, *(BINS * found[:2]))]
+    places = best_bin(counts - level, level), *(BINS * found[:2])
+    right = [np.mean(np.abs(place - 70.3) < 2) for place in places]
     assert right[0] < 0.4 < 0.7 < right[1] < right[2] and right[2] > 0.99
     # Centroid of 49 photons on their background: some tenths of a bin.
     assert np.std(BINS * found[1]) < 0.6
@@ -50,7 +54,7 @@ def test_pooled_histograms_find_what_pixels_cannot():
 def test_many_photons_give_depth_to_fractions_of_a_bin():
     slope = np.linspace(40.0, 80.0, 32) + np.zeros((32, 1))
     counts, level = histograms(slope, 500.0, 5.0)
-    found = BINS * clues_of(counts, level)[:2]
+    found = BINS * features_of(counts, level)[:2]
     inner = (slice(4, -4), slice(4, -4))
     assert np.sqrt(np.mean((found[0] - slope)[inner] ** 2)) < 0.3  # a window of 3 pixels sees 2.6 bins of slope
 
@@ -60,7 +64,7 @@ def test_the_shape_of_the_return_is_that_of_its_light():
     delay = 8.0  # bins
     law = exponnorm(delay / SIGMA, scale=SIGMA)
     counts, level = histograms(60.0, 300.0, 30.0, law=law)
-    found = clues_of(counts, level)
+    found = features_of(counts, level)
     anchor = BINS * found[2, 16, 16]
     expected = np.diff(law.cdf(anchor - 60.0 + BINS * np.array(EDGES)))
     shares = found[len(WINDOWS) : len(WINDOWS) + len(EDGES) - 1, 16, 16]
@@ -71,7 +75,7 @@ def test_the_shape_of_the_return_is_that_of_its_light():
 def test_fine_histograms_are_rebinned():
     taps = norm.pdf(np.arange(-60, 61), scale=SIGMA * 1000 / BINS)
     counts, level = histograms(603.0, 20.0, 20.0, bins=1000, side=16)
-    found = clues_of(counts, level, taps)
+    found = features_of(counts, level, taps)
     assert abs(np.median(1000 * found[1]) - 603.0) < 1.0
 
 
@@ -84,20 +88,22 @@ def test_each_pixel_may_have_its_background():
     counts += generator.poisson(np.maximum(beam - 1.0, 0.0) * level, (32, 32, BINS))
     each = np.broadcast_to(np.maximum(beam, 1.0) * level, (32, 32, BINS))
     sides = np.abs(np.linspace(-1, 1, 32)) > 0.6
-    wrong = [np.mean(np.abs(BINS * clues_of(counts, one)[2] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)]
+    wrong = [
+        np.mean(np.abs(BINS * features_of(counts, one)[2] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)
+    ]
     assert wrong[1] < 0.1 < wrong[0]
 
 
 def test_a_frame_of_pixels_without_counts_is_no_error():
-    found = clues_of(np.zeros((16, 16, BINS)), np.full(BINS, 1e-3))
+    found = features_of(np.zeros((16, 16, BINS)), np.full(BINS, 1e-3))
     assert np.isfinite(found).all()
 
 
-def test_scattered_light_is_late_and_from_beside():
+def test_scattered_light_is_delayed_and_spread():
     plain = Noise(delay=(0.01, 0.01), spread=(2.0, 2.0))
     rate = torch.zeros(6, 33, 33, 192)
     rate[:, 16, 16, 60] = 1.0
-    found = noise._scattered(rate, plain, torch.Generator().manual_seed(2))
+    found = synthetic_noise._scattered(rate, plain, torch.Generator().manual_seed(2))
     bins = torch.arange(192)
     assert torch.allclose(found.sum(dim=(1, 2, 3)), torch.ones(6), atol=2e-3)
     assert (found[..., :60] == 0).all()
@@ -112,27 +118,23 @@ def test_histograms_help_where_photons_are_few():
     place = np.where(np.arange(48) < 24, 60.0, 75.0) + np.zeros((48, 1))
     counts, level = histograms(place, 1.0, 3.0, side=48)
     clean = 13.5 + 2.5 * place / BINS
-    template = np.log1p(np.array([[norm.pdf(j - k, scale=SIGMA) / level[j] for k in range(BINS)] for j in range(BINS)]))
-    depth = 13.5 + 2.5 * ((counts @ template).argmax(axis=-1) + 0.5) / BINS
-    options = {"gate": (13.5, 16.0), "profile": level, "device": "cpu"}
-    alone = spadwarp.denoise.apply(depth, **options)
-    together = spadwarp.denoise.apply(depth, counts=counts, background=level, response=TAPS, **options)
-    before, after = (np.sqrt(np.nanmean((one - clean) ** 2)) for one in (alone, together))
+    depth = 13.5 + 2.5 * best_bin(counts, level) / BINS
+    alone = denoised(depth, profile=level)
+    together = denoised(depth, profile=level, counts=counts, background=level, response=TAPS)
+    before, after = (np.sqrt(np.nanmean((found - clean) ** 2)) for found in (alone, together))
     assert after < 0.7 * before
 
 
-def test_a_frame_that_is_turned_gives_the_same_depth():
-    """Windows and network take no side; edges of blocks apart, for which sizes are multiples of 16."""
+def test_a_rotated_frame_gives_the_same_depth():
+    """Windows and network treat all sides alike, except at borders of blocks: so sizes are multiples of 16."""
     counts, level = histograms(np.linspace(40.0, 80.0, 32) + np.zeros((32, 1)), 3.0, 3.0)
-    depth = np.full((32, 32), 15.0)
-    options = {"gate": (13.5, 16.0), "background": level, "response": TAPS, "device": "cpu"}
-    found = spadwarp.denoise.apply(depth, counts=counts, **options)
-    turned = spadwarp.denoise.apply(depth, counts=counts[::-1, ::-1], **options)
-    assert np.nanmax(np.abs(turned[::-1, ::-1] - found)) < 1e-4
+    depth, options = np.full((32, 32), 15.0), {"background": level, "response": TAPS}
+    rotated = denoised(depth, counts=counts[::-1, ::-1], **options)
+    assert np.nanmax(np.abs(rotated[::-1, ::-1] - denoised(depth, counts=counts, **options))) < 1e-4
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"counts": np.zeros((16, 16))}, "counts are float64"),
         ({"background": np.zeros(5)}, "background has shape"),
@@ -141,15 +143,15 @@ def test_a_frame_that_is_turned_gives_the_same_depth():
         ({"counts": np.zeros((20, 16, 8))}, "histograms are 1 frames"),
     ],
 )
-def test_errors_name_what_is_wrong(changed, said):
+def test_errors_name_what_is_wrong(changed, message):
     given = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3), **changed}
-    with pytest.raises(ValueError, match=said):
-        spadwarp.denoise.apply(np.full((16, 16), 15.0), gate=(13.5, 16.0), **given, device="cpu")
+    with pytest.raises(ArgumentError, match=message):
+        denoised(np.full((16, 16), 15.0), **given)
 
 
-def test_shapes_of_clues():
+def test_shapes_of_features():
     counts = np.random.default_rng(1).poisson(0.1, (2, 9, 10, 32))
-    found = inference.features_of_histograms(counts, background=np.full(32, 0.1), response=np.ones(3), device="cpu")
+    options = {"background": np.full(32, 0.1), "response": np.ones(3), "device": "cpu"}
+    found = inference.features_of_histograms(counts, **options)
     assert found.shape == (2, FEATURES, 9, 10) and found.dtype == np.float32
-    one = inference.features_of_histograms(counts[1], background=np.full(32, 0.1), response=np.ones(3), device="cpu")
-    assert np.array_equal(one[0], found[1])
+    assert np.array_equal(inference.features_of_histograms(counts[1], **options)[0], found[1])

@@ -1,4 +1,4 @@
-"""Networks, the noise they learn from, and the loop that teaches them."""
+"""Networks, the noise that they are trained on, and their training."""
 
 import json
 
@@ -9,37 +9,25 @@ from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
 from spadwarp.denoise import inference, networks
-from spadwarp.denoise import synthetic_noise as noise
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
-from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch
+from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch
 from spadwarp.denoise.training import fit, loss_of
 
-torch.set_num_threads(1)
 
-
-def scenes(count=4, size=64, hole=True):
+def scenes(count=4, size=64):
     """Tilted planes with a step, 14–15.5 m; a corner sees nothing."""
     y, x = torch.meshgrid(torch.linspace(0, 1, size), torch.linspace(0, 1, size), indexing="ij")
     depth = torch.stack([14.0 + 0.3 * k * x + 0.5 * (y > 0.3 + 0.1 * k) for k in range(count)])
-    if hole:
-        depth[:, : size // 8, : size // 8] = torch.nan
+    depth[:, : size // 8, : size // 8] = torch.nan
     gate = torch.tensor([13.5, 16.0]).expand(count, 2).contiguous()
-    profile = torch.linspace(1.8, 0.2, noise.BINS).expand(count, noise.BINS).contiguous()
+    profile = torch.linspace(1.8, 0.2, BINS).expand(count, BINS).contiguous()
     return CleanScenes(depth, torch.full_like(depth, 0.002), gate, profile)
 
 
 # No other noise than what a test asks for.
-PLAIN = {
-    "sigma_scale": (1.0, 1.0),
-    "own_gate": 1.0,
-    "own_profile": 1.0,
-    "slanted_gate": 0.0,
-    "counting": 0.0,
-    "scattered": 0.0,
-    "dead": 0.0,
-    "unknown_water": 0.0,
-}
+PLAIN = {"sigma_scale": (1.0, 1.0), "own_gate": 1.0, "own_profile": 1.0}
+PLAIN |= dict.fromkeys(("slanted_gate", "counting", "scattered", "dead", "unknown_water"), 0.0)
 
 
 def draw(plain, *, size=64, crop=64, seed=3, **options):
@@ -83,7 +71,7 @@ def test_order_statistics_are_those_of_a_sort():
         assert torch.equal(values[:, 0], expected[..., rank])
 
 
-def test_pyramid_weighs_the_depths_about_a_pixel_and_the_means_of_blocks_about_its_own():
+def test_pyramid_weighs_the_depths_around_a_pixel_and_the_means_of_blocks():
     """The same mean, pixel by pixel: 25 depths, nine means of 4×4, nine of 16×16 pixels, one value of the network's."""
     generator = torch.Generator().manual_seed(4)
     network = networks.PyramidNet().eval()
@@ -95,7 +83,7 @@ def test_pyramid_weighs_the_depths_about_a_pixel_and_the_means_of_blocks_about_i
         network.leave.bias.copy_(head)
         found = network(frame)
     depth, reported = frame[:, :1], frame[:, 1:2]
-    head = head.view(-1, 2, 2).repeat(1, 24, 16)  # what it says of the four pixels of a block is the same everywhere
+    head = head.view(-1, 2, 2).repeat(1, 24, 16)  # the same for the four pixels of every block
     true = head[-1].expand(2, 1, -1, -1)
     certainty = true.sigmoid() * reported
     values, trusts = [windows(depth, 2)], [windows(certainty, 2)]
@@ -113,7 +101,7 @@ def test_pyramid_weighs_the_depths_about_a_pixel_and_the_means_of_blocks_about_i
 
 
 def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
-    """What stands in for their depth changes neither weights nor neighbours: it is shut out by the mask."""
+    """The value in place of a missing depth changes neither weights nor neighbours: the mask leaves it out."""
     network = networks.PyramidNet().eval()
     frame = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(2))
     frame[:, 1] = 0.0
@@ -124,11 +112,11 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
 
 
 @pytest.mark.parametrize("level", [0.042, 0.48])
-def test_the_share_of_backscatter_is_the_one_asked_for(level):
+def test_the_backscatter_fraction_is_that_of_the_recipe(level):
     batch = draw(Noise(backscatter=(level, level), behind=1.0, **PLAIN))
     seen = batch.hit > 0
     off = (batch.frame[:, :1] - batch.clean).abs() > 5 * 0.002 / 2.5
-    missed = 2 * 5 * 0.002 / 2.5  # strays that fall upon the target by chance, at most twice the mean density
+    missed = 2 * 5 * 0.002 / 2.5  # backscatter at the target's depth by chance, at most twice the mean density
     share, count = float(off[seen].float().mean()), int(seen.sum())
     error = np.sqrt(level * (1 - level) / count)
     assert level * (1 - 1.8 * missed) - 4 * error < share < level + 4 * error
@@ -147,12 +135,12 @@ def test_backscatter_follows_the_profile_up_to_the_target():
     assert chi2 < 43.8  # p > 1e-3 at 19 degrees of freedom
 
 
-def test_the_network_is_told_the_density_at_the_reported_depth():
-    batch = draw(Noise(backscatter=(0.5, 0.5), **PLAIN))
-    there = batch.frame[:, 1] > 0
-    depth, told = batch.frame[:, 0][there], batch.frame[:, 2][there]
-    assert torch.allclose(told.exp(), 1.8 - 1.6 * depth.clamp(0, 1), atol=0.03)
-    assert (batch.frame[:, 0][~there] == 1.0).all() and (batch.frame[:, 2][~there] == 0.0).all()
+def test_the_input_holds_the_density_at_the_reported_depth():
+    frame = draw(Noise(backscatter=(0.5, 0.5), **PLAIN)).frame
+    reported = frame[:, 1] > 0
+    depth, density = frame[:, 0], frame[:, 2]
+    assert torch.allclose(density[reported].exp(), 1.8 - 1.6 * depth[reported].clamp(0, 1), atol=0.03)
+    assert (depth[~reported] == 1.0).all() and (density[~reported] == 0.0).all()
 
 
 @pytest.mark.parametrize("photons", [4.0, 100.0])
@@ -172,7 +160,7 @@ def test_one_seed_gives_one_batch():
     assert not torch.equal(first.frame, other.frame)
 
 
-def test_crops_without_a_target_teach_no_depth():
+def test_crops_without_a_target_do_not_count_for_depth():
     frame, clean, hit = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.4), torch.ones(2, 1, 32, 32)
     hit[1] = 0.0
     clean[1] = 1.0
@@ -182,35 +170,34 @@ def test_crops_without_a_target_teach_no_depth():
     assert loss_of(output, Batch(frame, clean, hit), kind="mse") == pytest.approx(0.01, rel=1e-5)
 
 
-def test_depth_that_was_chosen_teaches_what_is_the_targets():
-    """Of histograms: a depth that is right may not be called wrong because the pixel's own is."""
+def test_the_chosen_depth_decides_what_counts_as_the_targets():
+    """With histograms: a chosen depth that is right does not count as wrong because the pixel's own depth is."""
     hit = torch.ones(1, 1, 32, 32)
     batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit)
     right, wrong = (torch.cat([0.5 * hit, 9 * hit, 9 * hit, chosen * hit], dim=1) for chosen in (0.5, 0.1))
     assert loss_of(right, batch, kind="mse") < 1e-3 < 0.1 < loss_of(wrong, batch, kind="mse")
 
 
-RECIPE = {
-    "model": "usdn",
-    "data": "none",
-    "seed": 4,
-    "optimiser": {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2},
-}
+OPTIMISER = {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2}
+RECIPE = {"model": "usdn", "data": "none", "seed": 4, "optimiser": OPTIMISER}
 
 
-def test_a_run_that_was_cut_short_ends_like_one_that_was_not(tmp_path):
-    recipe = TrainingRecipe.from_dict(RECIPE)
-    whole = fit(recipe, scenes(), scenes(), tmp_path / "whole", device="cpu")
+def train(folder, *, progress=None, **changes):
+    recipe = TrainingRecipe.from_dict({**RECIPE, **changes})
+    return fit(recipe, scenes(), scenes(), folder, device="cpu", progress=progress)
 
-    class Cut(Exception):
+
+def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path):
+    class Interruption(Exception):
         pass
 
-    def cut(stage, done, total):
-        raise Cut
+    def interrupt(stage, done, total):
+        raise Interruption
 
-    with pytest.raises(Cut):
-        fit(recipe, scenes(), scenes(), tmp_path / "parts", device="cpu", progress=cut)
-    parts = fit(recipe, scenes(), scenes(), tmp_path / "parts", device="cpu")
+    whole = train(tmp_path / "whole")
+    with pytest.raises(Interruption):
+        train(tmp_path / "parts", progress=interrupt)
+    parts = train(tmp_path / "parts")
     for name, values in load_file(whole.weights).items():
         assert torch.equal(values, load_file(parts.weights)[name]), name
     lines = [json.loads(line) for line in parts.log.read_text().splitlines()]
@@ -220,30 +207,26 @@ def test_a_run_that_was_cut_short_ends_like_one_that_was_not(tmp_path):
 
 def test_histograms_are_learnt_from_the_weights_for_depth(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
-    recipe = TrainingRecipe.from_dict({**RECIPE, "model": "histograms", "start": "pyramid", "noise": noise})
-    done = fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
-    depth_alone = inference.load_network("pyramid")
+    done = train(tmp_path, model="histograms", start="pyramid", noise=noise)
     learnt = load_file(done.weights)
-    for name, values in depth_alone.state_dict().items():
+    for name, values in inference.load_network("pyramid").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.05), name  # six steps
     assert "enter_features.weight" in learnt
-    card = inference.weights_metadata("histograms", done.weights)
-    assert set(card["validation_psnr"]) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
+    validation = inference.weights_metadata("histograms", done.weights)["validation_psnr"]
+    assert set(validation) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
 
 
 def test_a_folder_holds_one_recipe(tmp_path):
-    recipe = TrainingRecipe.from_dict(RECIPE)
-    fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
-    other = TrainingRecipe.from_dict({**RECIPE, "seed": 5})
+    train(tmp_path)
     with pytest.raises(ConfigError, match="another recipe"):
-        fit(other, scenes(), scenes(), tmp_path, device="cpu")
+        train(tmp_path, seed=5)
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(FileError, match="damaged"):
-        fit(recipe, scenes(), scenes(), tmp_path, device="cpu")
+        train(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"model": "unet"}, "model"),
         ({"noise": {"backscatter": [0.5, 1.2]}}, r"noise.backscatter"),
@@ -253,8 +236,11 @@ def test_a_folder_holds_one_recipe(tmp_path):
         ({"start": "pyramid"}, r"start"),
     ],
 )
-def test_errors_in_a_recipe_name_the_field(tmp_path, change, said):
-    with pytest.raises(ConfigError, match=said):
+def test_errors_in_a_recipe_name_the_field(change, message):
+    with pytest.raises(ConfigError, match=message):
         TrainingRecipe.from_dict({**RECIPE, **change})
+
+
+def test_a_recipe_that_cannot_be_read(tmp_path):
     with pytest.raises(FileError, match="cannot be read"):
         load_training_recipe(tmp_path / "none.toml")

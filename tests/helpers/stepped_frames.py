@@ -1,6 +1,8 @@
-"""A plane with steps in a gate, and depth frames of it with stray pixels."""
+"""A plane with steps in a gate, and depth frames of it in which some pixels report backscatter."""
 
 import numpy as np
+
+from spadwarp.denoise import apply, metrics
 
 GATE = (13.5, 16.0)
 
@@ -15,9 +17,20 @@ def scene(height=48, width=64):
 
 
 def noisy_frame(clean, share=0.3, seed=0):
+    """Jitter of 3 mm, and a share of the pixels that report backscatter from nearer than the target."""
     generator = np.random.default_rng(seed)
     frame = clean + generator.normal(0, 0.003, clean.shape).astype(np.float32)
-    stray = generator.random(clean.shape) < share
+    replaced = generator.random(clean.shape) < share
     reach = np.nan_to_num(clean, nan=GATE[1]) - GATE[0]
-    frame[stray] = (GATE[0] + generator.random(clean.shape) * reach)[stray]
+    frame[replaced] = (GATE[0] + generator.random(clean.shape) * reach)[replaced]
     return frame.astype(np.float32)
+
+
+def denoised(depth, **options):
+    """Depth denoised on the CPU, over `GATE` unless options say otherwise."""
+    return apply(depth, **{"gate": GATE, "device": "cpu", **options})
+
+
+def scores(clean, estimate):
+    """Scores over `GATE`; a pixel without an estimate counts as one in the middle of the gate."""
+    return metrics.score(clean, np.nan_to_num(estimate, nan=14.75), gate=GATE)
