@@ -18,6 +18,7 @@ from skimage.metrics import structural_similarity
 from typer.testing import CliRunner
 
 import spadwarp
+from helpers.datasets import recipe
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, ConfigError, FileError
 from spadwarp.cli import app
@@ -199,22 +200,9 @@ def test_depths_below_zero_count_as_not_reported(tmp_path):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "set"
-    recipe = spadwarp.load_recipe("configs/datasets/lu2024.toml").with_overrides(
-        {
-            "scenes_per_target": 1,
-            "scenes_per_shard": 1,
-            "targets.builtin": ["staircase", "anchor", "naval_mine"],
-            "targets.validation": ["naval_mine"],
-            "targets.test": ["staircase"],
-            "frames.per_scene": 6,
-            "frames.backscatter_fraction": [0.042, 0.48],
-            "pose.yaw_deg": 0.0,
-            "pose.pitch_deg": 0.0,
-            "pose.roll_deg": 0.0,
-            "scene.camera": {"preset": "lu2024", "width": 64, "height": 48},
-        }
-    )
-    spadwarp.make_dataset(recipe, folder, device="cpu")
+    fractions, camera = [0.042, 0.48], {"preset": "lu2024", "width": 64, "height": 48}
+    changes = {"frames.per_scene": 6, "frames.backscatter_fraction": fractions, "scene.camera": camera}
+    spadwarp.make_dataset(recipe(scenes_per_target=1, **{"pose.yaw_deg": 0.0}, **changes), folder, device="cpu")
     return folder
 
 
@@ -258,9 +246,9 @@ def test_evaluation_needs_a_dataset(tmp_path):
 
 
 def test_training_from_a_dataset(dataset, tmp_path):
-    recipe, run, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
-    recipe.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
-    invoke("train", recipe, "--out", run, "--device", "cpu")
+    file, run, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
+    file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
+    invoke("train", file, "--out", run, "--device", "cpu")
     assert names(run) >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert inference.weights_metadata("usdn", own)["seed"] == "0"
     trained, shipped = (
@@ -269,10 +257,10 @@ def test_training_from_a_dataset(dataset, tmp_path):
     )
     assert trained.mean("usdn").psnr < shipped.mean("usdn").psnr  # two steps against a whole training
     assert trained.mean("input") == shipped.mean("input") and str(own) in trained.summary
-    recipe.write_text('model = "usdn"\n')
-    invoke("train", recipe, "--out", tmp_path / "other", code=2)
+    file.write_text('model = "usdn"\n')
+    invoke("train", file, "--out", tmp_path / "other", code=2)
     with pytest.raises(ConfigError, match="data"):
-        spadwarp.denoise.train(recipe, tmp_path / "other")
+        spadwarp.denoise.train(file, tmp_path / "other")
 
 
 def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, monkeypatch):
