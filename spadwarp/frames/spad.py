@@ -7,7 +7,6 @@ dark counts, ambient light, crosstalk → hazard λ per detector bin → counts,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,90 +75,45 @@ def detect(
     Raises:
         ArgumentError: Names the argument, its value and what is allowed.
     """
-    plan = _plan(
-        source,
-        detector=detector,
-        laser=laser,
-        gate_start=gate_start,
-        bin_width=bin_width,
-        irf=irf,
-        background=background,
-        window=window,
-        tdc_widths=tdc_widths,
-        pulses=pulses,
-        frames=frames,
-        first_frame=first_frame,
-        seed=seed,
-        camera_seed=camera_seed,
-        summed=summed,
-        tags=tags,
-    )
-    with in_torch_order(plan.source, plan.background, out):
-        light = _expected(plan, device)
-        drawn = _draw(plan, light, out)
-    return _pack(plan, light, drawn)
-
-
-# Plan
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Plan:
-    """Arguments of `detect`, complete and checked; sources are expected detections per pulse."""
-
-    source: Any
-    background: Any
-    detector: Detector
-    laser: Laser | None
-    gate_start: float
-    bin_width: float
-    irf: InstrumentResponse
-    window: tuple[float, int] | None
-    tdc_widths: ArrayLike | None
-    pulses: int
-    frames: int
-    first_frame: int
-    seed: int
-    camera_seed: int
-    summed: bool
-    tags: bool
-
-    @property
-    def free_running(self) -> bool:
-        return self.detector.mode == "free_running"
-
-    @property
-    def by_event(self) -> bool:
-        """Whether detections are followed one by one."""
-        return self.free_running or self.tags or self.detector.afterpulsing_probability > 0
-
-
-def _plan(source: Any, *, background: Any, detector: Detector | None, laser: Laser | None, **options: Any) -> _Plan:
     scene = getattr(source, "scene", None)
     if scene is not None:
         detector, laser = detector or scene.detector, laser or scene.laser
-        options |= {"gate_start": scene.gate.start, "bin_width": scene.gate.bin_width}
+        gate_start, bin_width = scene.gate.start, scene.gate.bin_width
         detections_per_photon = laser.photons_per_pulse * detector.pde
         if background is None:
             background = source.component("backscatter") * detections_per_photon
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
-    if options["pulses"] is None:
-        options["pulses"] = detector.pulses_per_frame
-    _check_integers(**{name: options[name] for name in ("pulses", "frames", "first_frame", "seed", "camera_seed")})
-    total = options["pulses"] * options["frames"]
-    if options["summed"] and total > 2**31 - 1:
-        raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
-    start, width = options["gate_start"], options["bin_width"]
-    if start is None or width is None:
+    pulses = detector.pulses_per_frame if pulses is None else pulses
+    numbers = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
+    _check_integers(**numbers, camera_seed=camera_seed)
+    if summed and pulses * frames > 2**31 - 1:
+        raise ArgumentError(f"pulses · frames = {pulses * frames} is above {2**31 - 1}: give fewer, or summed=False")
+    if gate_start is None or bin_width is None:
         raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
-    if not (math.isfinite(start) and math.isfinite(width) and width > 0):
-        raise ArgumentError(f"gate_start = {start} s, bin_width = {width} s: finite and a width > 0 are needed")
-    if laser is None and (detector.wrap or detector.mode == "free_running" or options["tags"]):
+    if not (math.isfinite(gate_start) and math.isfinite(bin_width) and bin_width > 0):
+        raise ArgumentError(f"gate_start = {gate_start} s, bin_width = {bin_width} s: finite and > 0 are needed")
+    if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
-    if options["irf"] is None:
-        options["irf"] = detector_response(detector, laser)
-    return _Plan(source=source, background=background, detector=detector, laser=laser, **options)
+    irf = detector_response(detector, laser) if irf is None else irf
+    camera = _Camera(detector, laser, irf, window, tdc_widths, camera_seed)
+    with in_torch_order(source, background, out):
+        light = _expected(source, background, camera, (gate_start, bin_width), device)
+        drawn = _draw(light, detector, is_torch(source), numbers, summed=summed, tags=tags, out=out)
+    time_axis, recorded = light.window, light.window.recorded
+    return Frames(
+        counts=drawn.counts,
+        expected=drawn.expected[:, :recorded].reshape(*light.image, -1),
+        background=drawn.background[:, :recorded].reshape(*light.image, -1),
+        gate_start=time_axis.start,
+        bin_width=bin_width,
+        edges=time_axis.edges[: recorded + 1],
+        period=time_axis.period if detector.wrap else None,
+        irf=irf,
+        tags=None if drawn.events is None else _time_tags(drawn.events, light.image, first_frame),
+        notes=missing_light(time_axis, gate_start) if detector.wrap else (),
+        **numbers,
+    )
 
 
 def _check_integers(**numbers: int) -> None:
@@ -173,6 +127,15 @@ def _check_integers(**numbers: int) -> None:
 # Expected detections
 
 
+class _Camera(NamedTuple):
+    detector: Detector
+    laser: Laser | None
+    irf: InstrumentResponse
+    window: tuple[float, int] | None
+    tdc_widths: ArrayLike | None
+    seed: int
+
+
 class _Light(NamedTuple):
     """Expected detections per pulse before pile-up, in the bins of the window: Warp rows `[pixel, bin]`."""
 
@@ -181,33 +144,26 @@ class _Light(NamedTuple):
     window: Window
     image: tuple[int, int]
 
-    @property
-    def device(self) -> Any:
-        return self.hazard.device
 
-
-def _expected(plan: _Plan, device: Any) -> _Light:
-    """Light through the response, noise and crosstalk."""
+def _expected(source: Any, background: Any, camera: _Camera, axis: tuple[float, float], device: Any) -> _Light:
+    """Light through the response, noise and crosstalk; `axis`: start and bin width of the source [s]."""
     from spadwarp_kernels import detection as kernels
 
-    detector = plan.detector
-    form: Any = {"device": device, "shape": "[H, W, T]", "dimensions": range(3, 4)}
-    rows, shape = histogram_rows(plan.source, name="source", **form)
+    detector, laser = camera.detector, camera.laser
+    free_running = detector.mode == "free_running"
+    form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
+    rows, shape = histogram_rows(source, name="source", device=device, **form)
     window = detector_window(
-        plan.window or (plan.gate_start, shape[2]),
-        plan.bin_width,
-        plan.tdc_widths,
-        period=math.inf if plan.laser is None else 1.0 / plan.laser.repetition_rate,
+        camera.window or (axis[0], shape[2]),
+        axis[1],
+        camera.tdc_widths,
+        period=math.inf if laser is None else 1.0 / laser.repetition_rate,
         wrap=detector.wrap,
-        free_running=plan.free_running,
+        free_running=free_running,
     )
+    edges, period = window.start + window.edges, window.period if detector.wrap else None
     matrix = response_matrix(
-        plan.irf,
-        source_start=plan.gate_start,
-        source_width=plan.bin_width,
-        source_bins=shape[2],
-        edges=window.start + window.edges,
-        period=window.period if detector.wrap else None,
+        camera.irf, source_start=axis[0], source_width=axis[1], source_bins=shape[2], edges=edges, period=period
     )
     noise = kernels.dark_count_rates(
         rows.shape[0],
@@ -216,7 +172,7 @@ def _expected(plan: _Plan, device: Any) -> _Light:
         hot_fraction=detector.hot_pixel_fraction,
         hot_rate=detector.hot_pixel_rate,
         offset=detector.ambient_rate,
-        seed=plan.camera_seed,
+        seed=camera.seed,
         device=rows.device,
     )
 
@@ -225,29 +181,27 @@ def _expected(plan: _Plan, device: Any) -> _Light:
 
     hazard = with_noise(rows)
     if detector.crosstalk_probability > 0:
-        if plan.free_running:
-            fired = kernels.free_running_probabilities(
-                hazard, dead_time=detector.dead_time_ns * 1e-9, period=window.period
-            )
+        dead_time = detector.dead_time_ns * 1e-9
+        if free_running:
+            fired = kernels.free_running_probabilities(hazard, dead_time=dead_time, period=window.period)
         else:
             fired = kernels.first_photon_probabilities(hazard)
         kernels.add_crosstalk(hazard, fired, image_width=shape[1], probability=detector.crosstalk_probability)
-    if plan.background is None:
-        background = _noise_alone(plan, window, noise)
+    if background is None:
+        expected_background = _noise_alone(window, noise, equal_bins=camera.tdc_widths is None)
     else:
-        known, known_shape = histogram_rows(plan.background, name="background", **{**form, "device": rows.device})
+        known, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
         if known_shape != shape:
             raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
-        background = with_noise(known)
-    return _Light(hazard, background, window, (shape[0], shape[1]))
+        expected_background = with_noise(known)
+    return _Light(hazard, expected_background, window, (shape[0], shape[1]))
 
 
-def _noise_alone(plan: _Plan, window: Window, noise: Any) -> Any:
-    """Dark counts and ambient light per pulse, `[pixel, 1]` where all bins are equally wide."""
+def _noise_alone(window: Window, noise: Any, *, equal_bins: bool) -> Any:
+    """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
     import warp as wp
 
-    widths = np.diff(window.edges[: window.recorded + 1])
-    widths = widths[:1] if plan.tdc_widths is None else widths
+    widths = np.diff(window.edges[: 2 if equal_bins else window.recorded + 1])
     return wp.array((noise.numpy()[:, None] * widths).astype(np.float32), device=noise.device)
 
 
@@ -263,68 +217,45 @@ class _Drawn(NamedTuple):
     events: dict[str, NDArray] | None
 
 
-def _draw(plan: _Plan, light: _Light, out: Any) -> _Drawn:
+def _draw(
+    light: _Light, detector: Detector, as_torch: bool, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
+) -> _Drawn:
     import warp as wp
 
     from spadwarp_kernels import detection as kernels
 
-    detector, window = plan.detector, light.window
-    shape = (*(() if plan.summed else (plan.frames,)), *light.image, window.recorded)
-    add_frames = plan.by_event and plan.summed  # the kernel of events does not
-    as_torch = is_torch(plan.source) or out is not None
+    window, free_running, frames = light.window, detector.mode == "free_running", numbers["frames"]
+    by_event = free_running or tags or detector.afterpulsing_probability > 0
+    shape = (*(() if summed else (frames,)), *light.image, window.recorded)
+    add_frames = by_event and summed  # the kernel of events does not
+    as_torch = as_torch or out is not None
     if as_torch:
-        out = output_tensor(out, name="out", shape=shape, device=light.device)
+        out = output_tensor(out, name="out", shape=shape, device=light.hazard.device)
     in_place = as_torch and not add_frames
-    common: dict[str, Any] = {
-        "pulses": plan.pulses,
-        "frames": plan.frames,
-        "first_frame": plan.first_frame,
-        "counter_depth": detector.counter_depth,
-        "seed": plan.seed,
-        "counts": wp.from_torch(out).flatten() if in_place else None,
-    }
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.counter_depth}
+    common["counts"] = wp.from_torch(out).flatten() if in_place else None
     events = None
-    if plan.by_event:
+    if by_event:
         counts, events = kernels.event_counts(
             light.hazard,
             edges=window.edges,
             recorded=window.recorded,
             period=window.period,
-            gated=not plan.free_running,
+            gated=not free_running,
             dead_time=detector.dead_time_ns * 1e-9,
             afterpulsing_probability=detector.afterpulsing_probability,
             afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
-            tags=plan.tags,
+            tags=tags,
             **common,
         )
     else:
-        counts = kernels.first_photon_counts(light.hazard, summed=plan.summed, **common)
+        counts = kernels.first_photon_counts(light.hazard, summed=summed, **common)
     to_caller: Any = tensor_of if as_torch else wp.array.numpy
     counts = out if in_place else to_caller(counts)
     if add_frames:
-        counts = counts.reshape(plan.frames, *shape).sum(0, dtype=counts.dtype)
+        counts = counts.reshape(frames, *shape).sum(0, dtype=counts.dtype)
         counts = out.copy_(counts) if as_torch else counts
     return _Drawn(counts.reshape(shape), to_caller(light.hazard), to_caller(light.background), events)
-
-
-def _pack(plan: _Plan, light: _Light, drawn: _Drawn) -> Frames:
-    window = light.window
-    return Frames(
-        counts=drawn.counts,
-        pulses=plan.pulses,
-        frames=plan.frames,
-        first_frame=plan.first_frame,
-        gate_start=window.start,
-        bin_width=plan.bin_width,
-        edges=window.edges[: window.recorded + 1],
-        period=window.period if plan.detector.wrap else None,
-        irf=plan.irf,
-        expected=drawn.expected[:, : window.recorded].reshape(*light.image, -1),
-        background=drawn.background[:, : window.recorded].reshape(*light.image, -1),
-        seed=plan.seed,
-        tags=None if drawn.events is None else _time_tags(drawn.events, light.image, plan.first_frame),
-        notes=missing_light(window, plan.gate_start) if plan.detector.wrap else (),
-    )
 
 
 def _time_tags(events: dict[str, NDArray], image: tuple[int, int], first_frame: int) -> TimeTags:
