@@ -1,0 +1,109 @@
+"""`detect` and `depth`: counts and depth are those of Python."""
+
+import h5py
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.cli import DEVICE, run, tables
+from spadwarp.io.exr import read_exr
+
+
+def test_frames_are_those_of_detect(done, tmp_path):
+    out = tmp_path / "out"
+    options = ("--pulses", "2e3", "--frames", 3, "--seed", 5, "--tags", *DEVICE)
+    told = run("detect", done, "--out", out, *options, "--json", tmp_path / "told.json")
+    result = spadwarp.load_result(done / "result.h5")
+    twin = spadwarp.detect(result, pulses=2000, frames=3, seed=5, tags=True, device="cpu")
+    with h5py.File(out / "frames.h5") as file:
+        assert np.array_equal(file["counts"], twin.counts)
+        assert np.array_equal(file["intensity"], twin.intensity)
+        assert np.array_equal(file["tags/bin"], twin.tags.bin) and np.array_equal(file["tags/y"], twin.tags.y)
+        assert np.array_equal(file["bound/time"], spadwarp.crlb(result, pulses=2000, device="cpu"), equal_nan=True)
+        assert sorted(file["depth"]) == ["centroid", "likelihood", "matched", "peak"]
+        depth = file["depth/likelihood"][...]
+        bound = file["bound/depth"][...]
+    assert (out / "frame.png").read_bytes().startswith(b"\x89PNG")
+    error = np.abs(depth.astype(float) - result.truth.depth)
+    # No estimator beats its bound; this one comes near it: 20 pixels, bins of 15 mm, light that was scattered forward.
+    assert 0.3 * np.median(bound) < np.median(error) < 10 * np.median(bound)
+    plain = tables(tmp_path / "told.json")
+    assert plain["depth"]["likelihood"]["median"] == pytest.approx(np.median(error), rel=1e-3)
+    assert "Cramér–Rao" in told.stdout and told.stdout.count("% of the target's pixels") == 4
+
+
+def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, monkeypatch):
+    monkeypatch.setattr("spadwarp.frames.record._PART_BYTES", 1)
+    run("detect", done, "--out", tmp_path, "--frames", 3, "--method", "peak", "--quiet", *DEVICE)
+    with h5py.File(tmp_path / "frames.h5") as file:
+        twin = spadwarp.detect(spadwarp.load_result(done / "result.h5"), frames=3, seed=0, device="cpu")
+        assert np.array_equal(file["counts"], twin.counts)
+        assert list(file["depth"]) == ["peak"]
+
+
+def test_the_detector_can_be_another(done, tmp_path):
+    dark = ("--set", "detector.dark_count_rate=1e7", "--set", "laser.pulse_energy=1e-20")
+    run(
+        "detect", done, "--out", tmp_path / "dark", *dark, "--method", "peak", "--json", tmp_path / "dark.json", *DEVICE
+    )
+    found = tables(tmp_path / "dark.json")
+    expected = -np.expm1(-1e7 * 150 * 100e-12)  # one count a pulse at most
+    assert found["detections_per_pulse_and_pixel"] == pytest.approx(expected, rel=0.02)
+    refused = run("detect", done, "--out", tmp_path / "x", "--set", "medium.extinction=1", code=2)
+    assert "medium.extinction" in refused.stderr and "simulate again" in refused.stderr
+    assert "frames = 0" in run("detect", done, "--out", tmp_path / "x", "--frames", 0, code=2).stderr
+
+
+def test_depth_of_a_result_is_that_of_python(done, tmp_path):
+    out, points = tmp_path / "out", tmp_path / "points.ply"
+    run("depth", done, "--out", out, "--background", 0, "--ply", points, "--quiet", *DEVICE)
+    result = spadwarp.load_result(done / "result.h5")
+    depth = result.depth(device="cpu")
+    assert np.array_equal(np.load(out / "depth.npy"), depth.astype(np.float32), equal_nan=True)
+    assert np.array_equal(read_exr(out / "depth.exr")[0]["Z"], depth.astype(np.float32), equal_nan=True)
+    assert (out / "depth.png").is_file()
+    import trimesh
+
+    cloud = trimesh.load(points)
+    assert np.allclose(cloud.vertices[:, 2], depth[np.isfinite(depth)], rtol=1e-6)
+
+
+def test_depth_of_frames_knows_the_response(done, tmp_path):
+    run("detect", done, "--out", tmp_path / "frames", "--frames", 2, "--quiet", *DEVICE)
+    run("depth", tmp_path / "frames", "--out", tmp_path / "out", "--method", "matched", *DEVICE)
+    with h5py.File(tmp_path / "frames" / "frames.h5") as file:
+        assert np.allclose(np.load(tmp_path / "out" / "depth.npy"), file["depth/matched"], rtol=1e-5, equal_nan=True)
+    asked = run("depth", done, "--out", tmp_path / "x", "--bin-width-ps", 5, code=2)
+    assert "the file knows its bin width" in asked.stderr
+
+
+def test_depth_of_measured_histograms(tmp_path):
+    """A wall at 3 m in fresh water, whose pulses come back as a Gaussian."""
+    index, width = 1.3566, 50e-12
+    arrival = 2 * 3.0 * index / 299_792_458.0
+    edges = np.arange(401) * width + 20e-9
+    irf = spadwarp.instrument_response(pulse_fwhm=0.0, jitter_fwhm=300e-12)
+    expected = 4000 * irf.bin_fractions(edges, arrival=arrival) + 0.5
+    counts = np.random.default_rng(1).poisson(expected, (3, 4, 400)).astype(np.uint16)
+    np.save(tmp_path / "counts.npy", counts)
+    axis = ("--bin-width-ps", 50, "--gate-start-ns", 20, "--group-index", index, "--irf-fwhm-ps", 300)
+    bound = 300e-12 / 2.3548 / np.sqrt(4000) / arrival * 3.0  # [m], without background
+    for method in ("centroid", "matched", "likelihood"):
+        out = tmp_path / method
+        run("depth", tmp_path / "counts.npy", "--out", out, *axis, "--method", method, "--quiet", *DEVICE)
+        distance = np.load(out / "range.npy")
+        assert np.abs(distance - 3.0).max() < (5 if method == "likelihood" else 40) * bound, method
+        assert "Z" not in read_exr(out / "range.exr")[0]
+
+    seen = ("--horizontal-fov-deg", 60, "--ply", tmp_path / "points.ply", "--json", tmp_path / "told.json")
+    run("depth", tmp_path / "counts.npy", "--out", tmp_path / "seen", *axis, *seen, *DEVICE)
+    assert tables(tmp_path / "told.json")["quantity"] == "depth"
+    depth = np.load(tmp_path / "seen" / "depth.npy")
+    assert depth[1, 1] == pytest.approx(3.0 / np.sqrt(1 + 0.1443**2), rel=2e-3)  # half a pixel off the axis
+
+    for missing, words in ((axis[2:], "bin width"), (axis[:4], "group index")):
+        assert words in run("depth", tmp_path / "counts.npy", "--out", tmp_path / "x", *missing, code=2).stderr
+    without = run("depth", tmp_path / "counts.npy", "--out", tmp_path / "x", *axis[:6], "--method", "matched", code=2)
+    assert "instrument response" in without.stderr
+    blind = run("depth", tmp_path / "counts.npy", "--out", tmp_path / "x", *axis, "--ply", tmp_path / "p.ply", code=2)
+    assert "field of view" in blind.stderr

@@ -1,0 +1,121 @@
+"""Commands that look: check, info, presets, water, devices, validate, targets; help, version, processes."""
+
+import json
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+import spadwarp
+from helpers.cli import DEVICE, ENVIRONMENT, ROOT, run, start, tables
+from spadwarp.cli import app
+
+
+def test_validation_says_what_failed(tmp_path, monkeypatch):
+    report = tmp_path / "report.json"
+    told = run("validate", "ledger", "--photons", "2e3", "--json", report, "--plots", tmp_path / "plots", *DEVICE)
+    found = tables(report)
+    assert found["passed"] and found["photons"] == 2000
+    assert f"{len(found['results'])} of {len(found['results'])} agree" in told.stdout
+    assert (tmp_path / "plots" / "ledger.png").is_file()
+
+    wrong = [spadwarp.validate.CaseResult("ledger", "its sum", 1.0, 2.0, 0.1, -10.0, 1e-20, False)]
+    monkeypatch.setattr("spadwarp.validate.validate", lambda *_, **__: wrong)
+    failed = run("validate", "ledger", code=1)
+    assert "0 of 1 agree" in failed.stdout and "its sum: z = -10.00" in failed.stderr
+    monkeypatch.undo()
+    assert "nope" in run("validate", "nope", code=2).stderr
+    assert "cube60" in run("validate", "--list").stdout
+
+
+def test_targets_are_listed_and_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr("spadwarp.viz.targets.builtin_names", lambda: ("plane", "staircase"))
+    told = run("targets", "--out", tmp_path / "out", "--json", tmp_path / "told.json", *DEVICE)
+    assert "staircase" in told.stdout and "4.00 x 4.00 x 0.70 m" in told.stdout
+    assert (tmp_path / "out" / "targets.png").read_bytes().startswith(b"\x89PNG")
+    assert tables(tmp_path / "told.json")["targets"][0] == {"name": "plane", "faces": 2, "extent": [1.0, 1.0, 0.0]}
+    assert "not empty" in run("targets", "--out", tmp_path / "out", code=2).stderr
+
+
+def test_check_warns_with_numbers(scene, tmp_path):
+    summary = tmp_path / "summary.json"
+    outcome = run("check", scene, "--set", "targets[0].translation=[0, 0, 9]", "--json", summary)
+    assert "warning: targets[0]: outside the gate" in outcome.stdout
+    found = tables(summary)["messages"]
+    assert found[0]["values"]["stop_ns"] == pytest.approx(22.0)
+    messages = spadwarp.check(spadwarp.load_scene(scene, ["targets[0].translation=[0, 0, 9]"]))
+    assert [message["text"] for message in found] == [message.text for message in messages]
+    assert all(str(message) in outcome.stdout for message in messages)
+
+
+def test_check_accepts_every_scene_that_comes_along():
+    for path in sorted((ROOT / "configs" / "scenes").glob("*.toml")):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            told = run("check", path).stdout
+        lengths = told.partition("attenuation length")[2].partition("\n")[0].split("; ")
+        assert len(lengths) == len(spadwarp.load_scene(path).medium.waters) and all("albedo" in one for one in lengths)
+
+
+def test_info_tells_what_the_result_holds(scene, tmp_path):
+    result = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu")
+    result.save(tmp_path / "result.h5")
+    summary = tmp_path / "summary.json"
+    told = run("info", tmp_path / "result.h5", "--json", summary).stdout
+    assert run("info", tmp_path).stdout == told  # the directory stands for the result in it
+    assert "20 000, seed 3" in told and "Energy ledger, exact" in told and "100.000000 %" in told
+    assert tables(summary) == json.loads(json.dumps(result.summary()))
+
+
+def test_presets_water_and_devices_are_those_of_python(tmp_path):
+    summary = tmp_path / "summary.json"
+    told = run("presets", "medium", "--json", summary).stdout
+    names = [preset["name"] for preset in tables(summary)["presets"]]
+    assert names == list(spadwarp.presets("medium"))
+    assert all(name in told for name in names) and "picoquant" not in told
+    assert "picoquant-visuv-532" in run("presets").stdout
+
+    told = run("water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", summary).stdout
+    optics = spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
+    assert f"{optics.extinction:.4g} 1/m" in told and f"{optics.group_index:.5f}" in told
+    assert tables(summary)["absorption"] == optics.absorption
+
+    assert "cpu" in run("devices", "--json", summary).stdout
+    assert tables(summary)["devices"] == spadwarp.devices()
+    assert sum(device["default"] for device in spadwarp.devices()) == 1
+
+
+def test_every_help_shows_an_example():
+    assert "Example" in run("--help").stdout
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__
+        told = run(name, "--help").stdout
+        assert f"spadwarp {name}" in told.split("Example", 1)[1], name
+
+
+def test_version():
+    assert run("--version").stdout == f"spadwarp {spadwarp.__version__}\n"
+
+
+def test_importing_the_command_line_loads_nothing_heavy():
+    code = "import sys, spadwarp.cli; print(*sys.modules)"
+    told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    heavy = {"warp", "h5py", "matplotlib", "trimesh", "torch", "OpenEXR", "pydantic", "numpy", "scipy", "manifold3d"}
+    assert heavy.isdisjoint(told.stdout.split())
+
+
+def test_a_process_keeps_stdout_for_the_answer(scene):
+    """Also on a machine without a GPU, of which Warp's native code would complain."""
+    process = start("devices")
+    told, complaints = process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert "Warp" not in told + complaints
+    assert told.startswith("cpu")
+
+
+def test_exit_code_of_a_process_that_was_used_wrongly(scene):
+    process = start("simulate", scene)
+    _, complaints = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "Traceback" not in complaints

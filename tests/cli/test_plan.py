@@ -1,0 +1,71 @@
+"""`analytic`, `budget` and `sweep` say what Python says."""
+
+import h5py
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.cli import DEVICE, run, tables
+from spadwarp.result.file import save_truth_maps
+
+
+def test_analytic_frames_are_those_of_python(spad_scene, tmp_path):
+    options = ("--frames", 7, "--seed", 3, "--set", "analytic.backscatter_fraction=0.2", *DEVICE)
+    told = run("analytic", spad_scene, "--out", tmp_path, *options, "--json", tmp_path / "told.json")
+    twin = spadwarp.simulate_analytic(
+        spadwarp.load_scene(spad_scene, {"analytic.backscatter_fraction": 0.2}), frames=7, seed=3, device="cpu"
+    )
+    with h5py.File(tmp_path / "analytic.h5") as file:
+        assert np.array_equal(file["depth"], twin.depth, equal_nan=True)
+        assert np.array_equal(file["labels"], twin.labels)
+        assert np.array_equal(file["maps/sigma_depth"], twin.sigma_depth, equal_nan=True)
+    assert tables(tmp_path / "told.json")["sigma_depth"] == np.median(twin.sigma_depth)
+    assert "20 % of their pixels report background" in told.stdout and (tmp_path / "analytic.png").is_file()
+
+
+def test_analytic_takes_truth_and_profile_from_files(spad_scene, done, tmp_path):
+    result = spadwarp.load_result(done / "result.h5")
+    exported = save_truth_maps(result, tmp_path / "truth.exr")
+    rendered = ("--depth", exported, "--depth-channel", "Z", "--depth-scale", 1, "--albedo", 0.7)
+    run("analytic", spad_scene, "--out", tmp_path / "a", *rendered, "--frames", 0, *DEVICE)
+    run("analytic", spad_scene, "--out", tmp_path / "b", "--frames", 0, "--quiet", *DEVICE)
+    with h5py.File(tmp_path / "a" / "analytic.h5") as a, h5py.File(tmp_path / "b" / "analytic.h5") as b:
+        assert np.allclose(a["truth/range"], b["truth/range"], rtol=1e-6)
+        facing = -b["truth/normal"][..., 2]  # without normals every surface faces the camera
+        assert (a["maps/signal"][...] >= b["maps/signal"][...] * (1 - 1e-6)).all() and (facing <= 1).all()
+    monte_carlo = ("--set", "analytic.backscatter=monte_carlo", "--profile", done)
+    run("analytic", spad_scene, "--out", tmp_path / "c", *monte_carlo, *DEVICE)
+    with h5py.File(tmp_path / "c" / "analytic.h5") as file:
+        scale = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+        assert np.allclose(file["maps/backscatter"], result.component("backscatter").sum(-1) * scale, rtol=1e-5)
+    assert "--depth" in run("analytic", spad_scene, "--out", tmp_path / "x", "--radial", code=2).stderr
+    assert "monte_carlo" in run("analytic", spad_scene, "--out", tmp_path / "x", "--profile", done, code=2).stderr
+    wrong = run("analytic", spad_scene, "--out", tmp_path / "x", "--depth", exported, "--depth-channel", "Q", code=1)
+    assert "no channel 'Q'" in wrong.stderr
+
+
+def test_budget_is_that_of_python(spad_scene, tmp_path):
+    summary = tmp_path / "told.json"
+    waters = ("--medium", "uwoc-clear", "--medium", "uwoc-harbour")
+    told = run("budget", spad_scene, "--range", "1:3:3", *waters, "--out", tmp_path / "out", "--json", summary, *DEVICE)
+    twin = spadwarp.budget(spadwarp.load_scene(spad_scene), [1, 2, 3], ["uwoc-clear", "uwoc-harbour"], device="cpu")
+    assert [row["signal"] for row in tables(summary)["rows"]] == [row.signal for row in twin]
+    assert "uwoc-harbour" in told.stdout and "range [m]" in told.stdout and "σ* [mm]" in told.stdout
+    csv = (tmp_path / "out" / "budget.csv").read_text().splitlines()
+    assert len(csv) == 7 and csv[0].startswith("medium,extinction,range")
+    assert (tmp_path / "out" / "budget.png").is_file()
+    assert "'x'" in run("budget", spad_scene, "--range", "x", code=2).stderr
+    assert "uwoc-clear" in run("budget", spad_scene, "--medium", "uwoc-cleer", code=2).stderr
+
+
+@pytest.mark.parametrize("of", ["budget", "depth-error"])
+def test_sweep_is_that_of_python(spad_scene, tmp_path, of):
+    summary, vary = tmp_path / "told.json", "medium.extinction=0.1:2:3"
+    run("sweep", spad_scene, "--vary", vary, "--of", of, "--out", tmp_path / "out", "--json", summary, *DEVICE)
+    twin = spadwarp.sweep(spadwarp.load_scene(spad_scene), vary=vary, of=of, device="cpu")
+    found = tables(summary)
+    assert (found["field"], found["values"]) == ("medium.extinction", [0.1, 1.05, 2.0])
+    assert [row["sigma_depth"] for row in found["rows"]] == [row.sigma_depth for row in twin.rows]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep.png", "sweep.csv"}
+    for wrong, words in (("medium.typo=1:2:2", "medium.typo"), ("nonsense", "from:to:count")):
+        assert words in run("sweep", spad_scene, "--vary", wrong, "--out", tmp_path / "x", code=2).stderr

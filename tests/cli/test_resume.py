@@ -1,0 +1,135 @@
+"""Runs that stop, go on and are added up."""
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.cli import DEVICE, FILES, PICTURES, run, start, tables
+
+
+def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):
+    """Also of one that stopped early because it was good enough."""
+    out = tmp_path / "out"
+    options = ("--relative-error", 0.3, "--photons", 200_000, "--quiet", *DEVICE)
+    run("simulate", spad_scene, "--out", out, *options, "--json", tmp_path / "first.json")
+    first = spadwarp.load_result(out / "result.h5")
+    assert 0 < tables(tmp_path / "first.json")["relative_error"] == first.relative_error <= 0.3
+    assert first.photons < 200_000 and not first.partial
+
+    total = 2 * first.photons
+    told = run("simulate", "--resume", out, "--photons", total, *DEVICE)
+    result = spadwarp.load_result(out / "result.h5")
+    long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=total, device="cpu")
+    assert np.array_equal(result.tallies, long.tallies) and result.ledger == long.ledger
+    assert result.photons == total == spadwarp.load_scene(out / "scene.toml").transport.photons
+    assert f"{100 * result.relative_error:.3g} % in the bins that decide the depth" in told.stdout
+
+
+def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
+    one, two, both = (tmp_path / name for name in ("one", "two", "both"))
+    size = spadwarp.load_result(done / "result.h5").batch_size
+    first, second = 16 * size, 16 * size
+    for out, photons, begin in ((one, first, 0), (two, second, first)):
+        options = ("--photons", photons, "--first-photon", begin, "--quiet", *DEVICE)
+        run("simulate", spad_scene, "--out", out, *options)
+    told = run("merge", one, two / "result.h5", "--out", both, "--json", tmp_path / "both.json", *DEVICE)
+    merged = spadwarp.load_result(both / "result.h5")
+    long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=first + second, device="cpu")
+    assert np.array_equal(merged.tallies, long.tallies) and merged.ledger == long.ledger
+    assert tables(tmp_path / "both.json")["photon_ranges"] == [[0, first + second]]
+    assert "closes exactly" in told.stdout and (both / "depth.exr").is_file()
+    assert "photon ids 0 to" in run("merge", one, one, "--out", tmp_path / "twice", code=2).stderr
+
+
+def test_what_does_not_go_with_resume(spad_scene, done, tmp_path):
+    assert "--seed" in run("simulate", "--resume", done, "--seed", 3, code=2).stderr
+    assert "SCENE" in run("simulate", spad_scene, "--resume", done, code=2).stderr
+    photons = spadwarp.load_result(done / "result.h5").photons
+    assert f"no more than the {photons}" in run("simulate", "--resume", done, code=2).stderr
+    run("simulate", "--resume", tmp_path, code=1)
+    assert (
+        "outside (0, 1)" in run("simulate", spad_scene, "--out", tmp_path / "x", "--relative-error", 2, code=2).stderr
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends signals")
+@pytest.mark.parametrize(("number", "pictures"), [(signal.SIGINT, PICTURES), (signal.SIGTERM, set())])
+def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
+    """Ctrl-C, and what a job scheduler sends before it kills."""
+    out = tmp_path / "out"
+    options = ("--photons", "1e11", "--seed", 3, "--set", f"output.png={'true' if pictures else 'false'}")
+    process = start("simulate", scene, "--out", out, *DEVICE, *options)
+    for line in process.stderr:
+        if " % " in line:
+            break
+    process.send_signal(number)
+    _, complaints = process.communicate(timeout=120)
+    assert process.returncode == 130, complaints
+    assert "marked partial" in complaints
+
+    result = spadwarp.load_result(out / "result.h5")
+    assert result.partial and 0 < result.photons < 10**11
+    assert result.ledger_report()["exact"]
+    assert {path.name for path in out.iterdir()} == FILES | pictures
+    assert "stopped early" in run("info", out).stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGKILL")
+def test_a_killed_run_goes_on_from_its_checkpoint(scene, tmp_path):
+    """Killed twice; the outcome is that of one run."""
+    out, kept = tmp_path / "out", tmp_path / "out" / "checkpoint.h5"
+    first = start("simulate", scene, "--out", out, *DEVICE, "--photons", "1e11", "--checkpoint", 0.1)
+    before = kill_after_checkpoint(first, kept, newer_than=0)
+    assert before.partial and before.ledger_report()["exact"] and before.requested == (0, 10**11)
+    assert not (out / "result.h5").exists()
+    assert f"--resume {out} goes on" in run("simulate", scene, "--out", out, code=2).stderr.replace("\n", " ")
+    second = start("simulate", "--resume", out, *DEVICE, "--checkpoint", 0.1)
+    after = kill_after_checkpoint(second, kept, newer_than=kept.stat().st_mtime_ns)
+    assert after.photons > before.photons
+
+    total = after.photons + 50_000
+    run("simulate", "--resume", out, *DEVICE, "--photons", total)
+    result = spadwarp.load_result(out / "result.h5")
+    long = spadwarp.simulate(spadwarp.load_scene(scene), photons=total, device="cpu")
+    assert np.array_equal(result.tallies, long.tallies) and result.ledger == long.ledger
+    assert not result.partial and "the first of 3 parts" in run("info", out).stdout
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def kill_after_checkpoint(process, kept, *, newer_than):
+    while not kept.exists() or kept.stat().st_mtime_ns <= newer_than:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.kill()
+    process.communicate(timeout=60)
+    return spadwarp.load_result(kept)
+
+
+def test_shards_are_merged(scene, tmp_path):
+    parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
+    for number, out in enumerate(parts, 1):
+        run("simulate", scene, "--out", out, *DEVICE, "--shard", f"{number}/3", "--uncertainty", "--quiet")
+    told = run("merge", *parts, "--out", tmp_path / "all", *DEVICE)
+    merged = spadwarp.load_result(tmp_path / "all" / "result.h5")
+    whole = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu", uncertainty=True)
+    assert np.array_equal(merged.tallies, whole.tallies) and np.array_equal(merged.second_moment, whole.second_moment)
+    assert f"photon ids  0 to {whole.photons - 1:,}".replace(",", " ") in told.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--shard", "4/3"), "4/3 is outside"),
+        (("--shard", "half"), "such as 3/64"),
+        (("--engine", "slurm"), "is not local or ray"),
+        (("--workers", "2"), "needs --engine ray"),
+        (("--shard", "1/2", "--records"), "photon 0"),
+        (("--device", "cuda:1", "--engine", "ray"), "cuda:1"),
+    ],
+)
+def test_wrong_parts_and_engines_are_named(scene, tmp_path, arguments, words):
+    assert words in run("simulate", scene, "--out", tmp_path / "out", *arguments, code=2).stderr
