@@ -25,7 +25,7 @@ from pydantic_core import PydanticUndefined
 
 import spadwarp
 from spadwarp.cli import app
-from spadwarp.dataset.recipe import Distribution, Recipe
+from spadwarp.dataset import Distribution, Recipe
 from spadwarp.scene import Scene
 from spadwarp.scene.load import COEFFICIENTS
 
@@ -245,9 +245,8 @@ def _short(value: Any) -> str:
 
 def dataset() -> str:
     """Datasets in the files of a dataset."""
-    from spadwarp.dataset.histograms import MEANING
-    from spadwarp.dataset.sampling import Plan
-    from spadwarp.dataset.schema import FRAME_COLUMNS, scene_columns
+    from spadwarp.dataset import Plan
+    from spadwarp.dataset.schema import FRAME_COLUMNS, HISTOGRAM_COLUMNS, scene_columns
 
     def table(rows: Mapping[str, tuple[str, str]]) -> str:
         lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]
@@ -266,7 +265,7 @@ def dataset() -> str:
         "## scenes-NNNNN.h5 and scenes.h5\n\nOne row a scene.\n\n" + table(scenes),
         "## histograms-NNNNN.h5\n\nOf traced scenes: `scene`, `expected`, `gate_start` and `bin_width` have a row "
         "a scene, `sample` and the counts a row a frame. Counts are stored as cubes (`counts`), or event by event.\n\n"
-        + table(MEANING),
+        + table(HISTOGRAM_COLUMNS),
     ]
     return "\n\n".join(parts) + "\n"
 

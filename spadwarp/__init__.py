@@ -61,13 +61,13 @@ _HOMES = {
     "video": "viz.transient_video",
     "to_torch": "result",
     "TorchResult": "result",
-    "load_recipe": "dataset.recipe",
-    "Recipe": "dataset.recipe",
-    "make_dataset": "dataset.make",
-    "verify_dataset": "dataset.make",
-    "FrameReader": "dataset.read",
-    "SpadDataset": "dataset.read",
-    "iterate_dataset": "dataset.read",
+    "load_recipe": "dataset",
+    "Recipe": "dataset",
+    "make_dataset": "dataset",
+    "verify_dataset": "dataset",
+    "FrameReader": "dataset",
+    "SpadDataset": "dataset",
+    "iterate_dataset": "dataset",
     "SpadwarpError": "errors",
     "ArgumentError": "errors",
     "ConfigError": "errors",
@@ -86,9 +86,15 @@ if TYPE_CHECKING:
     from spadwarp.analytic.photon_budget import budget
     from spadwarp.benchmark.cases import bench
     from spadwarp.checks import check
-    from spadwarp.dataset.make import make_dataset, verify_dataset
-    from spadwarp.dataset.read import FrameReader, SpadDataset, iterate_dataset
-    from spadwarp.dataset.recipe import Recipe, load_recipe
+    from spadwarp.dataset import (
+        FrameReader,
+        Recipe,
+        SpadDataset,
+        iterate_dataset,
+        load_recipe,
+        make_dataset,
+        verify_dataset,
+    )
     from spadwarp.device import devices
     from spadwarp.doctor.diagnosis import Diagnosis, SelfTest
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError

@@ -111,7 +111,7 @@ def info(folder: Folder, json_path: opt.Json = None) -> None:
     Example:
       spadwarp dataset info data/small/
     """
-    from spadwarp.dataset.make import read_manifest
+    from spadwarp.dataset import read_manifest
 
     manifest = read_manifest(folder)
     size = sum(one["bytes"] for one in manifest["files"].values())

@@ -1,5 +1,27 @@
 """Datasets of labelled depth frames: recipes, the generator, and readers.
 
-`recipe` says what a dataset is drawn from, `plan` draws it, `scenes` renders a scene and its frames, `shards` and
-`making` write files, `reading` reads them.
+`load_recipe` reads what a dataset is drawn from, `make_dataset` makes it, `verify_dataset` checks its files;
+`FrameReader`, `SpadDataset` (for torch) and `iterate_dataset` read it.
 """
+
+from spadwarp.dataset.make import DatasetReport, make_dataset
+from spadwarp.dataset.manifest import read_manifest, verify_dataset
+from spadwarp.dataset.read import FIELDS, FrameReader, SpadDataset, iterate_dataset
+from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe, load_recipe
+from spadwarp.dataset.sampling import Plan
+
+__all__ = [
+    "FIELDS",
+    "SPLITS",
+    "DatasetReport",
+    "Distribution",
+    "FrameReader",
+    "Plan",
+    "Recipe",
+    "SpadDataset",
+    "iterate_dataset",
+    "load_recipe",
+    "make_dataset",
+    "read_manifest",
+    "verify_dataset",
+]

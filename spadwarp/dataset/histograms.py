@@ -1,98 +1,79 @@
 """Histograms of traced scenes in one file a shard: expected counts of the scenes, counts of the frames.
 
-Counts are stored as a cube for each frame, or event by event: indices of the bins that hold any, y · W · T + x · T + k,
-and how many. Frame n's events are those from `event_start[n]` to `event_start[n + 1]`.
+Counts are stored as a cube for each frame, or event by event: the index y · W · T + x · T + k of each bin that holds
+counts, and their number. Frame n's events are those from `event_start[n]` to `event_start[n + 1]`.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.render_analytic import RenderedScene
+from spadwarp.dataset.rendered import RenderedScene
+from spadwarp.dataset.schema import HISTOGRAM_COLUMNS, PACKED, describe
 
 __all__ = ["HistogramFile", "HistogramWriter"]
 
-_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-
-MEANING = {
-    "scene": ("1", "index into scenes.h5"),
-    "expected": ("1", "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"),
-    "gate_start": ("s", "start of bin 0 after the pulse left the laser"),
-    "bin_width": ("s", "of a bin"),
-    "sample": ("1", "id of the frame in the whole dataset"),
-    "counts": ("1", "counts of the frame"),
-    "event_start": ("1", "first event of each frame; one entry more than frames"),
-    "event_index": ("1", "y * W * T + x * T + bin"),
-    "event_count": ("1", "counts in that bin"),
-}
+_KINDS = {"scene": np.int32, "gate_start": np.float64, "bin_width": np.float64, "sample": np.int64}
 
 
 class HistogramWriter:
     """Takes the traced scenes of a shard one by one into an open file; `close` writes the rest."""
 
     def __init__(self, file: Any, scenes: int, *, counts: str) -> None:
-        self._file, self._scenes, self._how = file, scenes, counts
+        self._file, self._scenes, self._counts = file, scenes, counts
         self._expected: Any = None
-        self._numbers: dict[str, list[Any]] = {name: [] for name in ("scene", "gate_start", "bin_width", "sample")}
+        self._numbers: dict[str, list[Any]] = {name: [] for name in _KINDS}
         self._events: list[tuple[NDArray[np.uint32], NDArray[np.int32]]] = []
 
-    def add(self, one: RenderedScene, samples: NDArray[np.int64]) -> None:
-        """The next scene."""
-        found = one.histograms
-        assert found is not None
-        height, width, bins = found.expected.shape
+    def add(self, rendered: RenderedScene, samples: NDArray[np.int64]) -> None:
+        """The next scene, and the ids of its frames."""
+        histograms, gate = rendered.histograms, rendered.scene.gate
+        assert histograms is not None
+        height, width, bins = histograms.expected.shape
         if self._expected is None:
             rows = max(1, min(height, (1 << 20) // (2 * width * bins)))  # chunks of 1 MiB
-            shape, self._chunk = (self._scenes, height, width, bins), (1, rows, width, bins)
-            self._expected = self._file.create_dataset(
-                "expected", shape, np.float16, chunks=self._chunk, track_times=False, **_PACKED
-            )
-        self._expected[len(self._numbers["scene"])] = found.expected
-        gate = one.scene.gate
-        for name, value in (("scene", one.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
+            self._chunk = (1, rows, width, bins)
+            self._expected = self._create("expected", (self._scenes, height, width, bins), np.float16)
+        self._expected[len(self._numbers["scene"])] = histograms.expected
+        for name, value in (("scene", rendered.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
             self._numbers[name].append(value)
         self._numbers["sample"].extend(samples)
-        if self._how != "none":
-            for frame in found.counts.reshape(len(found.counts), -1):
-                where = np.flatnonzero(frame)
-                self._events.append((where.astype(np.uint32), frame[where]))
+        if self._counts != "none":
+            for frame in histograms.counts.reshape(len(histograms.counts), -1):
+                filled = np.flatnonzero(frame)
+                self._events.append((filled.astype(np.uint32), frame[filled]))
 
     def close(self) -> None:
-        """Writes what could only be known at the end."""
-        kinds = {"scene": np.int32, "gate_start": np.float64, "bin_width": np.float64, "sample": np.int64}
-        for name, kind in kinds.items():
+        """Writes what is only known at the end."""
+        for name, kind in _KINDS.items():
             self._file.create_dataset(name, data=np.array(self._numbers[name], kind), track_times=False)
         if self._events:
             self._write_counts()
-        for name, one in self._file.items():
-            unit, text = MEANING[name]
-            one.attrs.update({"unit": unit, "description": text})
+        describe(self._file, HISTOGRAM_COLUMNS)
+
+    def _create(self, name: str, shape: tuple[int, ...], kind: Any) -> Any:
+        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **PACKED)
 
     def _write_counts(self) -> None:
-        most = max((int(counts.max(initial=0)) for _, counts in self._events), default=0)
-        kind = np.uint8 if most < 256 else np.uint16 if most < 65536 else np.uint32
-        each = np.dtype(kind).itemsize
-        total = sum(counts.size for _, counts in self._events)
+        indices, counts = zip(*self._events, strict=True)
+        sizes = [part.size for part in counts]
+        kind = np.min_scalar_type(max((int(part.max(initial=0)) for part in counts), default=0))
         shape = self._expected.shape[1:]
-        dense_bytes = len(self._events) * int(np.prod(shape)) * each
-        if self._how == "dense" or (self._how == "smaller" and dense_bytes <= (4 + each) * total):
-            options = {"chunks": self._chunk, "track_times": False, **_PACKED}
-            stored = self._file.create_dataset("counts", (len(self._events), *shape), kind, **options)
-            for row, (where, counts) in enumerate(self._events):
-                stored[row] = _cube(where, counts, shape, kind)
+        dense_bytes = len(counts) * math.prod(shape) * kind.itemsize
+        if self._counts == "dense" or (self._counts == "smaller" and dense_bytes <= (4 + kind.itemsize) * sum(sizes)):
+            stored = self._create("counts", (len(counts), *shape), kind)
+            for row, (index, count) in enumerate(self._events):
+                stored[row] = _cube(index, count, shape, kind)
             return
-        starts = np.concatenate([[0], np.cumsum([counts.size for _, counts in self._events])]).astype(np.int64)
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         self._file.create_dataset("event_start", data=starts, track_times=False)
-        parts = {
-            "event_index": np.concatenate([where for where, _ in self._events]),
-            "event_count": np.concatenate([counts for _, counts in self._events]).astype(kind),
-        }
-        for name, values in parts.items():
-            chunks = (max(1, min(values.size, 1 << 18)),)
-            packed = {"chunks": chunks, **_PACKED} if values.size else {}
+        events = {"event_index": np.concatenate(indices), "event_count": np.concatenate(counts).astype(kind)}
+        for name, values in events.items():
+            packed = {"chunks": (min(values.size, 1 << 18),), **PACKED} if values.size else {}
             self._file.create_dataset(name, data=values, track_times=False, **packed)
 
 
@@ -101,8 +82,9 @@ class HistogramFile:
 
     def __init__(self, file: Any) -> None:
         self._file = file
-        self._scenes = {int(one): row for row, one in enumerate(file["scene"][...])}
-        self._samples = {int(one): row for row, one in enumerate(file["sample"][...])}
+        self._scenes, self._samples = (
+            {int(number): row for row, number in enumerate(file[name][...])} for name in ("scene", "sample")
+        )
         self._starts = file["event_start"][...] if "event_start" in file else None
         self.shape: tuple[int, ...] = file["expected"].shape[1:]
 
@@ -122,7 +104,7 @@ class HistogramFile:
         return _cube(self._file["event_index"][part], self._file["event_count"][part], self.shape, np.float32)
 
 
-def _cube(where: NDArray[Any], counts: NDArray[Any], shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
+def _cube(index: NDArray[Any], counts: NDArray[Any], shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
     cube = np.zeros(int(np.prod(shape)), kind)
-    cube[where] = counts
+    cube[index] = counts
     return cube.reshape(shape)

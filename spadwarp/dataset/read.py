@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.histograms import HistogramFile
-from spadwarp.dataset.make import read_manifest
+from spadwarp.dataset.manifest import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.errors import ArgumentError, FileError
 
@@ -43,11 +43,11 @@ class FrameReader:
         split: "train", "validation", "test", or "all".
         fields: Images of an item, from `FIELDS`.
         crop: Side, or height and width, of a random part of the frame; None for the whole.
-        augment: Whether items are turned by random multiples of 90° (of 180° where they are not square) and mirrored.
-        repeats: How many differently cropped and turned items there are of each frame.
-        seed: Of crops and turns. They depend on it, on the epoch (`set_epoch`) and on the item's index alone.
+        augment: Whether items are rotated by random multiples of 90° (180° where they are not square) and mirrored.
+        repeats: How many differently cropped and rotated items there are of each frame.
+        seed: Of crops and rotations. They depend on it, on the epoch (`set_epoch`) and on the item's index alone.
 
-    Files are opened in the process that reads them, when it does: workers of a `DataLoader` need no care.
+    Each process opens the files for itself when it first reads: workers of a `DataLoader` need no extra care.
 
     Raises:
         FileError: No dataset, or one that is not whole.
@@ -79,11 +79,9 @@ class FrameReader:
         self.crop = (crop, crop) if isinstance(crop, int) else crop
         if self.crop is not None and not all(1 <= a <= b for a, b in zip(self.crop, self.shape, strict=True)):
             raise ArgumentError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
-        self.shards: list[str] = [
-            name for one in (SPLITS if split == "all" else (split,)) for name in self.manifest["splits"][one]["shards"]
-        ]
-        per_scene = self.manifest["frames_per_scene"]
-        self._stops = np.cumsum([_frames_in(self.path / name, per_scene) for name in self.shards], dtype=np.int64)
+        splits = [self.manifest["splits"][name] for name in (SPLITS if split == "all" else (split,))]
+        self.shards: list[str] = [shard for described in splits for shard in described["shards"]]
+        self._stops = np.cumsum([_frame_count(self.path / name) for name in self.shards], dtype=np.int64)
         self._open: dict[int, _Shard] = {}
         self._process = os.getpid()
 
@@ -96,7 +94,7 @@ class FrameReader:
         return int(self._stops[-1]) if len(self._stops) else 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Other crops and turns than those of other epochs."""
+        """Crops and rotations differ from epoch to epoch."""
         self.epoch = epoch
 
     def __getitem__(self, index: int) -> dict[str, Any]:
@@ -107,25 +105,28 @@ class FrameReader:
         number = int(np.searchsorted(self._stops, frame, side="right"))
         shard = self._shard(number)
         row = frame - (int(self._stops[number - 1]) if number else 0)
-        window: tuple[slice, slice] = (slice(None), slice(None))
-        turns, mirrored = 0, False
-        if self.crop is not None or self.augment:
-            generator = np.random.Generator(np.random.Philox(key=[self.seed, self.epoch], counter=[0, 0, index, 0]))
-            if self.crop is not None:
-                corner = [int(generator.integers(b - a + 1)) for a, b in zip(self.crop, self.shape, strict=True)]
-                window = tuple(slice(low, low + side) for low, side in zip(corner, self.crop, strict=True))  # type: ignore[assignment]
-            if self.augment:
-                height, width = self.crop or self.shape
-                turns = int(generator.integers(4)) if height == width else 2 * int(generator.integers(2))
-                mirrored = bool(generator.integers(2))
+        window, turns, mirrored = self._changes(index)
         item: dict[str, Any] = {}
         for name, image in shard.images(row, self.fields, window).items():
             if turns:
                 image = np.rot90(image, turns, axes=(-2, -1))
             item[name] = np.ascontiguousarray(image[..., ::-1] if mirrored else image)
         if "normal" in item:
-            item["normal"] = _turned(item["normal"], turns, mirrored)
+            item["normal"] = _rotated(item["normal"], turns, mirrored)
         return item | shard.numbers(row)
+
+    def _changes(self, index: int) -> tuple[tuple[slice, slice], int, bool]:
+        """The part of the frame, the rotations by 90°, and whether it is mirrored."""
+        generator = np.random.Generator(np.random.Philox(key=[self.seed, self.epoch], counter=[0, 0, index, 0]))
+        height, width = self.crop or self.shape
+        top = left = turns = 0
+        mirrored = False
+        if self.crop is not None:
+            top, left = (int(generator.integers(b - a + 1)) for a, b in zip(self.crop, self.shape, strict=True))
+        if self.augment:
+            turns = int(generator.integers(4)) if height == width else 2 * int(generator.integers(2))
+            mirrored = bool(generator.integers(2))
+        return (slice(top, top + height), slice(left, left + width)), turns, mirrored
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for index in range(len(self)):
@@ -178,11 +179,9 @@ def iterate_dataset(
 
 
 class _Shard:
-    """Two open files. What is stored without compression is read past HDF5, through a memory map."""
+    """Two or three open files. What is stored without compression is read past HDF5, through a memory map."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        import h5py
-
         self.frames = _opened(folder / name)
         self.scenes = _opened(folder / "scenes" / name.replace("frames-", "scenes-"))
         cubes = folder / name.replace("frames-", "histograms-")
@@ -190,37 +189,49 @@ class _Shard:
         depth = self.frames["depth"]
         self.step, self.offset = np.float32(depth.attrs["step"]), np.float32(depth.attrs["offset"])
         self.width: int = depth.shape[2]
-        self.stored = {one: _mapped(folder / name, self.frames[one]) for one in ("depth", "label", "intensity")}
-        place = Path(self.scenes.filename)
-        self.scene_images = {field: _mapped(place, self.scenes[column]) for field, column in _SCENE_FIELDS.items()}
+        self.stored = {field: _mapped(self.frames[field]) for field in ("depth", "label", "intensity")}
+        self.scene_images = {field: _mapped(self.scenes[column]) for field, column in _SCENE_FIELDS.items()}
         self.columns: dict[str, NDArray[Any]] = {
-            one: value[...] for one, value in self.frames.items() if isinstance(value, h5py.Dataset) and value.ndim == 1
+            column: stored[...] for column, stored in self.frames.items() if stored.ndim == 1
         }
         self.gate = np.stack([self.scenes["gate_near"][...], self.scenes["gate_far"][...]], axis=1).astype(np.float32)
         self.profiles, self.edges = self.scenes["backscatter_profile"][...], self.scenes["profile_edges"][...]
         self.first_scene = int(self.columns["scene"][0])
 
     def images(self, row: int, fields: Sequence[str], window: tuple[slice, slice]) -> dict[str, NDArray[np.float32]]:
-        scene = int(self.columns["scene"][row]) - self.first_scene
-        out: dict[str, NDArray[np.float32]] = {}
-        for name in fields:
-            if name == "noisy":
-                out[name] = self._noisy(row, window)[None]
-            elif name == "label":
-                rows, columns = window
-                bits = np.unpackbits(self.stored["label"][row, rows], axis=-1, count=self.width)
-                out[name] = bits[:, columns].astype(np.float32)[None]
-            elif name == "intensity":
-                scale = self.columns["intensity_step"][row]
-                out[name] = np.multiply(self.stored["intensity"][(row, *window)], scale, dtype=np.float32)[None]
-            elif name == "prior":
-                out[name] = self._prior(scene, self._noisy(row, window))[None]
-            elif name in ("counts", "expected"):
-                out[name] = np.moveaxis(self._histogram(name, row)[window], -1, 0)
-            else:
-                image = np.array(self.scene_images[name][(scene, *window)], np.float32)
-                out[name] = np.moveaxis(image, -1, 0) if name == "normal" else image[None]
-        return out
+        """A frame's images by field, `[C, H, W]` each."""
+        return {name: self._image(name, row, window) for name in fields}
+
+    def numbers(self, row: int) -> dict[str, Any]:
+        """What else an item holds."""
+        whole, real = ("sample", "scene", "target"), ("backscatter_fraction", "attenuation_lengths", "distance")
+        return {
+            **{name: int(self.columns[name][row]) for name in whole},
+            **{name: np.float32(self.columns[name][row]) for name in real},
+            "gate": self.gate[self._scene(row)].copy(),
+        }
+
+    def _scene(self, row: int) -> int:
+        return int(self.columns["scene"][row]) - self.first_scene
+
+    def _image(self, name: str, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
+        image: NDArray[Any]
+        if name in ("counts", "expected"):
+            return np.moveaxis(self._histogram(name, row)[window], -1, 0)
+        if name == "noisy":
+            image = self._noisy(row, window)
+        elif name == "prior":
+            image = self._prior(self._scene(row), self._noisy(row, window))
+        elif name == "label":
+            rows, columns = window
+            image = np.unpackbits(self.stored["label"][row, rows], axis=-1, count=self.width)[:, columns]
+        elif name == "intensity":
+            scale = self.columns["intensity_step"][row]
+            image = np.multiply(self.stored["intensity"][(row, *window)], scale, dtype=np.float32)
+        else:
+            image = np.array(self.scene_images[name][(self._scene(row), *window)])
+        image = image.astype(np.float32, copy=False)
+        return np.moveaxis(image, -1, 0) if name == "normal" else image[None]
 
     def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
         cube = None
@@ -230,17 +241,6 @@ class _Shard:
         if cube is None:
             raise FileError(f"{self.frames.filename}: frame {int(self.columns['sample'][row])} has no {name!r}")
         return cube
-
-    def numbers(self, row: int) -> dict[str, Any]:
-        scene = int(self.columns["scene"][row])
-        return {
-            **{name: int(self.columns[name][row]) for name in ("sample", "scene", "target")},
-            **{
-                name: np.float32(self.columns[name][row])
-                for name in ("backscatter_fraction", "attenuation_lengths", "distance")
-            },
-            "gate": self.gate[scene - self.first_scene].copy(),
-        }
 
     def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
         codes = self.stored["depth"][(row, *window)]
@@ -272,21 +272,22 @@ def _opened(path: Path) -> Any:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
-def _mapped(path: Path, stored: Any) -> Any:
+def _mapped(stored: Any) -> Any:
     """A dataset's values without a copy where they lie in one piece, else the dataset itself."""
     offset = stored.id.get_offset()
     if offset is None:
         return stored
-    return np.memmap(path, dtype=stored.dtype, mode="r", offset=offset, shape=stored.shape).view(np.ndarray)
+    path, kind = stored.file.filename, stored.dtype
+    return np.memmap(path, dtype=kind, mode="r", offset=offset, shape=stored.shape).view(np.ndarray)
 
 
-def _frames_in(path: Path, per_scene: int) -> int:
+def _frame_count(path: Path) -> int:
     with _opened(path) as file:
         return int(file["sample"].shape[0])
 
 
-def _turned(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:
-    """Normals of an image that was turned: their x and y turn with it."""
+def _rotated(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:
+    """Normals of an image that was rotated: their x and y rotate with it."""
     x, y, z = normal
     for _ in range(turns):  # np.rot90: what pointed right (+x) points up (−y)
         x, y = y, -x

@@ -5,29 +5,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.render_analytic import (
+from spadwarp.dataset.rendered import (
     Histograms,
     RenderedScene,
     StoredFrames,
-    exposed,
+    backscatter_profile,
     intensity_step,
-    water_profile,
+    with_exposure,
 )
 from spadwarp.dataset.sampling import Plan, SceneDraw
-from spadwarp.frames.cramer_rao import crlb
-from spadwarp.frames.frames import Frames
-from spadwarp.frames.spad import detect
-from spadwarp.result.result import Result
+from spadwarp.frames import Frames, crlb, detect
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
 from spadwarp.transport.simulate import simulate
 
-__all__ = ["render_traced"]
+__all__ = ["render_transport"]
 
-_MOST_PULSES = 2**31 - 1  # what the camera's counters take
+_MOST_PULSES = 2**31 - 1  # the camera counts in 32 bits
 
 
-def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
+def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
     """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
     assert draw.photons is not None
     scene = draw.scene
@@ -38,10 +35,9 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
     water = result.component("backscatter")
     returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
     seen = (returned > 0) & np.isfinite(result.truth.depth)
-    if draw.signal_photons is not None:
-        scene = exposed(scene, draw, returned[seen], most=_MOST_PULSES)
+    scene = with_exposure(scene, draw, returned[seen], most=_MOST_PULSES)
     pulses = min(scene.analytic.pulses_per_depth_frame, _MOST_PULSES)
-    taken = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
+    frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
     time_bound = crlb(result, pulses=pulses, device=device)
     view = pixel_directions(scene.camera)
     distances = np.nan_to_num(result.truth.range.reshape(-1).astype(np.float64))
@@ -52,38 +48,38 @@ def render_traced(plan: Plan, draw: SceneDraw, *, device: str | None, threads: i
         scene=scene,
         truth=result.truth,
         bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
-        profile=water_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
+        profile=backscatter_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
-        frames=_frames(plan, scene, result, taken, device=device),
+        frames=_stored(plan, scene, frames, device=device),
         histograms=Histograms(
-            expected=np.minimum(taken.expected * np.float32(pulses), 65504.0).astype(np.float16), counts=taken.counts
+            expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16), counts=frames.counts
         ),
     )
 
 
-def _frames(plan: Plan, scene: Scene, result: Result, taken: Frames, *, device: str | None) -> StoredFrames:
-    """Depth from the counts, and whether it is background that was most likely reported."""
-    time = taken.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
-    start, stop = taken.gate_start, taken.gate_start + taken.expected.shape[-1] * taken.bin_width
+def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> StoredFrames:
+    """Codes of the depth and the intensity of the counts; labels of the pixels that most likely report background."""
+    time = frames.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
+    start, stop = frames.gate_start, frames.gate_start + frames.expected.shape[-1] * frames.bin_width
     depth = depth_from_time(np.clip(time, start, stop), scene=scene)
     code = np.rint((depth - plan.depth_offset) / plan.depth_step)
     codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
-    counts = taken.counts.sum(axis=-1, dtype=np.int64)
-    step = intensity_step(float((taken.expected.sum(axis=-1) * taken.pulses).max()))
+    counts = frames.counts.sum(axis=-1, dtype=np.int64)
+    step = intensity_step(float((frames.expected.sum(axis=-1) * frames.pulses).max()))
     return StoredFrames(
         depth=codes,
         intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
-        labels=np.packbits(_stray(taken, time), axis=-1),
+        labels=np.packbits(_reports_background(frames, time), axis=-1),
         intensity_step=step,
     )
 
 
-def _stray(taken: Frames, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _reports_background(frames: Frames, time: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether background is more likely than the target at the time that a pixel reports, `[K, H, W]`."""
-    bins = taken.expected.shape[-1]
-    at = np.nan_to_num((time - taken.gate_start) / taken.bin_width).astype(np.int64).clip(0, bins - 1)
-    expected = np.take_along_axis(taken.expected[None], at[..., None], axis=-1)[..., 0]
-    known = np.broadcast_to(taken.background, taken.expected.shape)
+    bins = frames.expected.shape[-1]
+    at = np.nan_to_num((time - frames.gate_start) / frames.bin_width).astype(np.int64).clip(0, bins - 1)
+    expected = np.take_along_axis(frames.expected[None], at[..., None], axis=-1)[..., 0]
+    known = np.broadcast_to(frames.background, frames.expected.shape)
     background = np.take_along_axis(known[None], at[..., None], axis=-1)[..., 0]
     return (background > 0.5 * expected) & ~np.isnan(time)

@@ -1,29 +1,32 @@
-"""Who is who in a dataset: targets and splits, scenes, samples, shards, and what each is drawn from.
+"""What is in a dataset: its targets and splits, scenes, samples and shards, and how each value is drawn.
 
 Numbers follow from the recipe alone. Scene `j` of target `t` has the index t · scenes_per_target + j, and its frame `k`
-the sample id index · frames.per_scene + k. Every value is drawn from (seed of the split, what it is, id) by Philox: no
-draw depends on another, on the order, or on which machine makes the shard.
+the sample id index · frames.per_scene + k. Every value is drawn by Philox with a key of (seed of the split, name of the
+value, id): no draw depends on another, on the order, or on which machine makes the shard.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
-from spadwarp.dataset.targets import find_targets
-from spadwarp.scene import Scene
+from spadwarp.dataset.targets import TargetSource, find_targets
+from spadwarp.scene import Camera, Scene
 from spadwarp.scene.renamed import former_path
 from spadwarp.units import time_from_range
 
 __all__ = ["Plan", "SceneDraw", "Shard"]
 
-_SHORTEST_RANGE = 0.05  # [m], where a gate opens at the nearest
+_SHORTEST_RANGE = 0.05  # [m], the nearest at which a gate opens
+_UNIFORM = Distribution(low=0.0, high=1.0)
+
+_Draw = Callable[[str, Distribution | None], Any]
 
 
 @dataclass(frozen=True)
@@ -61,17 +64,17 @@ class Shard:
 
 @dataclass(frozen=True)
 class SceneDraw:
-    """One scene as it was drawn; its exposure is found later where it hangs on the light that comes back.
+    """One scene as it was drawn; an exposure that depends on the light that returns is found later.
 
     Attributes:
         index: Of the scene.
         target: Index into `Plan.targets`.
-        scene: Without the pulses of `signal_photons`.
+        scene: The scene; where `signal_photons` is given, its number of pulses is not final.
         distance: Of the target's centre [m].
         attenuation_lengths: Extinction times distance.
-        signal_photons: Of the median pixel; None where the scene's pulses hold.
-        fractions: BS of each frame; NaN where the photon rates say, as they do where photons are traced.
-        photons: To trace; None for the analytic model.
+        signal_photons: Of the median pixel, which decides the pulses; None: those of the scene.
+        fractions: Backscatter fraction of each frame; NaN where the photon rates decide, as with traced photons.
+        photons: Number to trace; None for the analytic model.
         seed: Of photons and camera.
     """
 
@@ -92,48 +95,69 @@ class Plan:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.targets = find_targets(recipe)
-        self.split_seeds = {split: int(_seeds([recipe.seed, _word(split)], 1)[0]) for split in SPLITS}
+        self.split_seeds = {split: _split_seed(recipe.seed, split) for split in SPLITS}
         self.frames_per_scene = recipe.frames.per_scene
         self.scene_count = len(self.targets) * recipe.scenes_per_target
         self.sample_count = self.scene_count * self.frames_per_scene
         self.shards = tuple(self._shards())
-        self._template = template = recipe.template()
-        self.shape = (template.camera.height, template.camera.width)
-        self._tables = template.to_dict()
-        self.depth_offset, self.depth_step = self._depth_code(template)
+        self._template = recipe.template()
+        self._tables = self._template.to_dict()
+        self.shape = (self._template.camera.height, self._template.camera.width)
+        self.depth_offset, self.depth_step = self._depth_code()
 
     def split_of(self, scene_index: int) -> str:
         """The split of a scene."""
         return self.targets[scene_index // self.recipe.scenes_per_target].split
 
-    def generator(self, split: str, what: str, index: int) -> np.random.Generator:
-        """The random numbers of one value of one scene or sample."""
-        return np.random.Generator(
-            np.random.Philox(np.random.SeedSequence([self.split_seeds[split], _word(what), index]))
-        )
+    def generator(self, split: str, field: str, index: int) -> np.random.Generator:
+        """The random numbers of one value, named by `field`, of one scene or sample."""
+        key = np.random.SeedSequence([self.split_seeds[split], _word(field), index])
+        return np.random.Generator(np.random.Philox(key))
 
     def scene(self, index: int) -> SceneDraw:
         """Draws a scene."""
         recipe, split = self.recipe, self.split_of(index)
-        target = self.targets[index // recipe.scenes_per_target]
+        number = index // recipe.scenes_per_target
+        source = self.targets[number]
 
-        def draw(what: str, distribution: Distribution) -> Any:
-            return distribution.draw(self.generator(split, what, index))
+        def draw(field: str, distribution: Distribution | None) -> Any:
+            return None if distribution is None else distribution.draw(self.generator(split, field, index))
 
-        pose = recipe.pose
-        if target.export is None:
-            distance = draw("pose.distance", pose.distance)
+        if source.export is None:
+            distance = float(draw("pose.distance", recipe.pose.distance))
         else:
-            depth = target.truth(self._template.camera, recipe.targets.export_preset).depth
-            distance = float(np.nanmedian(depth))
+            distance = self._export_distance(source)
         changes = {name: draw(f"vary.{former_path(name)}", one) for name, one in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
-        if recipe.water.attenuation_lengths is not None:
-            lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
-            scene = scene.with_overrides({"medium.extinction": lengths / distance})
-        else:
+        lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
+        if lengths is None:
             lengths = scene.medium.extinction * distance
+        else:
+            scene = scene.with_overrides({"medium.extinction": lengths / distance})
+        analytic = scene.analytic.to_dict()
+        if (pulses := draw("exposure.pulses", recipe.exposure.pulses_per_depth_frame)) is not None:
+            analytic["pulses_per_depth_frame"] = max(1, round(pulses))
+        drawn = {
+            "gate": self._gate(draw, distance, scene.medium.group_index),
+            "targets": [] if source.export else self._targets(draw, source, distance, scene.camera),
+            "analytic": analytic,
+        }
+        first = index * self.frames_per_scene
+        return SceneDraw(
+            index=index,
+            target=number,
+            scene=Scene.from_dict({**scene.to_dict(), **drawn}),
+            distance=distance,
+            attenuation_lengths=float(lengths),
+            signal_photons=draw("exposure.signal", recipe.exposure.signal_photons),
+            fractions=tuple(self.fraction(first + k) for k in range(self.frames_per_scene)),
+            photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
+            seed=int(self.generator(split, "photons", index).integers(2**63)),
+        )
 
+    def _targets(self, draw: _Draw, source: TargetSource, distance: float, camera: Camera) -> list[dict[str, Any]]:
+        """The target and, in part of the scenes, the wall behind it."""
+        pose, wall = self.recipe.pose, self.recipe.backdrop
         placed = {
             "translation": [draw("pose.shift.x", pose.shift), draw("pose.shift.y", pose.shift), distance],
             "rotation_deg": [
@@ -142,52 +166,32 @@ class Plan:
             "reflectance": draw("pose.reflectance", pose.reflectance),
             "scale": draw("pose.size", pose.size),
         }
-        targets = []
-        if target.export is None:
-            fill = None if pose.fill is None else draw("pose.fill", pose.fill)
-            size = recipe.targets.mesh_size
-            targets = [target.placed(placed, longest=size, fill=fill, camera=scene.camera)]
-        wall = recipe.backdrop
-        if targets and self.generator(split, "backdrop.probability", index).random() < wall.probability:
-            behind = draw("backdrop.behind", wall.behind)
-            wide = 4.0 * (distance + behind) * scene.camera.pixel_tangent * max(scene.camera.width, scene.camera.height)
+        fill, longest = draw("pose.fill", pose.fill), self.recipe.targets.mesh_size
+        targets = [source.placed(placed, longest=longest, fill=fill, camera=camera)]
+        if draw("backdrop.probability", _UNIFORM) < wall.probability:
+            behind = distance + draw("backdrop.behind", wall.behind)
+            side = 4.0 * behind * camera.pixel_tangent * max(camera.width, camera.height)
             tilt = [draw("backdrop.tilt.x", wall.tilt_deg), draw("backdrop.tilt.y", wall.tilt_deg), 0.0]
             targets.append(
                 {
                     "builtin": "plane",
-                    "size": [wide, wide],
+                    "size": [side, side],
                     "rotation_deg": tilt,
-                    "translation": [0.0, 0.0, distance + behind],
+                    "translation": [0.0, 0.0, behind],
                     "reflectance": draw("backdrop.reflectance", wall.reflectance),
                 }
             )
+        return targets
 
-        window = recipe.gate
+    def _gate(self, draw: _Draw, distance: float, group_index: float) -> dict[str, Any]:
+        window = self.recipe.gate
         near = max(distance - draw("gate.before", window.before), _SHORTEST_RANGE)
         far = distance + draw("gate.behind", window.behind)
-        group_index = scene.medium.group_index
-        gate = {
+        return {
             "start_ns": time_from_range(near, group_index) * 1e9,
             "bin_width_ps": time_from_range(far - near, group_index) / window.bins * 1e12,
             "bins": window.bins,
         }
-        exposure = recipe.exposure
-        signal = None if exposure.signal_photons is None else draw("exposure.signal", exposure.signal_photons)
-        analytic = scene.analytic.to_dict()
-        if exposure.pulses_per_depth_frame is not None:
-            analytic["pulses_per_depth_frame"] = max(1, round(draw("exposure.pulses", exposure.pulses_per_depth_frame)))
-        first = index * self.frames_per_scene
-        return SceneDraw(
-            index=index,
-            target=index // recipe.scenes_per_target,
-            scene=Scene.from_dict({**scene.to_dict(), "gate": gate, "targets": targets, "analytic": analytic}),
-            distance=float(distance),
-            attenuation_lengths=float(lengths),
-            signal_photons=signal,
-            fractions=tuple(self.fraction(first + k) for k in range(self.frames_per_scene)),
-            photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
-            seed=int(self.generator(split, "photons", index).integers(2**63)),
-        )
 
     def files_of(self, shard: Shard) -> tuple[str, ...]:
         """Names of a shard's files: frames, scenes, and histograms where photons are traced."""
@@ -200,7 +204,7 @@ class Plan:
         return bool(self.generator(self.split_of(index), "monte_carlo.share", index).random() < share)
 
     def fraction(self, sample: int) -> float:
-        """BS of a sample; NaN where the photon rates say."""
+        """Backscatter fraction of a sample; NaN where the photon rates decide."""
         levels = self.recipe.frames.backscatter_fraction
         scene = sample // self.frames_per_scene
         if levels == "rates" or self.is_traced(scene):
@@ -216,14 +220,16 @@ class Plan:
                 yield Shard(index, number, target.split, number * per_target + first, min(size, per_target - first))
                 index += 1
 
-    def _depth_code(self, template: Scene) -> tuple[float, float]:
+    def _export_distance(self, source: TargetSource) -> float:
+        return float(np.nanmedian(source.truth(self._template.camera).depth))
+
+    def _depth_code(self) -> tuple[float, float]:
         """Offset and step [m] with which 65 535 codes span every gate that can be drawn, the step a round number."""
-        recipe = self.recipe
-        tangent = 0.5 * template.camera.pixel_tangent * math.hypot(template.camera.width, template.camera.height)
-        ranges = [] if all(one.export for one in self.targets) else list(recipe.pose.distance.limits)
-        for one in self.targets:
-            if one.export is not None:
-                ranges.append(float(np.nanmedian(one.truth(template.camera, recipe.targets.export_preset).depth)))
+        recipe, camera = self.recipe, self._template.camera
+        tangent = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
+        ranges = [self._export_distance(one) for one in self.targets if one.export]
+        if len(ranges) < len(self.targets):
+            ranges += recipe.pose.distance.limits
         near = max(min(ranges) - recipe.gate.before.limits[1], _SHORTEST_RANGE)
         far = max(ranges) + recipe.gate.behind.limits[1]
         near /= math.hypot(1.0, tangent)
@@ -237,5 +243,5 @@ def _word(text: str) -> int:
     return zlib.crc32(text.encode())
 
 
-def _seeds(entropy: list[int], count: int) -> np.ndarray:
-    return np.random.SeedSequence(entropy).generate_state(count, np.uint64)
+def _split_seed(seed: int, split: str) -> int:
+    return int(np.random.SeedSequence([seed, _word(split)]).generate_state(1, np.uint64)[0])

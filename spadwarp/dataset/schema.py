@@ -1,19 +1,31 @@
-"""What the files of a dataset hold, name by name."""
+"""The columns of a dataset's files: name, unit, meaning, and where a scene's values come from."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from spadwarp.dataset.render_analytic import PROFILE_BINS, RenderedScene
+from spadwarp.dataset.rendered import PROFILE_BINS, RenderedScene
 from spadwarp.dataset.sampling import Plan
 from spadwarp.scene import phase_function
 from spadwarp.units import range_from_time
 
-__all__ = ["FORMAT_VERSION", "FRAME_COLUMNS", "scene_columns", "scene_row"]
+__all__ = [
+    "FORMAT_VERSION",
+    "FRAME_COLUMNS",
+    "HISTOGRAM_COLUMNS",
+    "PACKED",
+    "describe",
+    "scene_columns",
+    "scene_row",
+]
 
 FORMAT_VERSION = 1
+
+PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+"""How HDF5 packs arrays."""
 
 FRAME_COLUMNS: dict[str, tuple[str, str]] = {
     "depth": ("m", "noisy planar depth = offset + step * code; code 0: no return"),
@@ -23,13 +35,26 @@ FRAME_COLUMNS: dict[str, tuple[str, str]] = {
     "sample": ("1", "id of the frame in the whole dataset"),
     "seed": ("1", "key of the frame's random numbers, together with its sample id"),
     "target": ("1", "index into the targets of manifest.json"),
-    "backscatter_fraction": ("1", "BS, requested part of the pixels that report backscatter; NaN: by the photon rates"),
+    "backscatter_fraction": ("1", "requested part of the pixels that report backscatter; NaN: the photon rates decide"),
     "attenuation_lengths": ("1", "extinction times distance, one way"),
     "distance": ("m", "of the target's centre along the optical axis"),
     "pulses": ("1", "laser pulses of the frame"),
     "intensity_step": ("1", "recorded photons per unit of intensity"),
 }
 """Datasets of a frames file, all with one first dimension: unit and meaning."""
+
+HISTOGRAM_COLUMNS: dict[str, tuple[str, str]] = {
+    "scene": ("1", "index into scenes.h5"),
+    "expected": ("1", "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"),
+    "gate_start": ("s", "start of bin 0 after the pulse left the laser"),
+    "bin_width": ("s", "width of a bin"),
+    "sample": ("1", "id of the frame in the whole dataset"),
+    "counts": ("1", "counts of the frame"),
+    "event_start": ("1", "first event of each frame; one entry more than frames"),
+    "event_index": ("1", "y * W * T + x * T + bin"),
+    "event_count": ("1", "counts in that bin"),
+}
+"""Datasets of a histograms file: unit and meaning."""
 
 _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
     "distance": ("m", "of the target's centre along the optical axis"),
@@ -54,6 +79,13 @@ _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
 }
 
 
+def describe(file: Any, columns: Mapping[str, tuple[str, str]]) -> None:
+    """Writes unit and meaning to the datasets that an open HDF5 file holds."""
+    for name, stored in file.items():
+        unit, text = columns[name]
+        stored.attrs.update({"unit": unit, "description": text})
+
+
 def scene_columns(plan: Plan) -> dict[str, tuple[tuple[int, ...], Any, str, str]]:
     """Datasets of `scenes.h5`, all with one first dimension: shape of a row, type, unit, meaning."""
     height, width = plan.shape
@@ -76,41 +108,37 @@ def scene_columns(plan: Plan) -> dict[str, tuple[tuple[int, ...], Any, str, str]
     }
 
 
-def scene_row(plan: Plan, one: RenderedScene) -> dict[str, Any]:
+def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
     """A scene's values of `scene_columns`."""
-    scene, draw = one.scene, one.draw
-    medium, none = scene.medium, (np.nan,) * 3
-    target = scene.targets[0] if scene.targets else None
+    scene, draw = rendered.scene, rendered.draw
+    medium, source = scene.medium, plan.targets[draw.target]
+    placed: Any = scene.targets[0] if scene.targets else None
+    vectors = {name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")}
     config = scene.to_toml()
-    if (mesh := plan.targets[draw.target].mesh) is not None:
-        config = config.replace(str(mesh), mesh.name)  # where it lies on this machine is nobody's business
+    if source.mesh is not None:
+        config = config.replace(str(source.mesh), source.mesh.name)  # without the folders of this machine
     return {
-        "depth": one.truth.depth,
-        "bound": one.bound,
-        "normal": one.truth.normal,
-        "albedo": one.truth.reflectance,
-        "backscatter_profile": one.profile[0],
-        "profile_edges": one.profile[1],
+        "depth": rendered.truth.depth,
+        "bound": rendered.bound,
+        "normal": rendered.truth.normal,
+        "albedo": rendered.truth.reflectance,
+        "backscatter_profile": rendered.profile[0],
+        "profile_edges": rendered.profile[1],
         "target": draw.target,
-        "target_name": plan.targets[draw.target].name,
-        "translation": none if target is None else target.translation,
-        "rotation_deg": none if target is None else target.rotation_deg,
-        "scale": none if target is None else target.scale,
+        "target_name": source.name,
+        **vectors,
         "laser_position": scene.beam.position,
         "distance": draw.distance,
         "attenuation_lengths": draw.attenuation_lengths,
-        "absorption": medium.absorption,
-        "scattering": medium.scattering,
-        "extinction": medium.extinction,
+        **{name: getattr(medium, name) for name in ("absorption", "scattering", "extinction", "group_index")},
         "anisotropy": phase_function(medium).mean_cosine,
-        "group_index": medium.group_index,
         "gate_near": range_from_time(scene.gate.start, medium.group_index),
         "gate_far": range_from_time(scene.gate.stop, medium.group_index),
-        "reflectance": np.nan if target is None else target.reflectance,
+        "reflectance": getattr(placed, "reflectance", np.nan),
         "pulses": scene.analytic.pulses_per_depth_frame,
         "photons": draw.photons or 0,
-        "signal": one.signal,
-        "backscatter": one.backscatter,
+        "signal": rendered.signal,
+        "backscatter": rendered.backscatter,
         "pulse_energy": scene.laser.pulse_energy,
         "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
         "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,

@@ -1,144 +1,158 @@
-"""Where a dataset's targets come from: built-in shapes, mesh files, or depth maps that a game engine rendered."""
+"""The targets of a dataset: built-in shapes, mesh files, or depth maps that a game engine rendered."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.errors import ConfigError, FileError, MeshError
-from spadwarp.result.result import Truth
+from spadwarp.mesh import BUILTINS, builtin_names, load_target
+from spadwarp.mesh.targets import placement
+from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Target
 
-__all__ = ["Origin", "find_targets"]
+__all__ = ["TargetSource", "find_targets"]
 
 _MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb")
 _DEPTH_ENDING, _NORMAL_ENDING, _ALBEDO_ENDING = "_RGBD", "_Surf_Norm", "_Base_Col"
 
 
 @dataclass(frozen=True)
-class Origin:
-    """A target: its name, the split it belongs to, and a mesh file or an engine's depth map; a built-in without."""
+class TargetSource:
+    """A target of a dataset.
+
+    Attributes:
+        name: Of the built-in shape, or of the file without its ending.
+        split: "train", "validation" or "test".
+        mesh, export: The mesh file, or the engine's depth map; neither for a built-in shape.
+        export_preset: Conventions of the program that wrote the depth map.
+    """
 
     name: str
     split: str
     mesh: Path | None = None
     export: Path | None = None
+    export_preset: Literal["unreal", "blender"] = "unreal"
 
     def placed(
         self, pose: dict[str, Any], *, longest: float | None, fill: float | None, camera: Camera
     ) -> dict[str, Any]:
-        """The fields of a scene's target: its centre at the pose's translation, scaled as the recipe says.
+        """The fields of a scene's target, its centre at the pose's translation, scaled as the recipe asks.
 
         Args:
             pose: `translation`, `rotation_deg`, `scale`, `reflectance`.
             longest: Longest side that a mesh file is scaled to first [m].
-            fill: Part of the view that the target fills, in place of `scale`.
+            fill: Part of the view that the target fills; replaces `scale`.
             camera: Whose view.
         """
-        from spadwarp.mesh.targets import placement
-
-        scale = pose["scale"]
-        if self.mesh is not None or fill is not None:
-            lower, upper = _bounds(self)
-            sides = upper - lower
+        if self.mesh is None and fill is None:
+            return {"builtin": self.name, **pose}
+        scale, (lower, upper) = pose["scale"], _bounds(self)
+        sides = upper - lower
         if fill is not None:
             view = pose["translation"][2] * camera.pixel_tangent * np.array([camera.width, camera.height])
             scale = fill * float((view / sides[:2]).min())
-        elif self.mesh is not None and longest is not None:
+        elif longest is not None:
             scale *= longest / float(sides.max())
-        placed: dict[str, Any] = {**pose, "scale": scale}
         if self.mesh is None:
-            return {"builtin": self.name, **placed}
-        turned = placement(np.full(3, scale), pose["rotation_deg"], (0.0, 0.0, 0.0))[:3, :3]
-        shift = np.asarray(pose["translation"]) - turned @ (0.5 * (lower + upper))
-        return {"mesh": str(self.mesh), **placed, "translation": [float(one) for one in shift]}
+            return {"builtin": self.name, **pose, "scale": scale}
+        matrix = placement(np.full(3, scale), pose["rotation_deg"], (0.0, 0.0, 0.0))[:3, :3]
+        shift = np.asarray(pose["translation"]) - matrix @ (0.5 * (lower + upper))
+        return {"mesh": str(self.mesh), **pose, "scale": scale, "translation": shift.tolist()}
 
-    def truth(self, camera: Camera, preset: Any) -> Truth:
-        """What the engine rendered, of an `export`; with its normals and colours where their files lie beside it."""
-        assert self.export is not None
-        return _exported(self.export, camera, preset)
+    def truth(self, camera: Camera) -> Truth:
+        """The truth maps of an `export`, with normals and colours where their files lie beside it."""
+        return _exported(self, camera)
 
 
-def find_targets(recipe: Recipe) -> tuple[Origin, ...]:
-    """The targets of a recipe in order. Raises `ConfigError`, `MeshError` or `FileError` for what is not there."""
-    from spadwarp.mesh import BUILTINS, builtin_names
+def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
+    """The targets of a recipe in order.
 
-    known, chosen = builtin_names(), recipe.targets
-    objects = [name for name in known if name not in BUILTINS or name == "staircase"]
-    names = list(chosen.builtin)
-    if chosen.builtin == "all":
-        names = [] if chosen.meshes or chosen.exports else objects
-    problems = [
-        f"targets.builtin: {name!r} is not one of {', '.join(map(repr, known))}" for name in names if name not in known
-    ]
-    found: list[tuple[str, str, Path]] = []
-    for entry in chosen.meshes:
-        files = _files(Path(entry), lambda one: one.suffix.lower() in _MESH_ENDINGS)
-        if not files:
-            raise MeshError(f"targets.meshes: {entry}: no mesh file there")
-        found += [(one.stem, "mesh", one) for one in files]
-    for entry in chosen.exports:
-        files = _files(Path(entry), lambda one: one.stem.endswith(_DEPTH_ENDING) and one.suffix.lower() == ".exr")
-        if not files:
-            raise FileError(f"targets.exports: {entry}: no file *{_DEPTH_ENDING}.EXR there")
-        found += [(one.stem.removesuffix(_DEPTH_ENDING), "export", one) for one in files]
-    origins: dict[str, dict[str, Path]] = {name: {} for name in names}
-    for name, kind, path in found:
-        if name in origins:
-            problems.append(f"targets: {path}: a target {name!r} is there already")
-        origins[name] = {kind: path}
-    splits = dict.fromkeys(origins, "train")
+    Raises `ConfigError` for names that are unknown or given twice, `MeshError` and `FileError` for missing files.
+    """
+    chosen = recipe.targets
+    problems: list[str] = []
+    sources: dict[str, dict[str, Any]] = {name: {} for name in _builtins(recipe, problems)}
+    for name, source in _of_files(recipe):
+        if name in sources:
+            problems.append(f"targets: {next(iter(source.values()))}: there is already a target {name!r}")
+        sources[name] = source
+    splits = dict.fromkeys(sources, "train")
     for split in ("validation", "test"):
         for name in getattr(chosen, split):
-            if name not in splits:
-                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
-            elif splits[name] != "train":
-                problems.append(f"targets.{split}: {name!r} is in {splits[name]} already")
-            else:
+            if splits.get(name) == "train":
                 splits[name] = split
-    if not origins:
-        problems.append("targets: there are none")
+            elif name in splits:
+                problems.append(f"targets.{split}: {name!r} is already in {splits[name]}")
+            else:
+                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
+    if not sources:
+        problems.append("targets: none are given")
     if chosen.exports and recipe.monte_carlo.share > 0:
         problems.append("monte_carlo.share: photons need meshes; targets.exports are depth maps")
     if problems:
         raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
-    return tuple(Origin(name, splits[name], **origin) for name, origin in origins.items())
+    return tuple(TargetSource(name, splits[name], **source) for name, source in sources.items())
 
 
-def _files(place: Path, wanted: Any) -> list[Path]:
-    if place.is_dir():
-        return sorted(one for one in place.iterdir() if wanted(one))
-    return [place] if place.is_file() else []
+def _builtins(recipe: Recipe, problems: list[str]) -> list[str]:
+    known, chosen = builtin_names(), recipe.targets
+    if chosen.builtin == "all":
+        objects = [name for name in known if name not in BUILTINS or name == "staircase"]
+        return [] if chosen.meshes or chosen.exports else objects
+    listed = ", ".join(map(repr, known))
+    problems += [f"targets.builtin: {name!r} is not one of {listed}" for name in chosen.builtin if name not in known]
+    return list(chosen.builtin)
+
+
+def _of_files(recipe: Recipe) -> Iterator[tuple[str, dict[str, Any]]]:
+    chosen = recipe.targets
+    for place in chosen.meshes:
+        files = _files(place, lambda path: path.suffix.lower() in _MESH_ENDINGS)
+        if not files:
+            raise MeshError(f"targets.meshes: {place}: no mesh file there")
+        yield from ((path.stem, {"mesh": path}) for path in files)
+    for place in chosen.exports:
+        files = _files(place, lambda path: path.stem.endswith(_DEPTH_ENDING) and path.suffix.lower() == ".exr")
+        if not files:
+            raise FileError(f"targets.exports: {place}: no file *{_DEPTH_ENDING}.EXR there")
+        for path in files:
+            yield path.stem.removesuffix(_DEPTH_ENDING), {"export": path, "export_preset": chosen.export_preset}
+
+
+def _files(place: str, wanted: Callable[[Path], bool]) -> list[Path]:
+    """The wanted files of a folder, or the file itself; empty where there is neither."""
+    path = Path(place)
+    return sorted(filter(wanted, path.iterdir())) if path.is_dir() else [path] if path.is_file() else []
 
 
 @cache
-def _bounds(origin: Origin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    from spadwarp.mesh import load_target
-
-    mesh = load_target(Target(builtin=origin.name) if origin.mesh is None else Target(mesh=str(origin.mesh)))
+def _bounds(source: TargetSource) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    mesh = load_target(Target(builtin=source.name) if source.mesh is None else Target(mesh=str(source.mesh)))
     lower, upper = np.asarray(mesh.bounds, np.float64)
     return lower, upper
 
 
 @cache
-def _exported(path: Path, camera: Camera, preset: Any) -> Truth:
-    from spadwarp.result.rendered_truth import load_truth_exr
+def _exported(source: TargetSource, camera: Camera) -> Truth:
+    path = source.export
+    assert path is not None
 
     def beside(ending: str) -> Path | None:
-        one = path.with_name(path.name.replace(_DEPTH_ENDING, ending))
-        return one if one.is_file() else None
+        neighbour = path.with_name(path.name.replace(_DEPTH_ENDING, ending))
+        return neighbour if neighbour.is_file() else None
 
-    albedo = beside(_ALBEDO_ENDING)
     return load_truth_exr(
         depth=path,
         camera=camera,
-        preset=preset,
+        preset=source.export_preset,
         normal=beside(_NORMAL_ENDING),
-        albedo=0.5 if albedo is None else albedo,
+        albedo=beside(_ALBEDO_ENDING) or 0.5,
     )

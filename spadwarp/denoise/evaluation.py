@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.make import read_manifest
-from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames, own_weights

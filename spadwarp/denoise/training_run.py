@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spadwarp.dataset.make import read_manifest
+from spadwarp.dataset import read_manifest
 from spadwarp.denoise.inference import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError

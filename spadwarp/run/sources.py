@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import on_host
-from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset import FrameReader
 from spadwarp.errors import ArgumentError
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.frames.file import FORMAT, FramesFile

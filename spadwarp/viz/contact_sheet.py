@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset import FrameReader
 from spadwarp.errors import ArgumentError
 from spadwarp.io.atomic import atomic_path
 

@@ -20,9 +20,7 @@ from typer.testing import CliRunner
 import spadwarp
 from helpers.datasets import BS, TABLES, checksums, recipe
 from spadwarp.cli import app
-from spadwarp.dataset.read import FIELDS
-from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.sampling import Plan
+from spadwarp.dataset import FIELDS, SPLITS, Plan
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT

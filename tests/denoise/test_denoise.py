@@ -22,7 +22,7 @@ from helpers.datasets import recipe
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, ConfigError, FileError
 from spadwarp.cli import app
-from spadwarp.dataset.sampling import Plan
+from spadwarp.dataset import Plan
 from spadwarp.denoise import baselines, files, inference, metrics, photon_counts, training
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.recipe import load_training_recipe
