@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import MeshError
+from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.scene.pose import rotation_matrix, to_camera
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from spadwarp.scene import Scene, Target
 
-__all__ = ["BUILTINS", "SIZED_BUILTINS", "TriangleMesh", "build_mesh", "builtin_names", "load_target"]
+__all__ = ["TriangleMesh", "build_mesh", "load_target"]
 
 MAX_FACES = 2**31 - 1
 
@@ -66,48 +67,37 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
         MeshError: A target that is missing, unreadable, empty, not finite or without area; names file and field.
     """
     parts: list[TriangleMesh] = []
-    vertex_count = 0
+    vertex_count = face_count = 0
     varied = any(target.reflectance == "from_file" for target in scene.targets)
     lobes = any(target.specular > 0 for target in scene.targets)
     for index, target in enumerate(scene.targets):
         field = f"targets[{index}]" if scene.source is None else f"{scene.source}: targets[{index}]"
         mesh, images = _load(target, field, scene.laser.wavelength_nm)
-        faces = np.asarray(mesh.faces, dtype=np.int64) + vertex_count
-        vertex_count += len(mesh.vertices)
-        if vertex_count > MAX_FACES or sum(part.face_count for part in parts) + len(faces) > MAX_FACES:
+        faces, count = np.asarray(mesh.faces, dtype=np.int64) + vertex_count, len(mesh.faces)
+        vertex_count, face_count = vertex_count + len(mesh.vertices), face_count + count
+        if max(vertex_count, face_count) > MAX_FACES:
             raise MeshError(f"{field}: the targets have more than {MAX_FACES} faces or vertices together")
         pattern = _pattern(mesh, images, target, field) if varied else None
         parts.append(
             TriangleMesh(
                 vertices=to_camera(scene.camera, mesh.vertices).astype(np.float32),
                 faces=faces.astype(np.int32),
-                reflectance=_number(target, len(faces)) if pattern is None else _means(pattern),
-                target=np.full(len(faces), index, dtype=np.int32),
+                reflectance=_constant(target.reflectance, count) if pattern is None else _means(pattern),
+                target=np.full(count, index, dtype=np.int32),
                 pattern=pattern,
-                specular=np.full(len(faces), target.specular, dtype=np.float32) if lobes else None,
-                roughness=np.full(len(faces), target.roughness, dtype=np.float32) if lobes else None,
+                specular=_constant(target.specular, count) if lobes else None,
+                roughness=_constant(target.roughness, count) if lobes else None,
             )
         )
     if not parts:
         return None
-    return TriangleMesh(
-        vertices=np.concatenate([part.vertices for part in parts]),
-        faces=np.concatenate([part.faces for part in parts]),
-        reflectance=np.concatenate([part.reflectance for part in parts]),
-        target=np.concatenate([part.target for part in parts]),
-        pattern=_join([part.pattern for part in parts if part.pattern is not None]),
-        specular=_concatenate([part.specular for part in parts]),
-        roughness=_concatenate([part.roughness for part in parts]),
-    )
+    names = ("vertices", "faces", "reflectance", "target", *(("specular", "roughness") if lobes else ()))
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return TriangleMesh(**joined, pattern=_join([part.pattern for part in parts if part.pattern is not None]))
 
 
-def _number(target: Target, count: int) -> NDArray[np.float32]:
-    return np.full(count, target.reflectance, dtype=np.float32)
-
-
-def _concatenate(arrays: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:
-    given = [array for array in arrays if array is not None]
-    return np.concatenate(given) if given else None
+def _constant(value: Any, count: int) -> NDArray[np.float32]:
+    return np.full(count, value, dtype=np.float32)
 
 
 def _pattern(mesh: trimesh.Trimesh, images: Images, target: Target, field: str) -> Pattern:
@@ -115,7 +105,7 @@ def _pattern(mesh: trimesh.Trimesh, images: Images, target: Target, field: str) 
     count = len(mesh.faces)
     texture, coordinates = np.full(count, -1, dtype=np.int32), np.zeros((count, 3, 2), dtype=np.float32)
     if target.reflectance != "from_file":
-        return Pattern(np.repeat(_number(target, count)[:, None], 3, axis=1), texture, coordinates, ())
+        return Pattern(np.repeat(_constant(target.reflectance, count)[:, None], 3, axis=1), texture, coordinates, ())
     surface: NDArray[np.float64] = np.asarray(mesh.vertex_attributes["surface"])[mesh.faces]
     corners = surface[:, :, 0] * target.reflectance_scale
     texture = surface[:, 0, 1].round().astype(np.int32)
@@ -157,9 +147,9 @@ def _join(patterns: Sequence[Pattern]) -> Pattern | None:
 def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     """One target as a mesh in the world [m].
 
-    In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) turns it
-    about its own axes, first x, then the turned y, then the twice turned z (intrinsic; R = Rx·Ry·Rz). A mesh file's
-    axes are taken as they stand.
+    In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) rotates it
+    about its own axes, first x, then the new y, then the new z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are taken
+    as they are.
 
     Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
 
@@ -185,7 +175,10 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
         else:
             mesh = _read_mesh(path, name)
     else:
-        name, mesh = f"{field}.builtin = {target.builtin!r}", _make_builtin(str(target.builtin), field)
+        name = f"{field}.builtin = {target.builtin!r}"
+        if target.builtin not in builtin_names():
+            raise MeshError(f"{name} is not one of {', '.join(map(repr, builtin_names()))}")
+        mesh = make_builtin(target.builtin)
         if target.size is not None and target.builtin not in SIZED_BUILTINS:
             raise MeshError(
                 f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
@@ -216,29 +209,11 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
     if not solid.any():
         raise MeshError(f"{name}: none of the {len(mesh.faces)} faces has an area")
     if not solid.all():
-        if target.mesh is not None:  # slivers of a built-in are no news
+        if target.mesh is not None:  # that a built-in has slivers needs no warning
             warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
         mesh.update_faces(solid)
     mesh.remove_unreferenced_vertices()
     return mesh, images
-
-
-def builtin_names() -> tuple[str, ...]:
-    """Names that `builtin` can take."""
-    from spadwarp.mesh.shapes import SHAPES
-
-    return (*BUILTINS, *SHAPES)
-
-
-def _make_builtin(name: str, field: str) -> trimesh.Trimesh:
-    """A new mesh of a built-in in its own frame [m]."""
-    if name in BUILTINS:
-        return BUILTINS[name]()
-    if name not in builtin_names():
-        raise MeshError(f"{field}.builtin = {name!r} is not one of {', '.join(map(repr, builtin_names()))}")
-    from spadwarp.mesh.shapes import make_shape
-
-    return make_shape(name)
 
 
 def placement(
@@ -256,7 +231,7 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     import trimesh
 
     try:
-        mesh = trimesh.load_mesh(path, process=False)  # processing drops what is not finite without a word
+        mesh = trimesh.load_mesh(path, process=False)  # processing would drop what is not finite, without a warning
     except Exception as error:  # what trimesh raises depends on the format and its parser
         known = "STL, OBJ, PLY, OFF and GLB can be read"
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
@@ -265,66 +240,3 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     if np.isfinite(mesh.vertices).all():
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
-
-
-# Built-in targets
-
-
-def _staircase() -> trimesh.Trimesh:
-    """The paper's staircase (a 4 m plate with nine bars): one closed mesh, face at z = 0, bars towards −z.
-
-    Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal
-    bars, the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half
-    free, the strip is at the middle of the plate, as in the depth maps that the paper's authors published.
-    """
-    plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
-    left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]
-    upper = [((0.0, y, -proud), (2.0, y + 0.6, 0.1)) for y, proud in ((-2.0, 0.3), (-1.3, 0.2), (-0.6, 0.1))]
-    lower = [((x, 0.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((0.03, 0.3), (0.7, 0.2), (1.37, 0.1))]
-    return _union([plate, *left, *upper, *lower])
-
-
-def _union(boxes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> trimesh.Trimesh:
-    """One closed mesh of axis-aligned boxes, each given by its lowest and its highest corner."""
-    import trimesh
-
-    mesh = trimesh.boolean.union([trimesh.creation.box(bounds=bounds) for bounds in boxes], engine="manifold")
-    mesh.vertices = np.round(mesh.vertices, 6)  # the union came back in float32
-    return mesh
-
-
-def _plane() -> trimesh.Trimesh:
-    """A square of side 1 m at z = 0 that faces −z, two triangles."""
-    import trimesh
-
-    corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
-    return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
-
-
-def _box() -> trimesh.Trimesh:
-    """A cube of side 1 m about the origin, twelve triangles."""
-    import trimesh
-
-    return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
-
-
-def _sphere() -> trimesh.Trimesh:
-    """A ball of diameter 1 m about the origin: an icosahedron subdivided three times, 1280 triangles, corners on it."""
-    import trimesh
-
-    return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-
-
-BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
-    "staircase": _staircase,
-    "plane": _plane,
-    "box": _box,
-    "sphere": _sphere,
-}
-"""The geometric built-ins: functions without arguments that make a new mesh in its own frame [m].
-
-The objects of `spadwarp.mesh.shapes` join them; `builtin_names` has all.
-"""
-
-SIZED_BUILTINS = ("plane", "box", "sphere")
-"""Built-ins of 1 m that `size` stretches; the others have sizes of their own."""

@@ -9,30 +9,15 @@ height × depth (x, y, z). No randomness and no files: the same bits come out of
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, wraps
-from typing import TYPE_CHECKING
 
-from spadwarp.errors import ArgumentError
+from manifold3d import Manifold
+
 from spadwarp.mesh.shapes import gear, home, life, sea
-from spadwarp.mesh.shapes.solids import to_trimesh
 
-if TYPE_CHECKING:
-    import trimesh
-    from manifold3d import Manifold
+__all__ = ["SHAPES"]
 
-__all__ = ["SHAPES", "make_shape"]
-
-
-def _mesh_maker(model: Callable[[], Manifold]) -> Callable[[], trimesh.Trimesh]:
-    @wraps(model)
-    def make() -> trimesh.Trimesh:
-        return to_trimesh(model())
-
-    return make
-
-
-SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
-    model.__name__: _mesh_maker(model)
+SHAPES: dict[str, Callable[[], Manifold]] = {
+    model.__name__: model
     for model in (
         sea.submarine,
         sea.anchor,
@@ -55,19 +40,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
         life.bust,
     )
 }
-"""Every built-in target by name: functions without arguments that build the mesh anew; their docstrings give sizes."""
+"""Every object by name: functions without arguments that build the solid anew; their docstrings give sizes.
 
-
-def make_shape(name: str) -> trimesh.Trimesh:
-    """The built-in target `name` as a mesh [m], built once and copied for each caller.
-
-    Raises ValueError for a name that is not in `SHAPES`.
-    """
-    if name not in SHAPES:
-        raise ArgumentError(f"target shape = {name!r} is not one of {', '.join(SHAPES)}")
-    return _built(name).copy()
-
-
-@cache
-def _built(name: str) -> trimesh.Trimesh:
-    return SHAPES[name]()
+One more is a function in one of the files here, and its name in this list.
+"""

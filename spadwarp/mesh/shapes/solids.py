@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Point = Sequence[float] | np.ndarray
 """Three coordinates [m]."""
 
-_FROM_Z = {"x": (0.0, 90.0, 0.0), "y": (-90.0, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}  # turns what stands along z
+_FROM_Z = {"x": (0.0, 90.0, 0.0), "y": (-90.0, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}  # rotations of what stands along z
 
 
 def union(*parts: Manifold) -> Manifold:
@@ -155,7 +155,7 @@ _TETRAHEDRON_CASES = _tetrahedron_cases()
 
 
 def around(part: Manifold, count: int, *, axis: str = "y", first: float = 0.0) -> Manifold:
-    """`count` copies of `part`, evenly turned about the x, y or z axis, the first one by `first` degrees."""
+    """`count` copies of `part`, evenly rotated about the x, y or z axis, the first one by `first` degrees."""
     turn = np.eye(3)["xyz".index(axis)]
     return union(*(part.rotate(turn * (first + 360 * k / count)) for k in range(count)))
 
@@ -171,13 +171,13 @@ def mirrored(part: Manifold, axis: str = "x") -> Manifold:
 
 
 def view(part: Manifold, size: float, *, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Manifold:
-    """Turn to a good side and scale until the larger of width and height is `size` [m].
+    """Rotate to a good side and scale until the larger of width and height is `size` [m].
 
     `yaw` turns the front to the right, `pitch` then shows the top, `roll` lifts the right end.
     """
-    turned = part.rotate((0, yaw, 0)).rotate((pitch, 0, roll))
-    x0, y0, _, x1, y1, _ = turned.bounding_box()
-    return turned.scale(np.full(3, size / max(x1 - x0, y1 - y0)))
+    rotated = part.rotate((0, yaw, 0)).rotate((pitch, 0, roll))
+    x0, y0, _, x1, y1, _ = rotated.bounding_box()
+    return rotated.scale(np.full(3, size / max(x1 - x0, y1 - y0)))
 
 
 def spline(points: Sequence[Point] | np.ndarray, steps: int = 8, *, closed: bool = False) -> np.ndarray:
