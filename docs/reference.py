@@ -297,12 +297,18 @@ def _help(command: Any, path: str) -> Iterator[str]:
 
 
 def python() -> str:
-    """The names of `spadwarp.__all__`, by module."""
+    """The names of `spadwarp.__all__` by module, and the other public names of each room."""
     homes: dict[str, list[str]] = {}
     for name, home in spadwarp._HOMES.items():
         homes.setdefault(home, []).append(name)
+    for room in sorted(spadwarp._ROOMS):
+        module = import_module(f"spadwarp.{room}")
+        names = [name for name in getattr(module, "__all__", ()) if name not in spadwarp._HOMES]
+        homes.setdefault(room, []).extend(name for name in names if callable(getattr(module, name)))
+    homes = {home: names for home, names in homes.items() if names}
     parts = [
-        MADE + "# Python\n\n`import spadwarp` loads what is used when it is used. Everything here is `spadwarp.NAME`."
+        MADE + "# Python\n\n`import spadwarp` loads a name when it is used. Names of `spadwarp.__all__` are "
+        "`spadwarp.NAME`; the others are found in their room, as `spadwarp.ROOM.NAME`."
     ]
     for home, names in homes.items():
         about = inspect.cleandoc(import_module(f"spadwarp.{home}").__doc__ or "").splitlines()[0]
