@@ -9,7 +9,6 @@ from helpers.scenes import scene
 from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_vary, simulate_analytic, sweep
 from spadwarp.analytic.photon_budget import budget
 from spadwarp.errors import ConfigError
-from spadwarp.viz.budget import plot_budget, plot_sweep
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},
@@ -129,21 +128,3 @@ def test_bad_requests_are_named():
         budget(SCENE, reflectance=2)
     with pytest.raises(ConfigError, match="no target is in view"):
         sweep(SCENE.with_overrides({"targets": []}), vary="medium.extinction=1")
-
-
-def test_pictures_are_written_whole(tmp_path):
-    rows = budget(SCENE, ranges=[1, 3, 9], media=["uwoc-clear", "uwoc-harbour"])
-    figure = plot_budget(rows, tmp_path / "budget.png")
-    assert len(figure.axes) == 4
-    assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["1", "3", "9"]
-    assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == [
-        "uwoc-clear (0.149/m)",
-        "uwoc-harbour (2.17/m)",
-    ]
-    for of in ("budget", "depth-error"):
-        figure = plot_sweep(sweep(SCENE, vary="medium.extinction=0.1:2:3", of=of), tmp_path / f"{of}.pdf")
-        assert all(axis.get_xlabel() == "medium.extinction [1/m]" for axis in figure.axes)
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["budget.pdf", "budget.png", "depth-error.pdf"]
-    assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "budget.pdf").read_bytes().startswith(b"%PDF")

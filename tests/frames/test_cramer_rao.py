@@ -1,0 +1,93 @@
+"""Cramér–Rao bounds from the shape of histograms."""
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.scenes import scene
+from reference import crlb
+from spadwarp.frames import InstrumentResponse, crlb_from_histogram
+from spadwarp.frames.response import FWHM_PER_SIGMA
+
+BIN = 1e-11
+
+
+def bound(signal, background=2.0, **options):
+    return crlb_from_histogram(signal, background, **{"bin_width": BIN, "pulses": 1, **options})
+
+
+def gaussian(sigma_bins, counts=300.0):
+    return counts * crlb.binned_signal(np.arange(241.0), 120.0, sigma_bins)
+
+
+def test_bound_of_a_histogram_is_the_continuous_bound_where_bins_are_fine():
+    """300 photons of σ = 100 ps on 150 a σ: 12.898 ps, in bins of 0.1 σ 12.906 ps; pulses divide."""
+    signal = np.stack([gaussian(10.0), np.zeros(240)])[None]
+    sigma = bound(signal, 15.0)
+    assert sigma.shape == (1, 2) and np.isnan(sigma[0, 1])
+    assert round(sigma[0, 0] * 1e12, 3) == pytest.approx(12.906, abs=2e-3)
+    fewer = bound(signal / 400, np.full(240, 15.0) / 400, pulses=400)
+    assert fewer[0, 0] == pytest.approx(sigma[0, 0], rel=1e-6)
+
+
+def test_the_response_is_applied_exactly():
+    """A cube before the response gives the bound of the cube after it, by FWHM and by samples."""
+    expected = bound(gaussian(np.sqrt(6.0**2 + 8.0**2 + 1 / 12)))
+    samples = crlb.binned_signal(np.arange(-50.5, 51), 0.0, 8.0)
+    for irf in (8.0 * FWHM_PER_SIGMA * BIN, samples):
+        assert bound(gaussian(6.0), irf=irf) == pytest.approx(expected, rel=2e-3)
+
+
+def test_an_exponential_tail_is_applied_by_its_integrals():
+    """Taps from the response's integrals against the same response by quadrature over each bin."""
+    before = gaussian(3.0)
+    irf = InstrumentResponse(sigma=4e-11, tail=1e-10)
+    light = np.repeat(before, 100) / 100  # in hundredths of a bin
+    response = irf.density(np.arange(-300, 6000) * 1e-13) * 1e-13
+    after = np.convolve(light, response)[300 : 300 + 24000].reshape(240, 100).sum(axis=1)
+    assert bound(before, irf=irf) == pytest.approx(bound(after), rel=2e-3)
+
+
+def test_pile_up_loses_information():
+    signal = gaussian(5.0, counts=2.0)
+    assert bound(signal, 0.01, law="first_photon") > 1.2 * bound(signal, 0.01)
+    faint = [bound(signal * 1e-5, 1e-7, law=law) for law in ("poisson", "first_photon")]
+    assert faint[0] == pytest.approx(faint[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"signal": [-1.0, 1.0]}, r"signal_cube holds a value outside \[0, inf\)"),
+        ({"background": [np.nan, 1.0]}, r"background_cube holds a value outside"),
+        ({"background": np.zeros(3)}, r"background_cube has shape \(3,\)"),
+        ({"bin_width": 0.0}, r"bin_width = 0.0 is outside"),
+        ({"pulses": -1}, r"pulses = -1 is outside"),
+        ({"irf": -1.0}, r"irf = -1.0 s is outside"),
+        ({"irf": [1.0, 1.0]}, "odd number"),
+        ({"irf": InstrumentResponse(tail=1e-10)}, "irf has no width"),
+        ({"law": "coates"}, "law = 'coates' is not one of"),
+    ],
+)
+def test_wrong_input_is_named(changes, match):
+    with pytest.raises(ValueError, match=match):
+        bound(**{"signal": [1.0, 2.0], **changes})
+
+
+def test_the_bound_of_a_monte_carlo_result_is_the_analytic_one_in_clear_water():
+    """Little scattering, a plate square to the axis: both know the same return."""
+    clear = scene(
+        medium={"extinction": 0.02, "albedo": 0.01},
+        laser={"half_angle_deg": 30.0, "position": [0.0, 0.0, 0.0], "pulse_energy": 1e-12},
+        detector={"pdp": 0.2, "fill_factor": 0.1, "jitter_fwhm_ps": 400.0},
+        camera={"width": 4, "height": 4, "horizontal_fov_deg": 4.0, "aperture_diameter": 0.02},
+        gate={"start_ns": 10.0, "bin_width_ps": 50.0, "bins": 200},
+        targets=[{"builtin": "plane", "size": [3, 3], "translation": [0, 0, 2.2], "reflectance": 1e-3}],
+        transport={"estimator": "next_event", "max_collisions": 4},
+    )
+    found = spadwarp.crlb(spadwarp.simulate(clear, photons=3_000_000, seed=1))
+    expected = spadwarp.simulate_analytic(clear, frames=0).sigma_time
+    assert found.shape == (4, 4)
+    # 600 photons land on a pixel's part of the plate: 2 % on the bound.
+    np.testing.assert_allclose(found, expected, rtol=0.1)
+    assert np.median(found / expected) == pytest.approx(1, abs=0.03)
