@@ -19,10 +19,10 @@ __all__ = ["core_count", "devices", "physical_memory", "pick_device", "pick_devi
 def pick_devices(names: str | None = None) -> list[wp.Device]:
     """The Warp devices of a list such as "cuda:0,cuda:2"; "cuda:all" are the GPUs of this host.
 
-    A device that is named twice works twice, with tallies of its own each time.
+    A device that is named twice is used twice, with tallies of its own each time.
 
     Raises:
-        DeviceError: There is no such device; names those there are.
+        DeviceError: There is no such device; the text names those that exist.
     """
     import warp as wp
 
@@ -36,7 +36,7 @@ def pick_device(name: str | None = None) -> wp.Device:
     """The Warp device of that name; by default the first GPU, else the CPU.
 
     Raises:
-        DeviceError: There is no such device; names those there are.
+        DeviceError: There is no such device; the text names those that exist.
     """
     import warp as wp
 
@@ -80,7 +80,7 @@ def devices() -> list[dict[str, Any]]:
 
 
 def processor_name(device: wp.Device | None = None) -> str:
-    """What a device calls itself; by default the CPU."""
+    """The name of a device's processor; by default the CPU's."""
     if device is not None and device.is_cuda:
         return device.name
     return platform.processor() or platform.machine()
@@ -88,7 +88,7 @@ def processor_name(device: wp.Device | None = None) -> str:
 
 @functools.cache
 def start_warp() -> None:
-    """`wp.init()` without Warp's greeting, and on a machine without a GPU without its warning that there is none."""
+    """`wp.init()` without Warp's start-up text, nor its warning where there is no GPU."""
     import warp as wp
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
@@ -129,5 +129,5 @@ def core_count() -> int:
 
 
 def physical_memory() -> int | None:
-    """[bytes]; None where the system does not tell."""
+    """Memory of the machine [bytes]; None where the system does not report it."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None

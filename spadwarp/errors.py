@@ -40,4 +40,4 @@ class FileError(SpadwarpError):
 
 
 class DeviceError(SpadwarpError):
-    """A device that is not there, or too small for what was asked."""
+    """A device that does not exist, or has too little memory for what was asked."""

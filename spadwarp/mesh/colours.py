@@ -190,7 +190,7 @@ def _read_off(text: str) -> dict[str, Any]:
             colours.append(colour)
     parsed["faces"] = np.array(faces, dtype=np.int64).reshape(-1, 3)
     if len(faces) and not 0 <= parsed["faces"].min() <= parsed["faces"].max() < vertex_count:
-        raise ValueError("a face refers to a vertex that is not there")
+        raise ValueError("a face refers to a vertex that does not exist")
     if "vertex_colors" not in parsed and colours and all(len(colour) == 3 for colour in colours):
         parsed["face_colors"] = _numbers(colours)
     return parsed

@@ -17,9 +17,9 @@ class Domain(Section):
     shape: Literal["unbounded", "slab", "box"] = "unbounded"
     """slab: bounded in z; box: in x, y and z"""
     lower: Corner = (-math.inf,) * 3
-    """lower corner [m]; one number stands for all three, a slab uses z"""
+    """lower corner [m]; one number for all three; a slab uses z"""
     upper: Corner = (math.inf,) * 3
-    """upper corner [m]; one number stands for all three, a slab uses z"""
+    """upper corner [m]; one number for all three; a slab uses z"""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -65,13 +65,13 @@ def points_inside(triangles: Points, planes: Points) -> Points:
         if len(polygon):
             fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
             found.append(_spread(fan))
-            if len(found) > 256:  # enough for every number that is told
+            if len(found) > 256:  # enough for every number that a check reports
                 break
     return np.concatenate(found)
 
 
 def _spread(triangles: Points) -> Points:
-    """Points spread over each triangle: corners alone where there are many triangles."""
+    """Points evenly over each triangle; of many triangles the corners alone."""
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
     return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)

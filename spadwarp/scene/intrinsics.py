@@ -54,7 +54,7 @@ def is_invertible(camera: Camera) -> bool:
     """Whether each point of the image belongs to one direction of the view.
 
     The distortion is the gradient of a function of the tangents, so that a positive definite Jacobian throughout a
-    convex region makes it one-to-one there; looked at on a grid over the box that holds the view.
+    convex region makes it one-to-one in it; tested on a grid over the box that holds the view.
     """
     if not any(camera.distortion):
         return True

@@ -18,11 +18,11 @@ class Laser(Section):
     preset: str | None = None
     """a named laser, see `spadwarp presets laser`"""
     position: Vector = (0.0, 0.0, 0.0)
-    """place [m]"""
+    """where the beam begins [m]"""
     direction: Vector = (0.0, 0.0, 1.0)
-    """axis of the beam; any length but 0; a scan aims it itself"""
+    """axis of the beam; any length but 0; a scan sets it"""
     frame: Literal["camera", "world"] = "camera"
-    """frame of position and direction: a laser moves with the camera, or stands in the world"""
+    """frame of position and direction: a laser moves with the camera, or is fixed in the world"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
     profile_image: str | None = None

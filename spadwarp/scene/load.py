@@ -46,7 +46,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any]) -> Table:
-    """`layer` on top of `base`; a preset in the layer stands for the fields that it gives, beneath the layer's own.
+    """`layer` on top of `base`; a preset in the layer gives its fields, over which the layer's own lie.
 
     A value of None takes the field back to its default.
     """
@@ -143,7 +143,7 @@ def _parse_value(value: str, text: str) -> Any:
         table = tomllib.loads(f"value = {value}")
     except tomllib.TOMLDecodeError as error:
         if re.fullmatch(r"[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?", value):
-            return float(value)  # .9 and 5. are not TOML, but nobody means text by them
+            return float(value)  # .9 and 5. are not TOML, but mean numbers
         if value[0] in "\"'[{":
             raise ConfigError(f"override {text!r}: the value is not valid TOML: {error}") from None
         return value

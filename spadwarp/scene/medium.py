@@ -18,8 +18,13 @@ from spadwarp.scene.sections import Vector, listed
 from spadwarp.units import pulse_speed
 from spadwarp.water import water_optics
 
-# Fields that a phase function needs and no other takes.
-_PHASE_FIELDS = {"two_term_henyey_greenstein": ("g1", "g2", "alpha"), "tabulated": ("phase_table",)}
+# Fields that each phase function takes. Those that are None by default it needs, and no other takes.
+_PHASE_FIELDS = {
+    "henyey_greenstein": ("anisotropy",),
+    "two_term_henyey_greenstein": ("g1", "g2", "alpha"),
+    "fournier_forand": ("particle_index", "junge_slope"),
+    "tabulated": ("phase_table",),
+}
 
 
 class Medium(Water):
@@ -80,12 +85,13 @@ class Medium(Water):
     @model_validator(mode="after")
     def _fields_of_the_phase_function(self) -> Self:
         for law, names in _PHASE_FIELDS.items():
-            missing = [name for name in names if getattr(self, name) is None]
+            own = [name for name in names if type(self).model_fields[name].default is None]
+            missing = [name for name in own if getattr(self, name) is None]
             if law == self.phase_function and missing:
                 raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
-            if law != self.phase_function and len(missing) < len(names):
-                given = next(name for name in names if name not in missing)
-                raise ValueError(f"{given} = {getattr(self, given)!r} goes with phase_function = {law!r} only")
+            if law != self.phase_function and (given := [name for name in own if name not in missing]):
+                value = getattr(self, given[0])
+                raise ValueError(f"{given[0]} = {value!r} goes with phase_function = {law!r} only")
         return self
 
     @model_validator(mode="after")
@@ -140,8 +146,7 @@ class Medium(Water):
     @property
     def phase_parameters(self) -> dict[str, float | str]:
         """The fields that `phase_function` takes."""
-        names = {"henyey_greenstein": ("anisotropy",), "fournier_forand": ("particle_index", "junge_slope")}
-        return {name: getattr(self, name) for name in {**names, **_PHASE_FIELDS}[self.phase_function]}
+        return {name: getattr(self, name) for name in _PHASE_FIELDS[self.phase_function]}
 
     @property
     def molecular_share(self) -> float:
@@ -164,7 +169,7 @@ class Medium(Water):
     def at_wavelength(self, wavelength_nm: float) -> Medium:
         """The medium as light of a vacuum wavelength [nm] meets it.
 
-        Raises `ValueError` outside [400, 700] if anything depends on it.
+        Raises `ArgumentError` outside [400, 700] if anything depends on it.
         """
         medium = self.model_copy()
         medium._follow(wavelength_nm)
@@ -176,7 +181,7 @@ class Medium(Water):
         return (self, *self.layers)
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """∫c ds on the straight way between two points of the world [m]."""
+        """∫c ds along the straight line between two points of the world [m]."""
         length = math.dist(begin, end)
         if not self.layers or length == 0.0:
             return self.extinction * length

@@ -22,14 +22,14 @@ Vector = tuple[float, float, float]
 
 
 def rotation_matrix(rotation_deg: ArrayLike) -> NDArray[np.float64]:
-    """Rx·Ry·Rz `[3, 3]`: turns about x, then about the turned y, then about the twice turned z [°]."""
+    """Rx·Ry·Rz `[3, 3]`: rotations about x, then the new y, then the new z [°]."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_euler("XYZ", np.asarray(rotation_deg, np.float64), degrees=True).as_matrix()
 
 
 def rotation_angles(matrix: ArrayLike) -> Vector:
-    """`rotation_deg` [°] of a rotation matrix: `rotation_matrix` undone, with 0 for the last turn where ry is ±90°."""
+    """`rotation_deg` [°] of a rotation matrix: `rotation_matrix` undone, with 0 for the last angle where ry is ±90°."""
     from scipy.spatial.transform import Rotation
 
     return _vector(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True, suppress_warnings=True))
@@ -49,7 +49,7 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     """`position` and `rotation_deg` of the camera that OpenCV calls (rvec, tvec), as `solvePnP` returns them.
 
     OpenCV maps a point X of the world to R·X + t of the camera, with R the rotation about rvec by |rvec| radians
-    (Rodrigues); the camera so stands at −Rᵀt and its axes are the rows of R.
+    (Rodrigues): its position is −Rᵀt, and its axes are the rows of R.
 
     Args:
         rvec: Rotation vector [rad], 3 numbers, or the rotation matrix R `[3, 3]`.
@@ -63,25 +63,25 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     """
     from scipy.spatial.transform import Rotation
 
-    turn, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
-    if turn.shape != (3, 3):
-        turn = turn.ravel()
-    if turn.shape not in ((3,), (3, 3)) or shift.shape != (3,):
+    rotation, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
+    if rotation.shape != (3, 3):
+        rotation = rotation.ravel()
+    if rotation.shape not in ((3,), (3, 3)) or shift.shape != (3,):
         raise ArgumentError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
-    if turn.shape == (3,):
-        matrix = Rotation.from_rotvec(turn).as_matrix()
+    if rotation.shape == (3,):
+        matrix = Rotation.from_rotvec(rotation).as_matrix()
     else:
-        matrix = turn
+        matrix = rotation
         if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
             raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")
     return {"position": _vector(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
 
 
 def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.0, 0.0)) -> dict[str, Vector]:
-    """`position` and `rotation_deg` of a camera at a place of the world that looks at a point.
+    """`position` and `rotation_deg` of a camera at a position in the world that looks at a point.
 
     Args:
-        position: Where it stands [m].
+        position: Its position [m].
         point: What is on its optical axis [m].
         down: Direction of the world that is downwards in the image, as far as the view allows.
 

@@ -72,7 +72,7 @@ class Scene(BaseModel):
 
     @property
     def scan_positions(self) -> int:
-        """Places that the beam visits: photon i leaves at place i modulo this."""
+        """Positions of the beam: photon i is emitted at position i modulo this number."""
         return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
 
     @property
@@ -81,12 +81,12 @@ class Scene(BaseModel):
         laser, camera = self.laser, self.camera
         if laser.frame == "camera" or not camera.is_posed:
             return laser
-        place, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
-        moved = {"position": tuple(map(float, place)), "direction": tuple(map(float, axis)), "frame": "camera"}
+        position, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
+        moved = {"position": tuple(map(float, position)), "direction": tuple(map(float, axis)), "frame": "camera"}
         return laser.model_copy(update=moved)
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
-        """∫c ds on the straight way between two points of the camera frame [m]."""
+        """∫c ds along the straight line between two points of the camera frame [m]."""
         if self.medium.layers and self.camera.is_posed:
             begin, end = to_world(self.camera, [begin, end]).tolist()
         return self.medium.optical_depth(begin, end)
@@ -101,7 +101,7 @@ class Scene(BaseModel):
         """Tables from which `from_dict` makes an equal scene."""
         tables: dict[str, Any] = {}
         for name, section in self:
-            tables[name] = [one.to_dict() for one in section] if name == "targets" else section.to_dict()
+            tables[name] = [target.to_dict() for target in section] if name == "targets" else section.to_dict()
         if not tables["targets"]:
             del tables["targets"]
         return tables
@@ -116,9 +116,9 @@ class Scene(BaseModel):
         Overrides act as in `load_scene`. Raises `ConfigError`.
         """
         changed = self
-        for one in (overrides, sections):
-            if one:
-                changed = _build(changed.to_dict(), overrides=one, source=self.source, resolve=False)
+        for layer in (overrides, sections):
+            if layer:
+                changed = _build(changed.to_dict(), overrides=layer, source=self.source, resolve=False)
         return changed
 
     def __eq__(self, other: object) -> bool:

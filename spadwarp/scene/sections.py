@@ -28,21 +28,23 @@ def _padded(value: Any) -> Any:
     return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
 
 
-def _sized(value: Any) -> Any:
-    return (value,) if isinstance(value, (int, float)) and not isinstance(value, bool) else listed(value)
+def _repeated(count: int) -> BeforeValidator:
+    """One number stands for `count` of them."""
 
+    def repeat(value: Any) -> Any:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return (value,) * count if is_number else listed(value)
 
-def _three(value: Any) -> Any:
-    return (value,) * 3 if isinstance(value, (int, float)) and not isinstance(value, bool) else listed(value)
+    return BeforeValidator(repeat)
 
 
 Whole = Annotated[int, BeforeValidator(_whole)]
 Vector = Annotated[tuple[float, float, float], BeforeValidator(listed)]
 Brown = Annotated[tuple[float, float, float, float, float], BeforeValidator(_padded)]
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
-Corner = Annotated[tuple[Bound, Bound, Bound], BeforeValidator(_three)]
-Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(_sized), Field(min_length=1, max_length=3)]
-Scale = Annotated[tuple[float, float, float], BeforeValidator(_three)]
+Corner = Annotated[tuple[Bound, Bound, Bound], _repeated(3)]
+Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], _repeated(1), Field(min_length=1, max_length=3)]
+Scale = Annotated[tuple[float, float, float], _repeated(3)]
 
 
 class Section(BaseModel):

@@ -48,11 +48,11 @@ def chair() -> Manifold:
 
     Size 2.00 × 3.40 × 1.99 m.
     """
-    turned = [
+    profile = [
         (0, 0), (0.06, 0), (0.07, 0.15), (0.095, 0.4), (0.065, 0.5), (0.1, 0.58), (0.065, 0.66), (0.1, 1.0),
         (0.085, 1.4), (0, 1.4),
     ]  # fmt: skip
-    leg = lathe(turned, segments=32).rotate((-5, 0, 5)).translate((0.68, -1.7, 0.62))
+    leg = lathe(profile, segments=32).rotate((-5, 0, 5)).translate((0.68, -1.7, 0.62))
     legs = mirrored(mirrored(leg), "z")
     seat = box((1.65, 0.17, 1.5), (0, -0.3, 0), rounding=0.08)
     rungs = union(
