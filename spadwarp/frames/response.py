@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -50,6 +50,8 @@ class InstrumentResponse:
     tail: float = 0.0
     times: ArrayLike | None = None
     values: ArrayLike | None = None
+    _knots: Floats = field(init=False, repr=False)
+    _heights: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("sigma", "tail"):
@@ -68,8 +70,9 @@ class InstrumentResponse:
         if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
             span = f"{values.min()} … {values.max()}"
             raise ArgumentError(f"values of a measured response ({span}) must be finite, not negative and not all 0")
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "values", values / np.trapezoid(values, times))
+        values /= np.trapezoid(values, times)
+        for name, array in {"times": times, "values": values, "_knots": times, "_heights": values}.items():
+            object.__setattr__(self, name, array)
 
     # The curve
 
@@ -184,14 +187,6 @@ class InstrumentResponse:
         return np.where(z < 0, direct, scaled) / (2.0 * self.tail)
 
     # The measured curve
-
-    @property
-    def _knots(self) -> Floats:
-        return np.asarray(self.times)
-
-    @property
-    def _heights(self) -> Floats:
-        return np.asarray(self.values)
 
     @cached_property
     def _slopes(self) -> Floats:

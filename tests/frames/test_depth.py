@@ -83,8 +83,8 @@ def test_points_lie_where_they_were_seen(tmp_path):
     view = pixel_directions(camera)
     distance = 2.0 / view[..., 2]  # a wall at z = 2
     distance[1, 2] = np.nan
-    points, there = point_cloud(distance, view)
-    assert points.shape == (23, 3) and not there[1, 2]
+    points, valid = point_cloud(distance, view)
+    assert points.shape == (23, 3) and not valid[1, 2]
     assert np.allclose(points[:, 2], 2.0) and points[:, 0].max() < 2 * np.tan(np.radians(25))
     bright = np.arange(23, dtype=np.float32)
     path = write_ply(tmp_path / "wall.ply", points, {"intensity": bright, "seen": bright > 3}, comment="a\nwall")

@@ -89,11 +89,10 @@ def test_mat_as_denoisers_read_it(origin, frames, detection, result, tmp_path):
     )
 
     # Light that was neither scattered nor spread by the response arrives in `bin`.
-    there = file["bin"] > 0
     ballistic = result.component("ballistic")
-    lit = there & (ballistic.max(axis=-1) > 0)
-    assert lit.sum() > WIDTH * HEIGHT // 2
-    assert np.array_equal(file["bin"][lit] - 1, ballistic.argmax(axis=-1)[lit])
+    illuminated = (file["bin"] > 0) & (ballistic.max(axis=-1) > 0)
+    assert illuminated.sum() > WIDTH * HEIGHT // 2
+    assert np.array_equal(file["bin"][illuminated] - 1, ballistic.argmax(axis=-1)[illuminated])
     assert np.array_equal(file["range_bins"], file["bin"])
     assert file["bin_size"].item() == pytest.approx(result.scene.gate.bin_width)
     assert np.array_equal(file["depth"] > 0, np.isfinite(result.truth.depth))
@@ -127,14 +126,8 @@ def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
     assert read_histograms(path).gate_start == pytest.approx(detection.gate_start, abs=1e-15)
     # The same words by another writer are not ours to believe.
     with ptufile.PtuFile(path) as file:
-        about = file.comment
-    ptufile.imwrite(
-        tmp_path / "b.ptu",
-        np.ones((1, 2, 2, 1, 4), np.uint32),
-        global_resolution=50e-9,
-        tcspc_resolution=4e-12,
-        comment=about,
-    )
+        options = {"global_resolution": 50e-9, "tcspc_resolution": 4e-12, "comment": file.comment}
+    ptufile.imwrite(tmp_path / "b.ptu", np.ones((1, 2, 2, 1, 4), np.uint32), **options)
     assert read_histograms(tmp_path / "b.ptu").gate_start == 0
 
     ranges = {}
@@ -180,7 +173,7 @@ def test_analytic_frames(tmp_path):
         spadwarp.export(path, tmp_path / "a.mat")
 
 
-def test_what_cannot_be_written_is_said(frames, detection, result, tmp_path):
+def test_what_cannot_be_written_is_named(frames, detection, result, tmp_path):
     for ending in ("mat", "ptu"):
         with pytest.raises(ValueError, match="draw frames first"):
             spadwarp.export(result, tmp_path / f"a.{ending}")
@@ -196,31 +189,23 @@ def test_what_cannot_be_written_is_said(frames, detection, result, tmp_path):
 
 
 def test_command(frames, tmp_path):
-    def run(*arguments, code=0):
-        outcome = CliRunner().invoke(app, ["export", *map(str, arguments)])
+    def run(source, out, *options, code=0):
+        arguments = ["export", source, "--format", "npy", "--out", tmp_path / out, *options]
+        outcome = CliRunner().invoke(app, list(map(str, arguments)))
         assert outcome.exit_code == code, outcome.output
-        return outcome
+        return outcome.output
 
-    told = run(frames.parent, "--format", "mat", "--format", "npy", "--out", tmp_path / "a").stdout
-    assert "frames-00000.mat to frames-00001.mat (2 files)" in told
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == [
-        "frames-00000.mat",
-        "frames-00001.mat",
-        "frames.npy",
-    ]
-    run(frames, "--format", "npy", "--frames", "1:2", "--out", tmp_path / "b", "--quiet")
+    assert "frames-00000.mat to frames-00001.mat (2 files)" in run(frames.parent, "a", "--format", "mat")
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy"]
+    run(frames, "b", "--frames", "1:2", "--quiet")
     assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
-    assert (
-        "holds no frames.h5 and no result.h5"
-        in run(tmp_path, "--format", "npy", "--out", tmp_path / "c", code=1).output
-    )
-    assert "outside" in run(frames, "--format", "npy", "--frames", 9, "--out", tmp_path / "d", code=2).output
-    assert (
-        "none of them in 5:" in run(frames, "--format", "npy", "--frames", "5:", "--out", tmp_path / "d", code=2).output
-    )
+    assert "holds no frames.h5 and no result.h5" in run(tmp_path, "c", code=1)
+    assert "outside" in run(frames, "d", "--frames", 9, code=2)
+    assert "none of them in 5:" in run(frames, "d", "--frames", "5:", code=2)
     make_result(make_scene()).save(tmp_path / "result.h5")
-    refused = run(tmp_path / "result.h5", "--format", "npy", "--format", "mat", "--out", tmp_path / "e", code=2).output
-    assert "draw frames first" in refused and not list((tmp_path / "e").iterdir())  # the array neither
+    assert "draw frames first" in run(tmp_path / "result.h5", "e", "--format", "mat", code=2)
+    assert not list((tmp_path / "e").iterdir())  # the array neither
 
 
 RECIPE = {
@@ -284,9 +269,7 @@ def test_datasets_of_depth(dataset, tmp_path):
             assert np.array_equal(channels[name], item[field][0], equal_nan=True), name
     with pytest.raises(FileError, match="name the dataset's folder"):
         spadwarp.export(next(dataset.glob("frames-*.h5")), tmp_path / "b.npy")
-    outcome = CliRunner().invoke(
-        app,
-        ["export", str(dataset), "--split", "test", "--frames", "0:1", "--format", "exr", "--out", str(tmp_path / "c")],
-    )
+    options = ("--split", "test", "--frames", "0:1", "--format", "exr")
+    outcome = CliRunner().invoke(app, ["export", str(dataset), *options, "--out", str(tmp_path / "c")])
     assert outcome.exit_code == 0, outcome.output
     assert [path.name for path in (tmp_path / "c").iterdir()] == ["traced.exr"]
