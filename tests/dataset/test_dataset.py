@@ -391,3 +391,23 @@ def test_plan_needs_no_order():
     assert plan.scene(3).scene == plan.scene(3).scene != plan.scene(2).scene
     assert plan.scene(3).fractions == tuple(plan.fraction(9 + k) for k in range(3))
     assert not math.isnan(plan.scene(0).fractions[0])
+
+
+def test_older_words_in_a_recipe_mean_and_draw_the_same():
+    pulses = {"low": 1000.0, "high": 9000.0}
+    older, now = (
+        Plan(
+            spadwarp.Recipe.from_dict(
+                {**TABLES, "exposure": {f"pulses{more}": pulses}, "vary": {path: [True, False], "analytic.form": forms}}
+            )
+        )
+        for more, path, forms in (
+            ("", "detector.fold", ["paper", "radiometric"]),
+            ("_per_depth_frame", "detector.wrap", ["lu2024", "radiometric"]),
+        )
+    )
+    drawn = [older.scene(index).scene for index in range(older.scene_count)]
+    assert drawn == [now.scene(index).scene for index in range(now.scene_count)]
+    assert {scene.detector.wrap for scene in drawn} == {True, False}
+    changed = now.recipe.with_overrides({"exposure.pulses": 7.0})
+    assert changed.exposure.pulses_per_depth_frame.choices == (7.0,)
