@@ -25,15 +25,15 @@ _HOMES = {
     "PhaseFunction": "scene",
     "check": "checks",
     "bench": "benchmark.cases",
-    "simulate": "transport.simulate",
+    "simulate": "transport",
     "Ray": "parallel",
     "run_jobs": "parallel",
     "interruptible": "parallel",
-    "trace": "transport.records",
-    "PhotonRecords": "transport.records",
+    "trace": "transport",
+    "PhotonRecords": "transport",
     "look_at": "scene",
     "opencv_pose": "scene",
-    "truth_maps": "transport.model",
+    "truth_maps": "transport",
     "devices": "device",
     "Diagnosis": "doctor.diagnosis",
     "SelfTest": "doctor.diagnosis",
@@ -114,8 +114,7 @@ if TYPE_CHECKING:
     from spadwarp.run import save_analytic
     from spadwarp.run.formats import export
     from spadwarp.scene import PhaseFunction, Scene, load_scene, look_at, opencv_pose, phase_function, presets
-    from spadwarp.transport.model import truth_maps
-    from spadwarp.transport.records import PhotonRecords, trace
+    from spadwarp.transport import PhotonRecords, trace, truth_maps
     from spadwarp.transport.simulate import simulate
     from spadwarp.viz.transient_video import video
     from spadwarp.viz.viewer import view

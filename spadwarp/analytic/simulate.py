@@ -16,7 +16,7 @@ from spadwarp.analytic.result import AnalyticResult, background_photons
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene.geometry import pixel_directions
-from spadwarp.transport.model import truth_maps
+from spadwarp.transport import truth_maps
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

@@ -17,7 +17,7 @@ from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.scene import parse_override
 from spadwarp.scene.geometry import pixel_directions
-from spadwarp.transport.model import truth_maps
+from spadwarp.transport import truth_maps
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

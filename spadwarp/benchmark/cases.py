@@ -462,7 +462,7 @@ class _Memory:
 
 def _analytic(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
     from spadwarp.analytic.simulate import simulate_analytic
-    from spadwarp.transport.model import truth_maps
+    from spadwarp.transport import truth_maps
 
     frames = 512 if device.is_cuda else 32
     scene = Scene.from_dict(case.scene)

@@ -15,7 +15,7 @@ from spadwarp.device import pick_device
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
-from spadwarp.transport.model import truth_maps
+from spadwarp.transport import truth_maps
 
 __all__ = ["render_analytic"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ConfigError, SpadwarpError
-from spadwarp.result.photon_ids import joined
+from spadwarp.result.photon_ids import Range, joined
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
 
@@ -86,7 +86,7 @@ def merge(results: Iterable[Result]) -> Result:
         **vars(total),
         photons=sum(part.photons for part in parts),
         timing=add_timing(part.timing for part in parts),
-        provenance=join_provenance(parts),
+        provenance=join_provenance((part.provenance, part.photon_ranges) for part in parts),
         partial=any(part.partial for part in parts),
         photon_ranges=ranges,
         requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
@@ -99,12 +99,12 @@ def add_timing(timings: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return {name: sum(part.get(name, 0.0) for part in parts) for name in parts[0]}
 
 
-def join_provenance(parts: Iterable[Result]) -> dict[str, Any]:
-    """The first part's provenance, and under `parts` that of each with its photon ids."""
+def join_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
+    """The first provenance, and under `parts` each with its photon ids."""
     each: list[dict[str, Any]] = []
-    for part in parts:
-        own = dict(part.provenance)
-        each += own.pop("parts", None) or [{**own, "photon_ranges": [list(ids) for ids in part.photon_ranges]}]
+    for provenance, ranges in parts:
+        own = dict(provenance)
+        each += own.pop("parts", None) or [{**own, "photon_ranges": [list(ids) for ids in ranges]}]
     head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
     return head if len(each) == 1 else {**head, "parts": each}
 

@@ -1,4 +1,4 @@
-"""Which photons: ids as [start, stop) ranges."""
+"""Photon ids as [start, stop) ranges."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Iterable
 
 from spadwarp.errors import ConfigError
 
+__all__ = ["IdQueue", "Range", "Ranges", "count", "joined", "shard_of", "without"]
+
 Range = tuple[int, int]
 Ranges = tuple[Range, ...]
 
 
 def joined(ranges: Iterable[Range]) -> Ranges:
-    """The ranges in order, those that adjoin made one.
+    """The ranges in order, adjoining ones made one.
 
     Raises:
         ConfigError: Ids are in more than one of them.
@@ -28,7 +30,7 @@ def joined(ranges: Iterable[Range]) -> Ranges:
 
 
 def without(span: Range, done: Ranges) -> Ranges:
-    """What `done`, joined ranges, leaves of a span."""
+    """The parts of a span that are not in `done`, which are joined ranges."""
     left: list[Range] = []
     start, stop = span
     for first, last in done:
@@ -60,8 +62,8 @@ def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
     return start + unit * (units * (number - 1) // parts), start + unit * (units * number // parts)
 
 
-class Queue:
-    """Ids that wait, handed out from the front; what was lost comes back to it."""
+class IdQueue:
+    """Ids that wait, taken from the front; those of lost workers are put back."""
 
     def __init__(self, ranges: Iterable[Range]) -> None:
         self._ranges = sorted(ranges, reverse=True)

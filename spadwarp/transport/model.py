@@ -1,4 +1,4 @@
-"""From a scene to what the kernels take: parameter structs, the mesh's BVH, the unit of the tallies."""
+"""From a scene to what the kernels take: parameter structs, the mesh's BVH, the compile-time choices."""
 
 from __future__ import annotations
 
@@ -7,38 +7,39 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
-from spadwarp.device import physical_memory, pick_device
+import spadwarp_kernels as sk
+from spadwarp.device import physical_memory
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.result.result import COMPONENTS, Truth
+from spadwarp.result import COMPONENTS
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
-from spadwarp.scene.geometry import pixel_directions, scan_axes
+from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.pose import rotation_matrix, to_world
 from spadwarp.transport.tally_scale import tally_scale
 
 if TYPE_CHECKING:
-    import warp as wp
-
     from spadwarp.mesh import TriangleMesh
-    from spadwarp_kernels import Model
 
-# The paper's albedo is uniform in (0, 0.97).
-LU2024_ALBEDO = 0.97
+__all__ = ["build_model", "transport_spec"]
+
+# The albedo of Lu et al. 2024 is uniform in (0, 0.97).
+_LU2024_ALBEDO = 0.97
 
 _UNLIMITED = 1.0e30
 
 
 def build_model(
     scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: float = 1
-) -> Model:
+) -> sk.Model:
     """The scene on a device.
 
     Args:
         scene: What to simulate.
-        device: From `pick_device`.
-        mesh: From `spadwarp.mesh.targets.build_mesh`.
+        device: From `spadwarp.device.pick_device`.
+        mesh: From `spadwarp.mesh.build_mesh`.
         copies: Histograms that the run will hold on the device, for the check of its memory.
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
@@ -48,74 +49,21 @@ def build_model(
         FileError: That table or the beam's profile cannot be read.
         DeviceError: The device has too little memory.
     """
-    import warp as wp
-
-    import spadwarp_kernels as sk
-
     _check_domain(scene, camera)
-    medium = sk.Medium()
-    medium.extinction = scene.medium.extinction
-    medium.albedo = LU2024_ALBEDO if scene.medium.albedo == "lu2024" else scene.medium.albedo
-    medium.anisotropy = scene.medium.anisotropy
-    medium.axis_threshold = scene.transport.axis_threshold
-    if scene.medium.has_phase_table:
-        medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
-
-    laser, lens = _laser(scene, device), _camera(scene)
-
-    speed = scene.medium.pulse_speed
-    gate = sk.Gate()
-    gate.start, gate.stop = scene.gate.start * speed, scene.gate.stop * speed
-    gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)
-    gate.bins = scene.gate.bins
-
-    limits = sk.Limits()
-    lower, upper = np.array(scene.domain.bounds)
-    if _is_turned(scene):
-        limits.rotation = wp.mat33(*rotation_matrix(scene.camera.rotation_deg).ravel())
-        limits.origin = wp.vec3(*scene.camera.position)
-    else:
-        lower, upper = lower - scene.camera.position, upper - scene.camera.position
-    limits.lower = wp.vec3(*np.maximum(lower, -_UNLIMITED))
-    limits.upper = wp.vec3(*np.minimum(upper, _UNLIMITED))
-    limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
-    limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
-    # What arrives by a longer path than histories may have lies outside the gate for every estimator.
-    gate.stop = min(gate.stop, limits.max_path)
-    limits.weight_cutoff = scene.transport.weight_cutoff
-    limits.max_collisions = scene.transport.max_collisions
-
-    # Measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long. Each event divides the weight of
-    # light that was left alone by 1 - probability, so that thick water, where events are many, wants less.
-    there = [p + 0.5 * limits.max_path * u for p, u in zip(scene.beam.position, scene.beam.axis, strict=True)]
-    depth = scene.medium.extinction * limits.max_path
-    if scene.medium.layers:
-        depth = 2.0 * scene.optical_depth(scene.beam.position, there)
-    thickness = max(depth, 1e-6)
-    guiding = sk.Guiding()
-    guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))
-    guiding.surface_probability = 0.3
-    guiding.anisotropy = 0.97
-    guiding.return_probability = 0.1 * min(1.0, 5.0 / thickness)
-    guiding.return_anisotropy = 0.5
-
-    device_mesh, surfaces = None, sk.make_surfaces(None, device=device)
-    if mesh is not None:
-        device_mesh = wp.Mesh(
-            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
-            wp.array(mesh.faces.ravel(), dtype=int, device=device),
-            # The fastest to traverse, by measurement.
-            bvh_constructor="cubql" if device.is_cuda else None,
-            bvh_leaf_size=1 if device.is_cuda else 2,
-        )
-        surfaces = sk.make_surfaces(
-            device_mesh,
-            wp.array(mesh.reflectance, dtype=float, device=device),
-            camera=lens if camera else None,
-            **_appearance(mesh, device),
-        )
-    scale = tally_scale(scene, mesh)
-    model = sk.Model(device, medium, laser, lens, gate, limits, guiding, device_mesh, surfaces, scale)
+    lens, limits = _camera(scene), _limits(scene, camera)
+    device_mesh, surfaces = _surfaces(mesh, lens if camera else None, device)
+    model = sk.Model(
+        device=device,
+        medium=_medium(scene, device),
+        laser=_laser(scene, device),
+        camera=lens,
+        gate=_gate(scene, limits.max_path),
+        limits=limits,
+        guiding=_guiding(scene, limits.max_path),
+        mesh=device_mesh,
+        surfaces=surfaces,
+        scale=tally_scale(scene, mesh),
+    )
     if scene.medium.layers:
         model = dataclasses.replace(model, layers=_layers(scene, device))
     if scene.scan.mode != "none":
@@ -125,12 +73,80 @@ def build_model(
     return model
 
 
-def _appearance(mesh: TriangleMesh, device: wp.Device) -> dict[str, Any]:
-    """What `make_surfaces` takes beyond one reflectance a face."""
-    import warp as wp
+def _largest_albedo(albedo: float | str) -> float:
+    return _LU2024_ALBEDO if isinstance(albedo, str) else albedo
 
-    import spadwarp_kernels as sk
 
+def _medium(scene: Scene, device: wp.Device) -> Any:
+    medium = sk.Medium()
+    medium.extinction = scene.medium.extinction
+    medium.albedo = _largest_albedo(scene.medium.albedo)
+    medium.anisotropy = scene.medium.anisotropy
+    medium.axis_threshold = scene.transport.axis_threshold
+    if scene.medium.has_phase_table:
+        medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
+    return medium
+
+
+def _gate(scene: Scene, max_path: float) -> Any:
+    """The gate in path [m]; light by a longer path than histories may have is outside it for every estimator."""
+    speed = scene.medium.pulse_speed
+    gate = sk.Gate()
+    gate.start, gate.stop = scene.gate.start * speed, min(scene.gate.stop * speed, max_path)
+    gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)
+    gate.bins = scene.gate.bins
+    return gate
+
+
+def _limits(scene: Scene, camera: bool) -> Any:
+    limits = sk.Limits()
+    lower, upper = np.array(scene.domain.bounds)
+    if _has_rotated_domain(scene):
+        limits.rotation = wp.mat33(*rotation_matrix(scene.camera.rotation_deg).ravel())
+        limits.origin = wp.vec3(*scene.camera.position)
+    else:
+        lower, upper = lower - scene.camera.position, upper - scene.camera.position
+    limits.lower = wp.vec3(*np.maximum(lower, -_UNLIMITED))
+    limits.upper = wp.vec3(*np.minimum(upper, _UNLIMITED))
+    limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
+    limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
+    limits.weight_cutoff = scene.transport.weight_cutoff
+    limits.max_collisions = scene.transport.max_collisions
+    return limits
+
+
+def _guiding(scene: Scene, max_path: float) -> Any:
+    """Probabilities of guided flights, measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long.
+
+    Each event divides the weight of light that was not guided by 1 - probability, so that optically thick water, where
+    events are many, needs smaller ones.
+    """
+    beam = scene.beam
+    if scene.medium.layers:
+        far_point = [p + 0.5 * max_path * u for p, u in zip(beam.position, beam.axis, strict=True)]
+        thickness = max(2.0 * scene.optical_depth(beam.position, far_point), 1e-6)
+    else:
+        thickness = max(scene.medium.extinction * max_path, 1e-6)
+    guiding = sk.Guiding()
+    guiding.probability = 0.3 * min(1.0, math.sqrt(10.0 / thickness))
+    guiding.surface_probability = 0.3
+    guiding.anisotropy = 0.97
+    guiding.return_probability = 0.1 * min(1.0, 5.0 / thickness)
+    guiding.return_anisotropy = 0.5
+    return guiding
+
+
+def _surfaces(mesh: TriangleMesh | None, lens: Any, device: wp.Device) -> tuple[wp.Mesh | None, Any]:
+    """The mesh with its BVH, and its surfaces as the kernels take them."""
+    if mesh is None:
+        return None, sk.make_surfaces(None, device=device)
+    device_mesh = wp.Mesh(
+        wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        wp.array(mesh.faces.ravel(), dtype=int, device=device),
+        # The fastest to traverse, by measurement.
+        bvh_constructor="cubql" if device.is_cuda else None,
+        bvh_leaf_size=1 if device.is_cuda else 2,
+    )
     arrays: dict[str, Any] = {}
     if mesh.specular is not None and mesh.roughness is not None:
         arrays["specular"] = wp.array(mesh.specular, dtype=float, device=device)
@@ -141,20 +157,19 @@ def _appearance(mesh: TriangleMesh, device: wp.Device) -> dict[str, Any]:
             arrays["textures"] = sk.make_textures(
                 mesh.pattern.texture, mesh.pattern.coordinates, mesh.pattern.images, device=device
             )
-    return arrays
+    reflectance: wp.array = wp.array(mesh.reflectance, dtype=float, device=device)
+    return device_mesh, sk.make_surfaces(device_mesh, reflectance, camera=lens, **arrays)
 
 
 def _layers(scene: Scene, device: wp.Device) -> Any:
     """The medium and its layers as the kernels take them."""
-    import spadwarp_kernels as sk
-
     medium, camera = scene.medium, scene.camera
     axis = np.array(medium.layer_axis) / math.hypot(*medium.layer_axis)
     shift = float(axis @ camera.position)
     return sk.make_layers(
         [-_UNLIMITED, *(layer.start - shift for layer in medium.layers)],
         [water.extinction for water in medium.waters],
-        [LU2024_ALBEDO if water.albedo == "lu2024" else water.albedo for water in medium.waters],
+        [_largest_albedo(water.albedo) for water in medium.waters],
         [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
         axis=(axis @ rotation_matrix(camera.rotation_deg)).tolist(),
         device=device,
@@ -163,8 +178,6 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
 
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
     """The compile-time choices of a scene; `choices` override them."""
-    import spadwarp_kernels as sk
-
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
@@ -179,53 +192,12 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         lens=sk.PINHOLE if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED,
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode == "confocal",
-        rotated_domain=_is_turned(scene),
+        rotated_domain=_has_rotated_domain(scene),
     )
     return spec._replace(**choices)
 
 
-def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
-    """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
-    from spadwarp.mesh import build_mesh
-
-    mesh = build_mesh(scene)
-    return trace_truth(scene, build_model(scene, pick_device(device), mesh, camera=False))
-
-
-def trace_truth(scene: Scene, model: Model) -> Truth:
-    """`truth_maps` for a model that is already on its device."""
-    import warp as wp
-
-    import spadwarp_kernels as sk
-
-    shape = (scene.camera.height, scene.camera.width)
-    if model.mesh is None:
-        nothing = np.full(shape, np.nan, np.float32)
-        return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
-    directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
-    if not scene.camera.is_plain:
-        directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
-    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
-    normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
-    wp.launch(
-        sk.truth_kernel,
-        dim=shape,
-        inputs=[model.camera, model.surfaces, directions],
-        outputs=[depth, distance, normal, reflectance],
-        device=model.device,
-    )
-    return Truth(depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy())
-
-
-def _source(scene: Scene) -> str | None:
-    return None if scene.source is None else str(scene.source)
-
-
 def _laser(scene: Scene, device: wp.Device) -> Any:
-    import warp as wp
-
-    import spadwarp_kernels as sk
-
     beam = scene.beam
     laser = sk.Laser()
     laser.position = wp.vec3(*beam.position)
@@ -246,10 +218,6 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
 
 
 def _camera(scene: Scene) -> Any:
-    import warp as wp
-
-    import spadwarp_kernels as sk
-
     camera = scene.camera
     k1, k2, p1, p2, k3 = camera.distortion
     lens = sk.Camera()
@@ -266,10 +234,6 @@ def _camera(scene: Scene) -> Any:
 
 def _scan(scene: Scene, device: wp.Device) -> Any:
     """A raster over the pixels: the beam goes through the middle of each."""
-    import warp as wp
-
-    import spadwarp_kernels as sk
-
     axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
     scan = sk.Scan()
     scan.count = len(axes)
@@ -278,38 +242,36 @@ def _scan(scene: Scene, device: wp.Device) -> Any:
     return scan
 
 
-def _is_turned(scene: Scene) -> bool:
+def _has_rotated_domain(scene: Scene) -> bool:
     """Whether the domain has faces that are not parallel to the camera's axes."""
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
 def _check_domain(scene: Scene, camera: bool) -> None:
-    places = {"laser.position": to_world(scene.camera, scene.beam.position)}
+    points = {"laser.position": to_world(scene.camera, scene.beam.position)}
     if camera:
-        places["camera.position"] = np.array(scene.camera.position)
-    for name, point in places.items():
-        for axis, place, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
-            if not low <= place <= high:
-                problem = f"{name}: {axis} = {place} is outside [{low}, {high}], the domain"
-                raise ConfigError(problem, source=_source(scene))
+        points["camera.position"] = np.array(scene.camera.position)
+    for name, point in points.items():
+        for axis, value, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
+            if not low <= value <= high:
+                raise _config_error(scene, f"{name}: {axis} = {value} is outside [{low}, {high}], the domain")
 
 
-def _check_size(scene: Scene, model: Model, copies: float) -> None:
+def _check_size(scene: Scene, model: sk.Model, copies: float) -> None:
     """Refuses what cannot fit before anything is computed."""
-    shape = (
-        f"{scene.camera.height} x {scene.camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
-    )
-    if model.tally_size >= 2**31:
-        problem = f"camera and gate: {shape} = {model.tally_size} is outside [1, {2**31 - 1}]"
-        raise ConfigError(problem, source=_source(scene))
-    needed = 8 * model.tally_size * copies
-    if model.device.is_cuda:
-        there: int | None = model.device.free_memory
-    else:
-        # Counts on the device, their copy in the result, and the total of the components.
-        needed *= 2
-        there = physical_memory()
-    if there is not None and needed > there:
+    camera, size = scene.camera, model.tally_size
+    shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    if size >= 2**31:
+        raise _config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")
+    cuda = model.device.is_cuda
+    # On the CPU counts on the device, their copy in the result, and the total of the components.
+    needed = (8 if cuda else 16) * size * copies / 2**30
+    available = model.device.free_memory if cuda else physical_memory()
+    if available is not None and needed > available / 2**30:
         raise DeviceError(
-            f"{shape} need {needed / 2**30:.1f} GiB on {model.device.alias}; there are {there / 2**30:.1f} GiB"
+            f"{shape} need {needed:.1f} GiB on {model.device.alias}; {available / 2**30:.1f} GiB are available"
         )
+
+
+def _config_error(scene: Scene, problem: str) -> ConfigError:
+    return ConfigError(problem, source=None if scene.source is None else str(scene.source))

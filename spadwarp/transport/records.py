@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.mesh import build_mesh
 from spadwarp.scene.pose import rotation_matrix, to_world
-from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.transport.passes import CPU_PASS, CUDA_PASS, Lane, check_range
+from spadwarp.transport.plan import LAUNCH_SIZE, check_range
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -72,15 +72,16 @@ def trace(
     device: str | None = None,
     progress: Progress | None = None,
 ) -> PhotonRecords:
-    """Walks photons without a camera and returns the terminal state of each.
+    """Traces photons without a camera and returns the terminal state of each.
 
-    Positions and directions are those of the world. Path is limited by `transport.max_path` alone; the gate plays no
-    part. A photon takes 44 bytes.
+    Positions and directions are those of the world. Path is limited by `transport.max_path` alone, not by the gate.
+    A photon takes 44 bytes.
 
     Args and raises: as `simulate`.
     """
     import spadwarp_kernels as sk
-    from spadwarp.mesh import build_mesh
+    from spadwarp.transport.device_worker import DeviceWorker
+    from spadwarp.transport.model import build_model, transport_spec
 
     photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed
@@ -90,22 +91,23 @@ def trace(
     model = build_model(scene, pick_device(device), mesh, camera=False)
     if progress is not None:
         progress("compile", 0, 0)
-    lane = Lane(model, transport_spec(scene, mesh, estimator="none", records=True), seed=seed)
-    size = CUDA_PASS if model.device.is_cuda else CPU_PASS
+    spec = transport_spec(scene, mesh, estimator="none", records=True)
+    size = LAUNCH_SIZE["cuda" if model.device.is_cuda else "cpu"]
+    worker = DeviceWorker(model, spec, seed=seed, launch_size=size)
     parts: list[dict[str, NDArray[Any]]] = []
     for first in range(0, photons, size):
         stop = min(first + size, photons)
-        lane.data.records = sk.make_records(stop - first, device=model.device)
-        lane.launch(first, stop)
-        names = ("position", "direction", "weight", "path", "collisions", "reason")
-        parts.append({name: getattr(lane.data.records, name).numpy() for name in names})
+        worker.data.records = sk.make_records(stop - first, device=model.device)
+        worker.launch(first, stop)
+        parts.append({name: getattr(worker.data.records, name).numpy() for name in _ARRAYS if name != "id"})
         if progress is not None:
             progress("trace", stop, photons)
-    ledger, _ = sk.read_ledger(lane.data)
-    if scene.camera.is_posed:
+    ledger, _ = sk.read_ledger(worker.data)
+    camera = scene.camera
+    if camera.is_posed:
         for part in parts:
-            part["position"] = to_world(scene.camera, part["position"]).astype(np.float32)
-            part["direction"] = (part["direction"] @ rotation_matrix(scene.camera.rotation_deg).T).astype(np.float32)
+            part["position"] = to_world(camera, part["position"]).astype(np.float32)
+            part["direction"] = (part["direction"] @ rotation_matrix(camera.rotation_deg).T).astype(np.float32)
     return PhotonRecords(
         id=np.arange(photons, dtype=np.uint64),
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
@@ -121,7 +123,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     Args:
         records: From `spadwarp.trace`.
         path: The file; an existing one is replaced when the new one is whole.
-        scene: What they were traced in, to be kept beside them.
+        scene: The scene they were traced in, to be stored with them.
 
     Raises:
         FileError: The file cannot be written.

@@ -1,40 +1,34 @@
-"""Running a scene: which photons, on what, until when; their sums become a `Result`."""
+"""Simulation of a scene: plan the photons, trace them, collect their tallies in a `Result`."""
 
 from __future__ import annotations
 
 import datetime
 import platform
+import threading
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spadwarp.device import pick_devices, processor_name
-from spadwarp.errors import ConfigError, DeviceError, FileError
+from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.parallel import Ray, interruptible
-from spadwarp.result.merge import add_timing, check_capacity, check_targets, join_provenance, physics_of
-from spadwarp.result.photon_ids import Range, Ranges, count, joined, shard_of, without
-from spadwarp.result.result import Result
+from spadwarp.result import Result, Tallies
+from spadwarp.result.merge import add_timing, check_capacity, check_targets, join_provenance
+from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
 from spadwarp.scene import Scene
-from spadwarp.transport.passes import Plan, Tracer, check_range
+from spadwarp.transport.checkpoint import Checkpoint
+from spadwarp.transport.executor import Executor, Workers
+from spadwarp.transport.plan import Plan, make_plan
+from spadwarp.transport.tally_scale import tally_scale
 
-if TYPE_CHECKING:
-    from spadwarp.transport.cluster import ClusterTracer
+__all__ = ["Progress", "provenance", "simulate"]
 
-# Called with ("compile", 0, 0) before kernels are compiled or loaded, then with ("trace", photons done, photons asked
-# for); any other first word is a remark for whoever watches.
 Progress = Callable[[str, int, int], None]
-
-# Checkpoints take at most this share of the time.
-_CHECKPOINT_SHARE = 0.02
-
-# Photons of a batch at most: some seconds of a GPU, so that there is enough to deal out and little to lose.
-_LARGEST_BATCH = 1 << 30
 
 
 def simulate(
@@ -45,7 +39,7 @@ def simulate(
     device: str | None = None,
     engine: Ray | None = None,
     threads: int | None = None,
-    pass_size: int | None = None,
+    launch_size: int | None = None,
     progress: Progress | None = None,
     uncertainty: bool = False,
     relative_error: float | None = None,
@@ -58,7 +52,7 @@ def simulate(
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
-    One seed gives the same bits on one kind of device, whatever their number, the engine, `threads` and `pass_size`.
+    One seed gives the same bits on one kind of device, whatever their number, the engine, `threads` and `launch_size`.
 
     Args:
         scene: From `spadwarp.load_scene`.
@@ -69,8 +63,9 @@ def simulate(
             else the CPU.
         engine: `spadwarp.Ray(...)` to run on its workers; `device` is then "cpu" or "cuda".
         threads: CPU threads; by default one a core. A GPU takes none.
-        pass_size: Photons in one launch, up to 2^26, on the CPU 2^20.
-        progress: Called from the caller's thread.
+        launch_size: Photons in one launch, up to 2^26, on the CPU 2^20.
+        progress: Called from the caller's thread with ("compile", 0, 0) before kernels are compiled or loaded, then
+            with ("trace", photons done, photons asked for); any other first word is a remark for the user.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
             at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
         relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
@@ -79,8 +74,8 @@ def simulate(
         shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
         resume: A result of the same scene, to which photons are added until it has `photons`; the outcome is that of
             one long run. Gaps in its ids are filled.
-        checkpoint: A file that holds, as a partial result, what is done so far; `resume` goes on from it. Left where
-            it is when the run is done.
+        checkpoint: A file for the photons done so far, as a partial result that `resume` takes. It is not removed when
+            the run is done.
         checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
             the time at most.
         tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
@@ -93,230 +88,144 @@ def simulate(
 
     Raises:
         ConfigError, MeshError, DeviceError: The scene cannot be simulated; nothing was computed.
-        DeviceError: A device failed on the way; the text names the checkpoint, if there is one.
-        KeyboardInterrupt: Ctrl-C before the first pass was done, or a second Ctrl-C.
+        DeviceError: A device failed during the run; the text names the checkpoint, if there is one.
+        KeyboardInterrupt: Ctrl-C before the first launch was done, or a second Ctrl-C.
     """
-    from spadwarp.mesh import build_mesh
-
-    if resume is not None:
-        _check_resumed(resume, scene, seed, first_photon, shard, uncertainty or relative_error is not None)
-        seed, first_photon = resume.seed, resume.requested[0]
-        photons = count([resume.requested]) if photons is None else photons
-        if photons <= resume.photons:
-            raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
-    photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
-    check_range("photons", photons, 1, 10**12)
-    check_range("seed", seed, 0, 2**64 - 1)
-    check_range("first_photon", first_photon, 0, 2**62)
-    if relative_error is not None and not 0 < relative_error < 1:
-        raise ConfigError(f"relative_error = {relative_error} is outside (0, 1)")
-    if relative_error is not None and shard is not None:
-        raise ConfigError("relative_error goes without shard: no part knows the error of the whole")
     if tallies is not None and (resume is not None or engine is not None):
         raise ConfigError("tallies go without resume and engine: they hold one run of one device")
-    if not checkpoint_every >= 0:
-        raise ConfigError(f"checkpoint_every = {checkpoint_every} is outside [0, inf)")
-    batch_size = 0
-    if resume is not None:
-        batch_size = resume.batch_size
-    elif uncertainty or relative_error is not None:
-        # With a stopping rule more of them, so that it can act early.
-        least = 32 if relative_error is None else 1024
-        # Whole rounds of a scan, so that every position has as many photons in each.
-        positions = scene.scan_positions
-        batch_size = positions * _batch_size(photons // positions, least if shard is None else max(least, shard[1]))
-    if batch_size:
-        photons = -(-photons // batch_size) * batch_size
-        if first_photon % batch_size:
-            raise ConfigError(
-                f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
-            )
-    wanted = first_photon, first_photon + photons
-    if shard is not None:
-        wanted = shard_of(wanted, shard, batch_size or 1)
-
-    mesh = build_mesh(scene)
-    plan = Plan(scene, mesh, seed, batch_size, pass_size)
+    writer = Checkpoint(checkpoint, checkpoint_every)
+    plan = make_plan(
+        scene,
+        photons=photons,
+        seed=seed,
+        first_photon=first_photon,
+        shard=shard,
+        batches=uncertainty,
+        relative_error=relative_error,
+        resume=resume,
+        launch_size=launch_size,
+    )
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())
         if progress is not None:
             progress("compile", 0, 0)
-        tracer: Tracer | ClusterTracer
+        workers: Workers
         if engine is None:
-            tracer = Tracer(plan, pick_devices(device), threads=threads, base=resume, tallies=tallies)
-        else:
-            from spadwarp.transport.cluster import ClusterTracer
+            from spadwarp.transport.local_workers import LocalWorkers
 
-            tell = None if progress is None else lambda text: progress(text, 0, 0)
-            tracer = stack.enter_context(ClusterTracer(plan, engine, device, base=resume, note=tell))
-        run = _Run(plan, tracer, wanted, resume, progress, _Checkpoint(checkpoint, checkpoint_every))
+            workers = LocalWorkers(plan, pick_devices(device), threads=threads, tallies=tallies)
+        else:
+            from spadwarp.transport.ray_workers import ClusterWorkers
+
+            note = None if progress is None else lambda text: progress(text, 0, 0)
+            workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
         try:
-            return run(stopped, relative_error)
+            return _Run(plan, workers, resume, progress, writer).result(stopped, relative_error)
         except DeviceError as error:
-            if run.checkpoint.photons:
-                kept = f"{run.checkpoint.path}: the {run.checkpoint.photons} photons that were done are here; resume it"
+            if writer.photons:
+                kept = f"{writer.path}: the {writer.photons} photons that were done are here; resume it"
                 raise DeviceError(f"{error}\n{kept}") from error
             raise
 
 
-@dataclass
-class _Checkpoint:
-    """When what is done is written down, and where."""
-
-    path: str | Path | None
-    every: float
-    photons: int = 0
-
-    def __post_init__(self) -> None:
-        self._written, self._cost = time.monotonic(), 0.0
-
-    def due(self) -> bool:
-        pause = max(self.every, self._cost / _CHECKPOINT_SHARE)
-        return self.path is not None and time.monotonic() >= self._written + pause
-
-    def write(self, collect: Callable[[], Result]) -> None:
-        """The run goes on if this fails: the disk may have room again later."""
-        from spadwarp.result.file import save_result
-
-        assert self.path is not None
-        began = time.monotonic()
-        try:
-            result = collect()
-            save_result(result, self.path)
-            self.photons = result.photons
-        except FileError as error:
-            warnings.warn(f"no checkpoint, the run goes on: {error}", RuntimeWarning, stacklevel=2)
-        self._written = time.monotonic()
-        self._cost = self._written - began
-
-
-@dataclass
 class _Run:
-    """A plan on its way to a result."""
+    """The photons of a plan, those of an earlier result included."""
 
-    plan: Plan
-    tracer: Tracer | ClusterTracer
-    wanted: Range
-    resumed: Result | None
-    progress: Progress | None
-    checkpoint: _Checkpoint
-
-    def __call__(self, stopped: Any, relative_error: float | None) -> Result:
-        from spadwarp.transport.tally_scale import tally_scale
-
-        self.unit = 1.0 / tally_scale(self.plan.scene, self.plan.mesh)
-        if self.resumed is not None and self.resumed.unit != self.unit:
-            raise ConfigError(f"resume: the tally unit is {self.unit}, that of the result {self.resumed.unit}")
+    def __init__(
+        self, plan: Plan, workers: Workers, resumed: Result | None, progress: Progress | None, checkpoint: Checkpoint
+    ) -> None:
+        self._plan, self._workers, self._resumed, self._checkpoint = plan, workers, resumed, checkpoint
+        self._report = (lambda stage, done, total: None) if progress is None else progress
+        self._unit = 1.0 / tally_scale(plan.scene, plan.mesh)
+        if resumed is not None and resumed.unit != self._unit:
+            raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
         began = time.perf_counter()
-        self.truth = self.tracer.truth()
-        self.began = time.perf_counter()
-        self.truth_seconds = self.began - began
-        if self.resumed is not None:
-            check_targets(self.resumed.truth, self.truth, "resume")
+        self._truth = workers.truth()
+        self._began = time.perf_counter()
+        self._truth_seconds = self._began - began
+        if resumed is not None:
+            check_targets(resumed.truth, self._truth, "resume")
+        self._earlier: Ranges = () if resumed is None else joined(resumed.photon_ranges)
 
-        self.earlier: Ranges = () if self.resumed is None else joined(self.resumed.photon_ranges)
-        done = self.earlier
-        start, stop = self.wanted
-        for goal in [*self._milestones(count(done) if relative_error is not None else None), stop]:
+    def result(self, stopped: threading.Event, relative_error: float | None) -> Result:
+        """Of all photons, of those that reach a relative error, or of those done when the run was stopped."""
+        done = self._earlier
+        start, stop = self._plan.ids
+        for goal in [*self._milestones(relative_error), stop]:
             done = self._trace((start, goal), done, stopped)
             if stopped.is_set() and without((start, goal), done):
                 break
             if relative_error is not None:
                 result = self._collect(done)
-                if self._known(result, relative_error) or goal == stop:
+                if self._is_known(result, relative_error) or goal == stop:
                     return replace(result, requested=(start, goal), partial=False)
-        if count(done) == count(self.earlier):
+        if count(done) == count(self._earlier):
             raise KeyboardInterrupt
         return self._collect(done)
 
-    def _milestones(self, done: int | None) -> list[int]:
-        """Where the error is looked at: after 8, 16, 32, ... batches; nowhere without a stopping rule."""
-        start, stop = self.wanted
-        if done is None:
+    def _milestones(self, relative_error: float | None) -> list[int]:
+        """Where the error is checked: after 8, 16, 32, ... batches; nowhere without a stopping rule."""
+        if relative_error is None:
             return []
-        sizes = [self.plan.batch_size << power for power in range(3, 45)]
+        (start, stop), done = self._plan.ids, count(self._earlier)
+        sizes = [self._plan.batch_size << power for power in range(3, 45)]
         return [start + size for size in sizes if done < size < stop - start]
 
-    def _known(self, result: Result, relative_error: float | None) -> bool:
-        assert relative_error is not None
+    def _is_known(self, result: Result, relative_error: float) -> bool:
         if result.photons < 2 * result.batch_size:
             return False
-        error = result.relative_error
-        if self.progress is not None:
-            batches = result.photons // result.batch_size
-            self.progress(f"error {100 * error:.3g} % after {batches} batches", result.photons, count([self.wanted]))
+        error, batches = result.relative_error, result.photons // result.batch_size
+        remark = f"error {100 * error:.3g} % after {batches} batches"
+        self._report(remark, result.photons, count([self._plan.ids]))
         return error <= relative_error
 
-    def _trace(self, span: Range, done: Ranges, stopped: Any) -> Ranges:
+    def _trace(self, span: Range, done: Ranges, stopped: threading.Event) -> Ranges:
         """The ids done once a span is, or once the run was stopped."""
-        total = count([self.wanted])
-
-        def report(now: int) -> None:
-            if self.progress is not None:
-                self.progress("trace", count(done) + now, total)
-
-        def keep(now: Ranges) -> None:
-            self.checkpoint.write(lambda: self._collect(joined([*done, *now])))
-
         todo = without(span, done)
         if not todo:
             return done
-        now = self.tracer.trace(todo, stopped=stopped, report=report, due=self.checkpoint.due, keep=keep)
+        before, total = count(done), count([self._plan.ids])
+        now = Executor(self._workers, todo, unit=self._plan.batch_size or 1).run(
+            stopped=stopped,
+            report=lambda photons: self._report("trace", before + photons, total),
+            checkpoint_due=self._checkpoint.is_due,
+            checkpoint=lambda ids: self._checkpoint.write(lambda: self._collect(joined([*done, *ids]))),
+        )
         return joined([*done, *now])
 
     def _collect(self, done: Ranges) -> Result:
-        """The result of the ids done, which are what the tracer's sums hold."""
+        """The result of the ids done, whose tallies the workers and the earlier result hold."""
         import spadwarp_kernels as sk
 
-        sums = self.tracer.sums()
-        check_capacity(sums.tallies.sum(axis=0, dtype=np.float64))
-        tracing = {"truth": self.truth_seconds, "trace": time.perf_counter() - self.began}
-        fresh = Result(
-            scene=self.plan.scene,
-            **vars(sums),
-            unit=self.unit,
+        total, timing, made = self._workers.tallies(), dict(self._workers.timing), provenance()
+        timing |= {"truth": self._truth_seconds, "trace": time.perf_counter() - self._began}
+        made |= self._workers.metadata()
+        if self._resumed is not None:
+            total = Tallies.of(total)
+            total.add(self._resumed)
+        check_capacity(total.tallies.sum(axis=0, dtype=np.float64))
+        result = Result(
+            scene=self._plan.scene,
+            **vars(total),
+            unit=self._unit,
             photons=count(done),
-            seed=self.plan.seed,
+            seed=self._plan.seed,
             ledger_unit=sk.LEDGER_UNIT,
-            truth=self.truth,
-            timing={**self.tracer.timing, **tracing},
-            provenance={**provenance(), **self.tracer.about()},
+            truth=self._truth,
+            timing=timing,
+            provenance=made,
             photon_ranges=done,
-            batch_size=self.plan.batch_size,
-            requested=self.wanted,
-            partial=bool(without(self.wanted, done)),
+            batch_size=self._plan.batch_size,
+            requested=self._plan.ids,
+            partial=bool(without(self._plan.ids, done)),
         )
-        if difference := fresh.ledger_report()["difference"]:
+        if difference := result.ledger_report()["difference"]:
             raise DeviceError(f"the energy ledger is off by {difference} units: a device has lost counts")
-        if self.resumed is None:
-            return fresh
-        own = tuple(span for first in done for span in without(first, self.earlier))
-        parts = [self.resumed, replace(fresh, photon_ranges=own, photons=count(own))] if own else [self.resumed]
-        return replace(
-            fresh,
-            timing=add_timing([fresh.timing, self.resumed.timing]),
-            provenance=join_provenance(parts),
-        )
-
-
-def _batch_size(photons: int, least: int) -> int:
-    """A power of two, for at least so many batches."""
-    return min(1 << max(0, (photons // least).bit_length() - 1), _LARGEST_BATCH)
-
-
-def _check_resumed(
-    resume: Result, scene: Scene, seed: int | None, first_photon: int, shard: tuple[int, int] | None, batches: bool
-) -> None:
-    for name, value in (("first_photon", first_photon), ("shard", shard)):
-        if value:
-            raise ConfigError(f"{name} = {value} goes without resume, which knows where to go on")
-    if physics_of(scene) != physics_of(resume.scene):
-        raise ConfigError("resume: the result is of another scene; only photons and output may differ")
-    if seed not in (None, resume.seed):
-        raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
-    if batches and not resume.batch_size:
-        raise ConfigError("uncertainty: the run to resume kept no batches")
+        if self._resumed is None:
+            return result
+        own = tuple(span for ids in done for span in without(ids, self._earlier))
+        parts = [(self._resumed.provenance, self._resumed.photon_ranges), *([(made, own)] if own else [])]
+        return replace(result, timing=add_timing([timing, self._resumed.timing]), provenance=join_provenance(parts))
 
 
 def provenance(device: Any = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How bright the brightest bin of a scene can be: the unit of its tallies."""
+"""The unit of a scene's tallies, from an upper bound of its brightest bin."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     pixels = camera.width * camera.height
     half_field = 0.5 * camera.width * camera.pixel_tangent
     spread = _spread(laser)
-    # Each position of a scan has its part of the photons alone.
+    # Each position of a scan has its own part of the photons.
     share = scene.scan_positions
 
-    def lit(closeness: float) -> float:
-        """Pixels that share the beam, whose spot is closeness times what it is at the lens's distance."""
-        spot = max(math.pi * (spread * closeness / camera.pixel_tangent) ** 2, 1.0)
+    def illuminated_pixels(spot_scale: float) -> float:
+        """Pixels that share the beam, for a spot of `spot_scale` times its size as seen from the lens's distance."""
+        spot = max(math.pi * (spread * spot_scale / camera.pixel_tangent) ** 2, 1.0)
         return share * spot if share > 1 else min(spot, pixels)
 
     baseline = math.hypot(laser.position[0], laser.position[1])
@@ -47,7 +47,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     scattering = max(water.scattering for water in medium.waters)
     extinction = min(water.extinction for water in medium.waters)
     water = scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
-    surface, bistatic = 0.0, _crossing(scene, lit)
+    surface, bistatic = 0.0, _crossing(scene, illuminated_pixels)
     if mesh is not None:
         lower, upper = mesh.bounds.astype(float)
         gap = float(np.linalg.norm(np.maximum(np.maximum(lower, -upper), 0.0)))
@@ -57,12 +57,12 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
             white = max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
         surface = white / (math.pi * max(gap, nearest) ** 2)
         if math.hypot(*laser.position) > 0.25 * gap:
-            place = np.array(laser.position)
-            reach = float(np.linalg.norm(np.maximum(np.maximum(lower - place, place - upper), 0.0)))
-            spot = lit(min(1.0, reach / max(gap, 1e-3)))
+            exit_point = np.array(laser.position)
+            reach = float(np.linalg.norm(np.maximum(np.maximum(lower - exit_point, exit_point - upper), 0.0)))
+            spot = illuminated_pixels(min(1.0, reach / max(gap, 1e-3)))
             through = math.exp(-extinction * (gap + reach))
             bistatic = max(bistatic, white * through / (math.pi * max(gap, camera.aperture_radius, 0.01) ** 2 * spot))
-    coaxial = max(water, surface) * math.exp(-extinction * 2.0 * nearest) / lit(1.0)
+    coaxial = max(water, surface) * math.exp(-extinction * 2.0 * nearest) / illuminated_pixels(1.0)
     brightest = 16.0 * camera.aperture_area * max(coaxial, bistatic)
     brightest = min(max(brightest, 1e-30), 1.0)
     exponent = math.floor(62 - math.log2(PHOTON_CAPACITY) - math.log2(brightest))
@@ -81,16 +81,16 @@ def _spread(laser: Laser) -> float:
     return math.tan(min(laser.half_angle, 1.5))
 
 
-def _crossing(scene: Scene, lit: Callable[[float], float]) -> float:
+def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float]) -> float:
     """Largest share of the light per area of the lens [1/m^2] that one bin of one pixel gets where the beam's axis is
     in view, by single scattering; 0 if it never is, or starts at the lens."""
     camera, laser, gate = scene.camera, scene.beam, scene.gate
-    place = np.array(laser.position)
-    if np.linalg.norm(place) < camera.aperture_radius or scene.scan_positions > 1:
+    exit_point = np.array(laser.position)
+    if np.linalg.norm(exit_point) < camera.aperture_radius or scene.scan_positions > 1:
         return 0.0
     speed = scene.medium.pulse_speed
     along = np.geomspace(1e-3, max(scene.path_limit, 2e-3), 400)
-    points = place + along[:, None] * np.array(laser.axis)
+    points = exit_point + along[:, None] * np.array(laser.axis)
     away = np.linalg.norm(points, axis=1)
     planes = view_planes(camera)
     seen = (points @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)
@@ -101,9 +101,10 @@ def _crossing(scene: Scene, lit: Callable[[float], float]) -> float:
     for distance, point, r in zip(along[seen], points[seen], away[seen], strict=True):
         one_minus_cosine = 1.0 + float(point @ laser.axis) / r
         phase = (1.0 - g * g) / (4.0 * math.pi * ((1.0 - g) ** 2 + 2.0 * g * one_minus_cosine) ** 1.5)
-        # Of the beam, what arrives within a bin; light that comes straight on arrives all at once.
+        # The part of the beam that arrives within a bin; light that comes straight at the lens arrives all at once.
         part = min(gate.bin_width * speed / max(one_minus_cosine, 1e-6), distance + r)
         r = max(r, camera.aperture_radius, 0.01)
-        value = scattering * part * phase * math.exp(-extinction * (distance + r)) / r**2 / lit(distance / r)
+        value = scattering * part * phase * math.exp(-extinction * (distance + r)) / r**2
+        value /= illuminated_pixels(distance / r)
         brightest = max(brightest, value)
     return brightest

@@ -74,7 +74,7 @@ def draw_targets(
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from spadwarp.transport.model import truth_maps
+    from spadwarp.transport.truth import truth_maps
 
     chosen = list(builtin_names() if names is None else names)
     columns = min(4, len(chosen))

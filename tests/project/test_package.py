@@ -57,6 +57,9 @@ LOADED_LATE = {
     "denoise/networks.py",
     "denoise/synthetic_noise.py",
     "denoise/training.py",
+    "transport/device_worker.py",
+    "transport/local_workers.py",
+    "transport/model.py",
 }
 
 

@@ -10,8 +10,9 @@ import spadwarp
 import spadwarp_kernels as sk
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
+from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.transport.model import build_model, pick_device, transport_spec
+from spadwarp.transport.model import build_model, transport_spec
 
 pytestmark = pytest.mark.physics
 

@@ -11,13 +11,13 @@ import spadwarp_kernels
 from helpers.runs import PHOTONS, RUN, same
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
-from spadwarp.result.photon_ids import Queue, count, joined, shard_of, without
+from spadwarp.result.photon_ids import IdQueue, count, joined, shard_of, without
 
 # Photon ids
 
 
 def test_ids_are_handed_out_once():
-    waiting = Queue([(100, 130), (0, 50)])
+    waiting = IdQueue([(100, 130), (0, 50)])
     first = waiting.take(40)
     assert first == (0, 40) and waiting.take(40) == (40, 50) and waiting.left == 30
     waiting.put_back([first])
@@ -56,7 +56,7 @@ def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, wh
         **RUN,
         device=device,
         threads=4,
-        pass_size=3000,
+        launch_size=3000,
         uncertainty=uncertainty,
         progress=lambda *report: seen.append(report),
     )
@@ -113,7 +113,7 @@ def test_an_interrupted_shard_knows_where_it_ends(whole):
 
     fired = []
     # Few threads: many would have walked all photons before the first of them is reported.
-    options = {**RUN, "device": "cpu", "threads": 2, "shard": (2, 2), "pass_size": 1000}
+    options = {**RUN, "device": "cpu", "threads": 2, "shard": (2, 2), "launch_size": 1000}
     part = spadwarp.simulate(scene(), **options, progress=interrupt)
     assert part.partial and part.requested == (PHOTONS // 2, PHOTONS) and fired == [PHOTONS // 2]
     rest = spadwarp.simulate(scene(), device="cpu", resume=part)
@@ -155,7 +155,7 @@ def failing_after(calls, monkeypatch, error):
 def test_a_device_that_disappears_costs_what_was_not_kept(device, uncertainty, whole, tmp_path, monkeypatch):
     place = tmp_path / "checkpoint.h5"
     failing_after(120, monkeypatch, "CUDA error 719: unspecified launch failure")
-    options = {**RUN, "device": device, "uncertainty": uncertainty, "pass_size": 1000, "threads": 2}
+    options = {**RUN, "device": device, "uncertainty": uncertainty, "launch_size": 1000, "threads": 2}
     with pytest.raises(spadwarp.DeviceError) as caught:
         spadwarp.simulate(scene(), **options, checkpoint=place, checkpoint_every=0.0)
     monkeypatch.undo()
@@ -187,9 +187,9 @@ def test_a_full_disk_costs_no_photons(whole, tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
 
     # Few threads: many would have walked all photons before the first checkpoint is due.
-    options = {**RUN, "device": "cpu", "threads": 2, "pass_size": 2000, "progress": fill}
+    options = {**RUN, "device": "cpu", "threads": 2, "launch_size": 2000, "progress": fill}
     try:
-        with pytest.warns(RuntimeWarning, match=r"no checkpoint, the run goes on: .*checkpoint\.h5: cannot be written"):
+        with pytest.warns(RuntimeWarning, match=r"the run continues: .*checkpoint\.h5: cannot be written"):
             result = spadwarp.simulate(scene(), **options, checkpoint=place, checkpoint_every=0.0)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

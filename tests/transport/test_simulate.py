@@ -20,11 +20,11 @@ def _bits(result):
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, device):
     one = scene(transport={"estimator": estimator})
-    whole = spadwarp.simulate(one, photons=20_000, seed=2**63 + 5, device=device, threads=1, pass_size=20_000)
+    whole = spadwarp.simulate(one, photons=20_000, seed=2**63 + 5, device=device, threads=1, launch_size=20_000)
     assert whole.tallies.any()
-    for threads, pass_size in [(1, 777), (2, 1000), (3, 4096)]:
+    for threads, launch_size in [(1, 777), (2, 1000), (3, 4096)]:
         cut = spadwarp.simulate(
-            one, photons=20_000, seed=2**63 + 5, device=device, threads=threads, pass_size=pass_size
+            one, photons=20_000, seed=2**63 + 5, device=device, threads=threads, launch_size=launch_size
         )
         assert _bits(cut) == _bits(whole)
     other = spadwarp.simulate(one, photons=20_000, seed=2**63 + 6, device=device)
@@ -159,7 +159,9 @@ def test_interrupt_keeps_what_is_done():
             signal.raise_signal(signal.SIGINT)
 
     fired = threading.Event()
-    result = spadwarp.simulate(one, photons=10**7, seed=1, device="cpu", threads=2, pass_size=1000, progress=interrupt)
+    result = spadwarp.simulate(
+        one, photons=10**7, seed=1, device="cpu", threads=2, launch_size=1000, progress=interrupt
+    )
     assert result.partial and 3000 <= result.photons < 10**7
     assert result.photon_ranges == ((0, result.photons),)
     again = spadwarp.simulate(one, photons=result.photons, seed=1, device="cpu")
@@ -168,7 +170,7 @@ def test_interrupt_keeps_what_is_done():
 
 def test_progress_is_reported_in_order():
     seen = []
-    spadwarp.simulate(scene(), photons=5000, device="cpu", pass_size=1000, progress=lambda *a: seen.append(a))
+    spadwarp.simulate(scene(), photons=5000, device="cpu", launch_size=1000, progress=lambda *a: seen.append(a))
     assert seen[0][0] == "compile"
     assert [done for stage, done, _ in seen if stage == "trace"][-1] == 5000
     counts = [done for stage, done, _ in seen if stage == "trace"]
@@ -181,7 +183,7 @@ def test_progress_is_reported_in_order():
         ({"photons": 0}, "photons = 0 is outside [1, 1000000000000]"),
         ({"seed": -1}, "seed = -1 is outside"),
         ({"device": "cuda:99"}, "device = 'cuda:99' is not one of cpu"),
-        ({"pass_size": 0}, "pass_size"),
+        ({"launch_size": 0}, "launch_size"),
     ],
 )
 def test_wrong_use_is_named(arguments, text):

@@ -55,7 +55,7 @@ def test_standard_error_is_the_spread_between_seeds(device):
 def test_batches_do_not_depend_on_how_the_run_is_cut_up():
     one = scene()
     whole = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=1, uncertainty=True)
-    cut = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=2, pass_size=100, uncertainty=True)
+    cut = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=2, launch_size=100, uncertainty=True)
     _same(whole, cut)
     assert whole.photons >= 20_000 and whole.photons % whole.batch_size == 0
     plain = spadwarp.simulate(one, photons=whole.photons, seed=5, device="cpu")

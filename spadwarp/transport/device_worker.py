@@ -1,0 +1,165 @@
+"""Photons on one device: launches into tallies of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import spadwarp_kernels as sk
+from spadwarp.arrays import caller_tallies
+from spadwarp.errors import DeviceError
+from spadwarp.result import COMPONENTS, Tallies
+from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
+
+__all__ = ["DeviceWorker", "device_errors"]
+
+
+class DeviceWorker:
+    """A device with a model and tallies of its own.
+
+    Args:
+        model: From `build_model`.
+        spec: From `transport_spec`.
+        seed: 64-bit.
+        launch_size: Photons in one launch at most.
+        threads: Launches at a time. On a CPU all of them add to one tally, with atomics of their own.
+        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
+        tallies: The caller's own, to be filled.
+    """
+
+    def __init__(
+        self,
+        model: sk.Model,
+        spec: Any,
+        *,
+        seed: int,
+        launch_size: int,
+        threads: int = 1,
+        batch_size: int = 0,
+        tallies: Any = None,
+    ) -> None:
+        camera, gate = model.camera, model.gate
+        self._shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
+        own = None if tallies is None else caller_tallies(tallies, shape=self._shape, device=model.device)
+        self.model, self.threads, self.launch_size = model, threads, launch_size
+        self._spec, self._seed, self._batch_size = spec, seed, batch_size
+        with device_errors(model.device):
+            self.data = sk.make_data(model, tally=None if batch_size else own, histogram=spec.estimator != "none")
+            self._batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
+            # Compiles, or loads from Warp's cache, before the time of the launches is taken.
+            sk.load_transport_kernel(spec, model.device)
+        self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
+
+    def launch(self, first: int, stop: int) -> None:
+        """Traces the photons of one launch to their end."""
+        with device_errors(self.model.device):
+            sk.launch_transport(
+                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
+            )
+            wp.synchronize_device(self.model.device)
+
+    def trace(
+        self, block: Range, *, stopped: threading.Event, report: Callable[[int], None] = lambda photons: None
+    ) -> Ranges:
+        """Traces photons; returns the ids that were done before `stopped` was set, with batches those of whole ones.
+
+        Args:
+            block: The ids; with batches whole batches.
+            stopped: Once set, no further launch begins.
+            report: Called with the photons of each launch, from the thread that ran it.
+        """
+        if self._batches is None:
+            return self._trace(block, stopped, report)
+        done: list[Range] = []
+        for first in range(*block, self._batch_size):
+            batch = first, first + self._batch_size
+            if self._trace(batch, stopped, report) != (batch,):
+                self.data.tally.zero_()
+                self.data.ledger.zero_()
+                break
+            self._close_batch()
+            done.append(batch)
+        return joined(done)
+
+    def _trace(self, ids: Range, stopped: threading.Event, report: Callable[[int], None]) -> Ranges:
+        waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()
+        failures: list[BaseException] = []
+
+        def work() -> None:
+            try:
+                while not (stopped.is_set() or failures):
+                    with lock:
+                        span = waiting.take(self._size(waiting.left))
+                    if span is None:
+                        return
+                    self.launch(*span)
+                    with lock:
+                        done.append(span)
+                    report(span[1] - span[0])
+            except BaseException as error:
+                failures.append(error)
+
+        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self.threads - 1)]
+        for thread in helpers:
+            thread.start()
+        work()
+        for thread in helpers:
+            thread.join()
+        if failures:
+            raise failures[0]
+        return joined(done)
+
+    def _size(self, left: int) -> int:
+        """Photons of the next launch, fewer towards the end so that all threads end at about the same time."""
+        share = left // (2 * self.threads) if self.threads > 1 else left
+        return min(self.launch_size, max(share, self.launch_size // 16, 1))
+
+    def _close_batch(self) -> None:
+        """Adds a batch whose photons are all done to the totals."""
+        assert self._batches is not None
+        with device_errors(self.model.device):
+            self._batches.close(self.data.tally)
+            batch = sk.read_ledger(self.data)
+            self.data.ledger.zero_()
+        self._closed = batch if self._closed is None else tuple(map(_added, self._closed, batch))
+
+    def tallies(self) -> Tallies:
+        """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
+        with device_errors(self.model.device):
+            if self._batches is None:
+                total, second_moment = self.data.tally, None
+            else:
+                total = self._batches.total
+                halves = self._batches.second_moment
+                second_moment = np.stack([half.numpy().reshape(self._shape[1:]) for half in halves])
+            ledger, counters = self._closed or sk.read_ledger(self.data)
+            return Tallies(total.numpy().reshape(self._shape), ledger, counters, second_moment)
+
+    def clear(self) -> None:
+        """Empties the tallies."""
+        self._closed = None
+        arrays = [self.data.tally, self.data.ledger]
+        if self._batches is not None:
+            arrays += [self._batches.total, *self._batches.second_moment]
+        for array in arrays:
+            array.zero_()
+
+
+def _added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
+    return {name: value + b[name] for name, value in a.items()}
+
+
+@contextmanager
+def device_errors(device: wp.Device) -> Iterator[None]:
+    """Makes a `DeviceError` that names the device of what Warp raises."""
+    try:
+        yield
+    except RuntimeError as error:
+        short = "allocate" in str(error) or "out of memory" in str(error)
+        problem = "has too little memory left" if short else "failed"
+        raise DeviceError(f"{device.alias} {problem}: {error}") from error

@@ -1,0 +1,121 @@
+"""Which photons a run traces, and what all who trace them must agree on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from spadwarp.errors import ConfigError
+from spadwarp.mesh import build_mesh
+from spadwarp.result import Result
+from spadwarp.result.merge import physics_of
+from spadwarp.result.photon_ids import Range, count, shard_of
+from spadwarp.scene import Scene
+
+if TYPE_CHECKING:
+    from spadwarp.mesh import TriangleMesh
+
+__all__ = ["LARGEST_LAUNCH", "LAUNCH_SIZE", "Plan", "check_range", "make_plan"]
+
+# Photons in one launch: large enough to fill the device, small enough for progress and Ctrl-C.
+LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
+# One CPU thread walks a whole launch, and counts its events in 32 bits.
+LARGEST_LAUNCH = {"cpu": 1 << 20, "cuda": 1 << 26}
+
+# Photons of a batch at most: some seconds of a GPU, so that several can share the work and little is lost.
+_LARGEST_BATCH = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A run, in a form that can be sent to other processes.
+
+    Attributes:
+        scene, mesh: What to simulate; the mesh from `spadwarp.mesh.build_mesh`.
+        seed: 64-bit.
+        ids: Of the photons, [start, stop).
+        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
+        launch_size: Photons in one launch; None: what suits the device.
+    """
+
+    scene: Scene
+    mesh: TriangleMesh | None
+    seed: int
+    ids: Range
+    batch_size: int = 0
+    launch_size: int | None = None
+
+
+def make_plan(
+    scene: Scene,
+    *,
+    photons: int | None,
+    seed: int | None,
+    first_photon: int,
+    shard: tuple[int, int] | None,
+    batches: bool,
+    relative_error: float | None,
+    resume: Result | None,
+    launch_size: int | None,
+) -> Plan:
+    """The plan for the arguments of `simulate`; raises `ConfigError` for those that do not go together."""
+    if relative_error is not None and not 0 < relative_error < 1:
+        raise ConfigError(f"relative_error = {relative_error} is outside (0, 1)")
+    if relative_error is not None and shard is not None:
+        raise ConfigError("relative_error goes without shard: no part knows the error of the whole")
+    batches = batches or relative_error is not None
+    if resume is not None:
+        _check_resumed(resume, scene, seed, first_photon, shard, batches)
+        seed, first_photon = resume.seed, resume.requested[0]
+        photons = count([resume.requested]) if photons is None else photons
+        if photons <= resume.photons:
+            raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
+    photons = scene.transport.photons if photons is None else photons
+    seed = scene.transport.seed if seed is None else seed
+    check_range("photons", photons, 1, 10**12)
+    check_range("seed", seed, 0, 2**64 - 1)
+    check_range("first_photon", first_photon, 0, 2**62)
+    batch_size = 0
+    if resume is not None:
+        batch_size = resume.batch_size
+    elif batches:
+        batch_size = _batch_size(scene, photons, relative_error, shard)
+    if batch_size:
+        photons = -(-photons // batch_size) * batch_size
+        if first_photon % batch_size:
+            raise ConfigError(
+                f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
+            )
+    ids = first_photon, first_photon + photons
+    if shard is not None:
+        ids = shard_of(ids, shard, batch_size or 1)
+    return Plan(scene, build_mesh(scene), seed, ids, batch_size, launch_size)
+
+
+def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
+    """A power of two, times the positions of a scan so that every batch has whole rounds of it."""
+    # With a stopping rule more batches, so that it can act early.
+    least = 32 if relative_error is None else 1024
+    least = least if shard is None else max(least, shard[1])
+    positions = scene.scan_positions
+    return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
+
+
+def _check_resumed(
+    resume: Result, scene: Scene, seed: int | None, first_photon: int, shard: tuple[int, int] | None, batches: bool
+) -> None:
+    for name, value in (("first_photon", first_photon), ("shard", shard)):
+        if value:
+            raise ConfigError(f"{name} = {value} goes without resume, which has the photon ids of its run")
+    if physics_of(scene) != physics_of(resume.scene):
+        raise ConfigError("resume: the result is of another scene; only photons and output may differ")
+    if seed not in (None, resume.seed):
+        raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
+    if batches and not resume.batch_size:
+        raise ConfigError("uncertainty: the run to resume kept no batches")
+
+
+def check_range(name: str, value: int, low: int, high: int) -> None:
+    """Raises `ConfigError` where an argument is outside [low, high]."""
+    if not low <= value <= high:
+        raise ConfigError(f"{name} = {value} is outside [{low}, {high}]")
