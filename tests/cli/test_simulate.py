@@ -134,7 +134,7 @@ def test_a_disk_that_is_too_small_is_found_out_before_the_run(scene, tmp_path, m
         return type("usage", (), {"free": 1000})
 
     monkeypatch.setattr("shutil.disk_usage", disk_usage)
-    monkeypatch.setattr("spadwarp.transport.simulate.simulate", lambda *_, **__: pytest.fail("it ran"))
+    monkeypatch.setattr("spadwarp.transport.simulate", lambda *_, **__: pytest.fail("it ran"))
     outcome = run("simulate", scene, "--out", tmp_path / "out", code=1)
     assert "1000 bytes are free" in outcome.stderr
 
