@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 import spadwarp
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 
@@ -26,7 +26,7 @@ class _Commands(TyperGroup):
             try:
                 return super().invoke(ctx)
             except SpadwarpError as error:
-                fail(str(error), WRONG_USE if isinstance(error, ConfigError) else FAILED)
+                fail(str(error), WRONG_USE if isinstance(error, ConfigError | ArgumentError) else FAILED)
             except MemoryError as error:
                 fail(f"not enough memory: {error}")
             except KeyboardInterrupt:

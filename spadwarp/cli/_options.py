@@ -5,8 +5,6 @@ from __future__ import annotations
 import enum
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import spadwarp
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import FileError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -145,15 +143,6 @@ def load_run(place: Path) -> Result:
     from spadwarp.io.atomic import file_within
 
     return spadwarp.load_result(file_within(place, ("result.h5",)))
-
-
-@contextmanager
-def arguments_checked() -> Iterator[None]:
-    """A value that the API refuses is wrong use of the command."""
-    try:
-        yield
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
 
 
 def prepare_directory(out: Path, *, overwrite: bool, needed: int) -> None:

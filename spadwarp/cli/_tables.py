@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from spadwarp.analytic import BudgetRow
 
 
-def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
+def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
     from spadwarp.analytic import OUTLIERS
 
-    table = _table(
+    table = new_table(
         title,
         "range [m]",
         "c·r",
@@ -39,17 +39,17 @@ def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) 
             f"{row.signal:.3g}",
             f"{row.background:.3g}",
             f"{row.alpha:.3g}",
-            _short(row.signal_to_backscatter),
-            _bracketed(1e12 * row.sigma_time, reached),
-            _bracketed(1e3 * row.sigma_depth, reached),
-            _percent(row.outlier_probability),
+            short(row.signal_to_backscatter),
+            bracketed(1e12 * row.sigma_time, reached),
+            bracketed(1e3 * row.sigma_depth, reached),
+            percent(row.outlier_probability),
             "never" if math.isinf(row.pulses_for_1cm) else f"{row.pulses_for_1cm:.3g}",
         )
         before = name
     return table
 
 
-def _table(first: str, *titles: str) -> Table:
+def new_table(first: str, *titles: str) -> Table:
     from rich import box
     from rich.markup import escape
     from rich.table import Table
@@ -61,24 +61,24 @@ def _table(first: str, *titles: str) -> Table:
     return table
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     if math.isnan(value):
         return "-"
     return "∞" if math.isinf(value) else f"{value:.3g}"
 
 
-def _bracketed(value: float, reached: bool) -> str:
-    text = _short(value)
+def bracketed(value: float, reached: bool) -> str:
+    text = short(value)
     return text if reached or text == "-" else f"({text})"
 
 
-def _percent(value: float) -> str:
+def percent(value: float) -> str:
     if math.isnan(value):
         return "-"
     return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
-def _write_csv(path: Path, table: Sequence[dict[str, Any]]) -> Path:
+def write_csv(path: Path, table: Sequence[dict[str, Any]]) -> Path:
     import csv
 
     from spadwarp.io.atomic import atomic_path

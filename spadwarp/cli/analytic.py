@@ -16,7 +16,7 @@ from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
     from spadwarp import AnalyticResult, Truth
-from spadwarp.cli._tables import _percent
+from spadwarp.cli._tables import percent
 
 
 class Exporter(enum.StrEnum):
@@ -95,30 +95,29 @@ def analytic(
         )
     pixels = scene.camera.width * scene.camera.height
     opt.prepare_directory(out, overwrite=overwrite, needed=(5 * max(frames, 0) + 200) * pixels + (16 << 20))
-    with opt.arguments_checked():
-        if frames < 0:
-            raise ArgumentError(f"frames = {frames} is outside [0, inf)")
-        truth: Truth | None = None
-        if depth is not None:
-            truth = spadwarp.load_truth_exr(
-                depth=depth,
-                camera=scene.camera,
-                preset=exr_preset.value,
-                depth_channel=depth_channel,
-                depth_scale=depth_scale,
-                radial=radial,
-                normal=normal,
-                albedo=_albedo(albedo),
-                albedo_channel=albedo_channel,
-            )
-        result = spadwarp.simulate_analytic(
-            scene,
-            truth=truth,
-            frames=min(frames, 1),
-            seed=seed,
-            device=device,
-            backscatter_profile=None if profile is None else opt.load_run(profile),
+    if frames < 0:
+        raise ArgumentError(f"frames = {frames} is outside [0, inf)")
+    truth: Truth | None = None
+    if depth is not None:
+        truth = spadwarp.load_truth_exr(
+            depth=depth,
+            camera=scene.camera,
+            preset=exr_preset.value,
+            depth_channel=depth_channel,
+            depth_scale=depth_scale,
+            radial=radial,
+            normal=normal,
+            albedo=_albedo(albedo),
+            albedo_channel=albedo_channel,
         )
+    result = spadwarp.simulate_analytic(
+        scene,
+        truth=truth,
+        frames=min(frames, 1),
+        seed=seed,
+        device=device,
+        backscatter_profile=None if profile is None else opt.load_run(profile),
+    )
     written = [result.save(out / "analytic.h5", frames=frames, device=device)]
     written.append(draw_analytic(result, out / "analytic.png"))
     summary = {"frames": frames, "seed": seed, **_summary(result)}
@@ -165,7 +164,7 @@ def _told(summary: dict[str, Any]) -> dict[str, str]:
         f"all together {summary['alpha']:.3g}",
         "signal to backscatter": f"{summary['signal_to_backscatter']:.3g}",
         "bound": f"{1e12 * summary['sigma_time']:.3g} ps, {1e3 * summary['sigma_depth']:.3g} mm of depth",
-        "outliers": f"{_percent(summary['outlier_probability'])} of the fits would find a false peak",
+        "outliers": f"{percent(summary['outlier_probability'])} of the fits would find a false peak",
         "frames": f"{opt.count(summary['frames'])}, seed {summary['seed']}, "
-        f"{_percent(summary['background_probability'])} of their pixels report background",
+        f"{percent(summary['background_probability'])} of their pixels report background",
     }

@@ -11,6 +11,7 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
+from spadwarp.cli._tables import new_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -80,21 +81,14 @@ def bench(
         raise
     summary = report(results)
     if not quiet:
-        made = summary["provenance"]
-        if any(result.memory is None and result.tally_bytes for result in results):
-            say("* histograms alone; Warp does not count memory on the CPU")
-        say(f"{made['device_name']} ({made['device']}), {made['date']}")
-        for line in _growth(results):
-            say(line)
-        for result in results:
-            if result.check is not None:
-                say(_checked(result.case, result.check))
+        _say_summary(results, summary["provenance"])
     if before is not None:
         faster = ratios(results, before)
         summary["ratios"] = faster
         if not quiet:
             made = before["provenance"]
-            _show(_ratio_table(faster), f"over {compare}: {made['device_name']}, {made['date']}")
+            say(f"over {compare}: {made['device_name']}, {made['date']}")
+            opt.show_table(_ratio_table(faster))
     opt.write_json(summary, json_path)
     missed = [result.case for result in results if result.check is not None and not result.check["passed"]]
     if missed:
@@ -161,27 +155,22 @@ def _growth(results: Sequence[BenchResult]) -> list[str]:
 
 
 def _ratio_table(faster: Mapping[str, Mapping[str, float]]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("case", no_wrap=True)
     units = list(dict.fromkeys(unit for rates in faster.values() for unit in rates))
-    for unit in units:
-        table.add_column(f"{unit}/s", justify="right")
+    table = new_table("case", *(f"{unit}/s" for unit in units))
     for case, rates in faster.items():
         table.add_row(case, *(f"× {rates[unit]:.3f}" if unit in rates else "-" for unit in units))
     return table
 
 
-def _show(table: Table, title: str) -> None:
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=160)
-    say(title)
-    console.print(table)
+def _say_summary(results: Sequence[BenchResult], made: Mapping[str, Any]) -> None:
+    if any(result.memory is None and result.tally_bytes for result in results):
+        say("* histograms alone; Warp does not count memory on the CPU")
+    say(f"{made['device_name']} ({made['device']}), {made['date']}")
+    for line in _growth(results):
+        say(line)
+    for result in results:
+        if result.check is not None:
+            say(_checked(result.case, result.check))
 
 
 def _seconds(value: float) -> str:

@@ -15,7 +15,7 @@ from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
     pass
-from spadwarp.cli._tables import _budget_table, _write_csv
+from spadwarp.cli._tables import budget_table, write_csv
 
 
 @app.command()
@@ -53,20 +53,19 @@ def budget(
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
     if out is not None:
         opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
-    with opt.arguments_checked():
-        found = spadwarp.budget(scene, _numbers(ranges), media or None, reflectance=reflectance, device=device)
+    found = spadwarp.budget(scene, numbers(ranges), media or None, reflectance=reflectance, device=device)
     written = []
     if out is not None:
         plot_budget(found, out / "budget.png")
-        written = [out / "budget.png", _write_csv(out / "budget.csv", [dataclasses.asdict(row) for row in found])]
+        written = [out / "budget.png", write_csv(out / "budget.csv", [dataclasses.asdict(row) for row in found])]
     if not quiet:
-        opt.show_table(_budget_table([row.medium for row in found], "water", found))
+        opt.show_table(budget_table([row.medium for row in found], "water", found))
         if written:
             say(f"written: {', '.join(path.name for path in written)} in {out}")
     opt.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written}, json_path)
 
 
-def _numbers(text: str | None) -> list[float] | None:
+def numbers(text: str | None) -> list[float] | None:
     from spadwarp.analytic import parse_vary
 
     if text is None:

@@ -153,8 +153,7 @@ def preview(
     """
     from spadwarp.viz.contact_sheet import draw_dataset
 
-    with opt.arguments_checked():
-        path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
+    path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
     say(f"written: {path}")
 
 

@@ -94,24 +94,23 @@ def denoise(
     told, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
         try:
-            with opt.arguments_checked():
-                done = denoise_file(
-                    one,
-                    out,
-                    model=model,
-                    gate=gate,
-                    profile=given,
-                    weights=weights,
-                    device=device,
-                    as_depth=depth,
-                    channel=channel,
-                    scale=scale,
-                    variable=variable,
-                    bin_width_ps=bin_width_ps,
-                    gate_start_ns=gate_start_ns,
-                    group_index=group_index,
-                    irf_fwhm_ps=irf_fwhm_ps,
-                )
+            done = denoise_file(
+                one,
+                out,
+                model=model,
+                gate=gate,
+                profile=given,
+                weights=weights,
+                device=device,
+                as_depth=depth,
+                channel=channel,
+                scale=scale,
+                variable=variable,
+                bin_width_ps=bin_width_ps,
+                gate_start_ns=gate_start_ns,
+                group_index=group_index,
+                irf_fwhm_ps=irf_fwhm_ps,
+            )
         except (ConfigError, FileError) as error:
             if len(paths) == 1:
                 raise

@@ -88,17 +88,16 @@ def depth(
         opt.check_writable(ply.parent)
     histograms = read_histograms(file_within(path, ("frames.h5", "result.h5")), variable=variable)
     opt.prepare_directory(out, overwrite=overwrite, needed=8 * histograms.values.size // histograms.values.shape[-1])
-    with opt.arguments_checked():
-        histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
-        reduced = depth_of(
-            histograms,
-            method=method.value,
-            group_index=group_index,
-            horizontal_fov_deg=horizontal_fov_deg,
-            background=_background(background),
-            device=device,
-        )
-        written = write_depth(reduced, out, ply=ply, comment=f"{path.name}, {method.value}")
+    histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
+    reduced = depth_of(
+        histograms,
+        method=method.value,
+        group_index=group_index,
+        horizontal_fov_deg=horizontal_fov_deg,
+        background=_background(background),
+        device=device,
+    )
+    written = write_depth(reduced, out, ply=ply, comment=f"{path.name}, {method.value}")
     first = reduced.first
     summary = {**_statistics(first), "quantity": reduced.quantity, "frames": reduced.frames, "files": written}
     if not quiet:

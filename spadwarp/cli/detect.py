@@ -67,7 +67,7 @@ def detect(
     shots = result.scene.detector.pulses_per_frame if pulses is None else pulses
     counted = min(shots, bins) if result.scene.detector.mode == "first_photon" else bins
     opt.prepare_directory(out, overwrite=overwrite, needed=pixels * (4 * counted + 4 * len(chosen) + 8) + (16 << 20))
-    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as report:
+    with progress(quiet=quiet, unit="frames") as report:
         recording = record_frames(
             result,
             out / "frames.h5",

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 from spadwarp.cli._progress import progress
+
+if TYPE_CHECKING:
+    from spadwarp.denoise import Evaluation
 
 
 @app.command()
@@ -70,10 +73,8 @@ def evaluate(
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
     """
-    from rich.table import Table
-
-    from spadwarp.denoise import TITLES, write_report
     from spadwarp.denoise import evaluate as run
+    from spadwarp.denoise import write_report
 
     chosen = ["median", "gating", "usdn", "dncnn", "pyramid"] if models == "all" else models.split(",")
     chosen = [name.strip() for name in chosen]
@@ -93,7 +94,7 @@ def evaluate(
             json_path=json_path,
         )
         return
-    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+    with progress(quiet=quiet, unit="frames") as told:
         found = run(
             data,
             models=chosen,
@@ -107,30 +108,32 @@ def evaluate(
         )
     written = write_report(found, report) if report is not None else []
     if not quiet:
-        table = Table("method", *found.levels, "mean")
-        for method in found.ranking():
-            gains = []
-            for level in (*found.levels, None):
-                one, before = found.mean(method, level=level), found.mean("input", level=level)
-                gains.append(f"{one.psnr:.2f}" if method == "input" else f"{one.psnr - before.psnr:+.2f}")
-            table.add_row(TITLES[method], *gains)
-        say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
-        opt.show_table(table)
-        if found.steps:
-            steps = {
-                method: [one for (name, _), one in found.steps.items() if name == method] for method in found.methods
-            }
-            say(
-                opt.rows(
-                    {
-                        TITLES[method]: f"{sum(one.resolved for one in all_)} of {sum(one.total for one in all_)} steps"
-                        for method, all_ in steps.items()
-                    }
-                )
-            )
+        _say_gains(found)
         if written:
             say(f"written: {written[0]}")
     opt.write_json({**found.to_dict(), "files": written}, json_path)
+
+
+def _say_gains(found: Evaluation) -> None:
+    from rich.table import Table
+
+    from spadwarp.denoise import TITLES
+
+    table = Table("method", *found.levels, "mean")
+    for method in found.ranking():
+        gains = []
+        for level in (*found.levels, None):
+            after, before = found.mean(method, level=level), found.mean("input", level=level)
+            gains.append(f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}")
+        table.add_row(TITLES[method], *gains)
+    say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
+    opt.show_table(table)
+    lines = {}
+    for method in found.methods:
+        steps = [item for (name, _), item in found.steps.items() if name == method]
+        lines[TITLES[method]] = f"{sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps"
+    if found.steps:
+        say(opt.rows(lines))
 
 
 def _sweep(
@@ -150,7 +153,7 @@ def _sweep(
     from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
 
     result = opt.load_run(data)
-    with opt.arguments_checked(), progress(quiet=quiet, unit="frames") as told:
+    with progress(quiet=quiet, unit="frames") as told:
         found = photon_sweep(
             result,
             models=[one for one in models if one != "bm3d"],

@@ -66,11 +66,10 @@ def export(
     chosen = _frames(frames)
     opt.prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
     written: dict[str, list[Path]] = {}
-    with opt.arguments_checked():
-        # Those that not every source has go first, so that nothing is written where one is refused.
-        for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
-            path = out / f"{source.resolve().stem}.{one.value}"
-            written[one.value] = spadwarp.export(source, path, frames=chosen, split=split)
+    # Those that not every source has go first, so that nothing is written where one is refused.
+    for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
+        path = out / f"{source.resolve().stem}.{one.value}"
+        written[one.value] = spadwarp.export(source, path, frames=chosen, split=split)
     if not quiet:
         lines = {}
         for name, paths in written.items():

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from spadwarp import Scene
     from spadwarp.analytic import DepthErrorRow
-from spadwarp.cli._tables import _budget_table, _percent, _short, _table, _write_csv
+from spadwarp.cli._tables import budget_table, new_table, percent, short, write_csv
 
 
 class Quantity(enum.StrEnum):
@@ -56,17 +56,16 @@ def sweep(
 
     scene: Scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
     opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
-    with opt.arguments_checked():
-        curves = spadwarp.sweep(scene, vary=vary, of=of.value, device=device)
+    curves = spadwarp.sweep(scene, vary=vary, of=of.value, device=device)
     plot_sweep(curves, out / "sweep.png")
     values, some = list(curves.values), list[Any](curves.rows)
     found = [dataclasses.asdict(row) for row in some]
     table = [{curves.field: value, **row} for value, row in zip(values, found, strict=True)]
-    written = [out / "sweep.png", _write_csv(out / "sweep.csv", table)]
+    written = [out / "sweep.png", write_csv(out / "sweep.csv", table)]
     if not quiet:
         names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in values]
         opt.show_table(
-            _budget_table(names, curves.field, some)
+            budget_table(names, curves.field, some)
             if of is Quantity.budget
             else _error_table(names, curves.field, some)
         )
@@ -77,14 +76,14 @@ def sweep(
 
 
 def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:
-    table = _table(title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "S/B")
+    table = new_table(title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "S/B")
     for name, row in zip(names, found, strict=True):
         table.add_row(
             name,
-            _short(1e3 * row.sigma_depth),
-            _short(1e3 * row.sigma_depth_p90),
-            _percent(row.outlier_probability),
-            _percent(row.estimate_fraction),
-            _short(row.signal_to_backscatter),
+            short(1e3 * row.sigma_depth),
+            short(1e3 * row.sigma_depth_p90),
+            percent(row.outlier_probability),
+            percent(row.estimate_fraction),
+            short(row.signal_to_backscatter),
         )
     return table

@@ -56,7 +56,7 @@ def train(
         raise ConfigError(f"--out: {out} is a file; a directory is needed")
     opt.check_writable(out)
     first = int(os.environ.get("RANK", "0")) == 0
-    with opt.arguments_checked(), progress(quiet=quiet or not first, unit="steps") as told:
+    with progress(quiet=quiet or not first, unit="steps") as told:
         trained = run(chosen, out, device=device, progress=told)
     if first:
         if not quiet:

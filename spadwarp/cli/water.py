@@ -28,10 +28,7 @@ def water(
     Example:
       spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
     """
-    with opt.arguments_checked():
-        optics = spadwarp.water_optics(
-            wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
-        )
+    optics = spadwarp.water_optics(wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
     say(
         opt.rows(
             {
