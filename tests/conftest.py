@@ -1,6 +1,12 @@
 """What all tests share: devices, markers, runs. Hypothesis draws the same examples each time, and nothing fails because
 a machine is slow."""
 
+import os
+
+# Tests run side by side; threads of BLAS and OpenMP that wait for small matrices would take the cores from each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 from hypothesis import HealthCheck, settings
 

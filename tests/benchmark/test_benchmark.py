@@ -70,6 +70,7 @@ def test_plane_is_the_scene_that_comes_with_the_project():
     assert ours.gate.stop == pytest.approx(shipped.gate.stop, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_rates_are_counts_over_the_fastest_run(staircase):
     assert len(staircase.seconds) == 2
     assert staircase.rates["photons"] == pytest.approx(4000 / min(staircase.seconds))
@@ -111,6 +112,7 @@ def test_ratios_are_now_over_before(staircase, kept):
     }
 
 
+@pytest.mark.slow
 def test_command_writes_and_compares(kept, tmp_path):
     out = tmp_path / "new.json"
     result = run(

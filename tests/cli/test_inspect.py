@@ -12,6 +12,7 @@ from helpers.cli import DEVICE, ENVIRONMENT, ROOT, run, start, tables
 from spadwarp.cli import app
 
 
+@pytest.mark.slow
 def test_validation_says_what_failed(tmp_path, monkeypatch):
     report = tmp_path / "report.json"
     told = run("validate", "ledger", "--photons", "2e3", "--json", report, "--plots", tmp_path / "plots", *DEVICE)

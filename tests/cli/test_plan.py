@@ -23,6 +23,7 @@ def test_analytic_frames_are_those_of_python(spad_scene, tmp_path):
     assert "20 % of their pixels report background" in told.stdout and (tmp_path / "analytic.png").is_file()
 
 
+@pytest.mark.slow
 def test_analytic_takes_truth_and_profile_from_files(spad_scene, done, tmp_path):
     result = spadwarp.load_result(done / "result.h5")
     exported = save_truth_maps(result, tmp_path / "truth.exr")

@@ -56,6 +56,7 @@ def test_what_does_not_go_with_resume(spad_scene, done, tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="sends signals")
 @pytest.mark.parametrize(("number", "pictures"), [(signal.SIGINT, PICTURES), (signal.SIGTERM, set())])
 def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
@@ -78,6 +79,7 @@ def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
     assert "stopped early" in run("info", out).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGKILL")
 def test_a_killed_run_goes_on_from_its_checkpoint(scene, tmp_path):
     """Killed twice; the outcome is that of one run."""

@@ -178,6 +178,7 @@ def start(recipe_path, out, **options):
     return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, **options)
 
 
+@pytest.mark.slow
 def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
     small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
     (tmp_path / "recipe.toml").write_text(small.to_toml())
@@ -197,6 +198,7 @@ def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
     assert before and all(kept[name] == when for name, when in before.items())
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_loses_nothing_else(tmp_path):
     """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
     small = recipe(**{"frames.per_scene": 1})
@@ -352,6 +354,7 @@ def test_recipes_that_come_with_spadwarp(path):
         assert codes[0] < 0.97 * (far - 2.0) and far < codes[1]
 
 
+@pytest.mark.slow
 def test_commands(tmp_path):
     (tmp_path / "recipe.toml").write_text(recipe().to_toml())
     out = str(tmp_path / "data")

@@ -206,6 +206,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_evaluation_and_report(dataset, tmp_path):
     found = spadwarp.denoise.evaluate(dataset, models=("median", "gating"), frames=2)
     assert found.levels == ("0.042", "0.480") and found.targets == ("staircase",)
@@ -245,6 +246,7 @@ def test_evaluation_needs_a_dataset(tmp_path):
         spadwarp.denoise.evaluate(tmp_path)
 
 
+@pytest.mark.slow
 def test_training_from_a_dataset(dataset, tmp_path):
     file, run, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
@@ -263,6 +265,7 @@ def test_training_from_a_dataset(dataset, tmp_path):
         spadwarp.denoise.train(file, tmp_path / "other")
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, monkeypatch):
     """torchrun, stopped in the middle and started again, against one process that takes both halves of each batch.
 

@@ -205,6 +205,7 @@ def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path):
     assert lines[-1]["mean_psnr"] == pytest.approx(whole.psnr, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_histograms_are_learnt_from_the_weights_for_depth(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
     done = train(tmp_path, model="histograms", start="pyramid", noise=noise)

@@ -85,6 +85,7 @@ def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(options
     assert sorted(done) == begun and 5 <= len(begun) <= 7
 
 
+@pytest.mark.slow
 def test_simulations_do_not_depend_on_who_runs_them():
     for seed, tallies in run_jobs(parallel_jobs.shots, [3, 4], **ENGINES["processes"]):
         alone = spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu")
@@ -166,6 +167,7 @@ def test_what_ray_cannot_do_is_said(cluster):
         spadwarp.simulate(scene(), **RUN, engine=Ray(workers=0))
 
 
+@pytest.mark.slow
 def test_a_dataset_whose_workers_are_killed_has_the_files_of_a_local_one(cluster, tmp_path):
     small, killer = recipe(**{"frames.per_scene": 1, "scenes_per_target": 3}), Killer(2, seed=3)
     spadwarp.make_dataset(small, tmp_path / "here", device="cpu")

@@ -96,6 +96,7 @@ SMALLER = {
 }
 
 
+@pytest.mark.slow
 def test_tutorial_runs(checkout):
     """From the first command to the last, block by block; pip aside."""
     names = {}

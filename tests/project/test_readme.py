@@ -15,6 +15,7 @@ def python_blocks(readme):
     return re.findall(r"^```python\n(.*?)^```", (ROOT / readme).read_text(), flags=re.DOTALL | re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("readme", "roots", "told"),
     [

@@ -186,6 +186,7 @@ def test_orders_of_scattering_add_up():
     assert orders.sum() == pytest.approx(0.285255, abs=5e-5)
 
 
+@pytest.mark.slow
 def test_isotropic_fluence_agrees_with_the_walk_and_its_second_moment():
     count, rng = 200_000, np.random.default_rng(6)
     edges = np.linspace(0, 5, 6)[1:-1]

@@ -31,6 +31,7 @@ def _cells(estimator, device, photons, **sections):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
 def test_estimators_agree_in_every_component(axis_threshold, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
@@ -47,6 +48,7 @@ def test_estimators_agree_in_every_component(axis_threshold, device):
     assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
+@pytest.mark.slow
 def test_estimators_agree_with_a_tabulated_phase_function(device):
     """Two terms, one of them backward, under a raised near-axis threshold."""
     water = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
@@ -60,6 +62,7 @@ def test_estimators_agree_with_a_tabulated_phase_function(device):
     assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
 
 
+@pytest.mark.slow
 def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
     """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
     water = {"phase_function": "fournier_forand"}
@@ -72,6 +75,7 @@ def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
     assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
 
 
+@pytest.mark.slow
 def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
     """Through the file, the table, and the directions and angles of its own that guided takes from it."""
     angle = np.concatenate([[0.0], np.geomspace(0.01, 20.0, 400), np.linspace(20.0, 180.0, 641)[1:]])

@@ -42,6 +42,7 @@ def test_layers_of_one_water_are_that_water(estimator, device):
         np.testing.assert_allclose(layered.tallies.sum(axis=(1, 2)), plain.tallies.sum(axis=(1, 2)), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_estimators_agree_through_layers(device):
     def cells(estimator, photons):
         one = scene(medium=LAYERED, transport={"estimator": estimator})
@@ -76,6 +77,7 @@ def test_ballistic_light_is_weakened_by_every_layer(estimator, device):
     assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_single_scattering_is_that_of_the_quadrature(estimator, device):
     """By bins of 25 cm of path, which show each layer; the plate is black and behind the gate."""

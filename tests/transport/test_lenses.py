@@ -45,6 +45,7 @@ def _cells(estimator, device, photons, **sections):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
     cells = {

@@ -62,6 +62,7 @@ def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, estimator, device):
     assert result.tallies.any(axis=(0, 3)).all()
 
 
+@pytest.mark.slow
 def test_the_estimators_agree_in_a_scan(device):
     """From 1 m on: nearer, next_event's rare and bright events next to the lens have no normal mean yet."""
     cells, gate = {}, {"start_ns": 6.671, "bins": 4}

@@ -265,6 +265,7 @@ def _corner(path) -> list[dict]:
     return [plate, {**wall, "reflectance": 0.2, "specular": 0.7, "roughness": 0.15}]
 
 
+@pytest.mark.slow
 def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     targets = _corner(shaded_square(tmp_path / "square.ply", greens=(40, 120, 180, 200)))
     cells = {}

@@ -36,6 +36,7 @@ def test_squares_are_exact_to_128_bits(device):
     assert batches.count == 300
 
 
+@pytest.mark.slow
 def test_standard_error_is_the_spread_between_seeds(device):
     """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
     one = scene(transport={"estimator": "guided"})

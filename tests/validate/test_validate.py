@@ -65,6 +65,7 @@ def test_slab_references(row):
     assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", references.STACKS, ids=lambda row: row.text)
 def test_stack_references(row):
     solved = stack([(g, albedo, extinction * thickness) for g, albedo, extinction, thickness in row.layers])
@@ -96,6 +97,7 @@ def test_moment_references():
     assert pytest.approx((collided.z, collided.r2, collided.cos_theta), abs=6e-7) == references.AFTER_COLLISIONS
 
 
+@pytest.mark.slow
 def test_references_of_the_rules_that_bias():
     for threshold, cosine in references.NEAR_AXIS.items():
         expected = snapped_mean_cosines(5, anisotropy=0.924, axis_threshold=threshold)[5]
@@ -132,6 +134,7 @@ def test_lambertian_references():
         assert fraction == pytest.approx(image[rows, columns].sum(), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_fournier_forand_references():
     """The mean of 1 − cosθ is the integral of what lies above it."""
     law = {"particle_index": 1.10, "junge_slope": 3.5835}
@@ -159,6 +162,7 @@ def results():
     )
 
 
+@pytest.mark.slow
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
     assert not failed

@@ -31,6 +31,7 @@ def check_pictures(result: Result, directory: Path, **options: object) -> list[n
     return images
 
 
+@pytest.mark.slow
 def test_previews_show_the_target(tmp_path: Path) -> None:
     result = make_result(make_scene())
     depth, *_ = check_pictures(result, tmp_path / "run", method="peak")
@@ -53,11 +54,13 @@ def test_frames_without_returns_or_targets_are_shown(result: Result, tmp_path: P
     check_pictures(result, tmp_path, method="peak")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 1)])
 def test_every_image_shape_is_shown(width: int, height: int, tmp_path: Path) -> None:
     check_pictures(make_result(make_scene(width=width, height=height, bins=8)), tmp_path, method="peak")
 
 
+@pytest.mark.slow
 def test_a_given_depth_frame_is_shown_as_it_is(tmp_path: Path) -> None:
     result = make_result(make_scene())
     frame = np.full(result.truth.depth.shape, np.nan)
@@ -78,6 +81,7 @@ def test_pictures_need_no_pyplot() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, env={"PYTHONPATH": ":".join(sys.path)})
 
 
+@pytest.mark.slow
 def test_pictures_for_print_are_vectors_and_the_same_again(tmp_path: Path) -> None:
     result = make_result(make_scene())
     first, second = (write_previews(result, tmp_path / run, method="peak", formats=["pdf"]) for run in ("a", "b"))

@@ -177,6 +177,7 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
 # Film
 
 
+@pytest.mark.slow
 def test_a_film_is_bright_when_the_target_answers(result, tmp_path):
     path = spadwarp.video(result, tmp_path / "light.gif", scale="linear", fps=10)
     lit = np.flatnonzero(result.detections.any(axis=(0, 1)))
