@@ -1,4 +1,4 @@
-"""Frames of a camera on disk: the one place that knows how they lie in an HDF5 file."""
+"""Frames of a camera on disk: the only file that knows the HDF5 layout."""
 
 from __future__ import annotations
 

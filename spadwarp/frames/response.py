@@ -311,14 +311,14 @@ def response_matrix(
     """
     e = np.asarray(edges, np.float64)
     lower, upper = irf.support
-    turns = range(1)
+    wraps = range(1)
     if period is not None:
         source_stop = source_start + source_bins * source_width
         first = math.ceil((source_start + lower - e[-1]) / period)
-        turns = range(first, math.floor((source_stop + upper - e[0]) / period) + 1)
+        wraps = range(first, math.floor((source_stop + upper - e[0]) / period) + 1)
     rows, columns, weights = [], [], []
-    for turn in turns:
-        shifted = e + (turn * period if period is not None else 0.0)
+    for wrap in wraps:
+        shifted = e + (wrap * period if period is not None else 0.0)
         begin = np.clip(np.floor((shifted[:-1] - upper - source_start) / source_width), 0, source_bins)
         stop = np.clip(np.ceil((shifted[1:] - lower - source_start) / source_width), 0, source_bins)
         index = begin[:, None] + np.arange(int(np.max(stop - begin)) + 1)

@@ -68,8 +68,8 @@ def detector_window(
 
 def missing_light(window: Window, gate_start: float) -> tuple[str, ...]:
     """A note if light from before the source's first bin would fall into the window, one or more periods later."""
-    turn = math.ceil((gate_start - window.start) / window.period - 1e-9) - 1
-    if gate_start <= 0 or window.start + turn * window.period + window.edges[-1] <= 0:
+    wrap = math.ceil((gate_start - window.start) / window.period - 1e-9) - 1
+    if gate_start <= 0 or window.start + wrap * window.period + window.edges[-1] <= 0:
         return ()
     return (
         f"the source begins at {gate_start * 1e9:.6g} ns: earlier light of later pulses, near-range backscatter above "

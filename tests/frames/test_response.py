@@ -110,19 +110,19 @@ def test_a_delta_on_the_same_bins_changes_nothing():
 
 
 @pytest.mark.parametrize("name", ["gaussian", "tail", "delta"])
-def test_folding_loses_nothing_when_the_window_is_the_period(name):
+def test_wrapping_loses_nothing_when_the_window_is_the_period(name):
     period = 1.73e-9  # neither a multiple of the bins nor a divisor of the source
     edges = np.linspace(0, period, 23) + 3e-9
     dense = _dense(response_matrix(RESPONSES[name], **AXIS, edges=edges, period=period), 22, 40)
     np.testing.assert_allclose(dense.sum(0), 1.0, atol=1e-6)
 
 
-def test_folding_shifts_by_whole_periods():
+def test_wrapping_shifts_by_whole_periods():
     irf, period = RESPONSES["tail"], 2e-9  # 20 source bins
     edges = 10e-9 + np.arange(21) * 100 * PS
     dense = _dense(response_matrix(irf, **AXIS, edges=edges, period=period), 20, 40)
     np.testing.assert_allclose(dense[:, :20], dense[:, 20:], atol=1e-6)
-    # The detector sees a circle: each source bin's column is the one before it, turned.
+    # The detector sees a circle: each source bin's column is the one before it, rotated.
     np.testing.assert_allclose(np.roll(dense[:, 3], 1), dense[:, 4], atol=1e-6)
 
 
