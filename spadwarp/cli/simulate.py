@@ -283,7 +283,7 @@ def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None,
     if not quiet:
         complain("the photons again, for their records")
     with progress(quiet=quiet) as report:
-        records = spadwarp.trace(scene, photons=photons, device=device, progress=report)
+        records = spadwarp.transport.trace(scene, photons=photons, device=device, progress=report)
     return save_records(records, out / "records.h5", scene=scene)
 
 

@@ -106,7 +106,7 @@ def test_a_slab_of_three_layers_passes_and_returns_what_adding_says(device):
         transport={"max_path": 1000.0, "weight_cutoff": 1e-5, "max_collisions": 1000},
     )
     count = 400_000
-    records = spadwarp.trace(one, photons=count, seed=5, device=device)
+    records = spadwarp.transport.trace(one, photons=count, seed=5, device=device)
     reflected, transmitted = (records.weight[records.ended(face)] for face in ("exit_z_low", "exit_z_high"))
     expected = stack([(0.8, 0.8, 0.6), (0.5, 0.6, 0.75), (0.8, 0.9, 0.26)])
     for part, exact in zip((reflected, transmitted), expected, strict=True):

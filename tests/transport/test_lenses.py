@@ -77,13 +77,13 @@ def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
 def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
     rvec, tvec, coefficients = (0.2, -0.3, 0.4), (0.1, -0.05, 1.0), (-0.25, 0.05, 0.01, -0.008, 0.0)
     spots = np.array([[0.55, 0.35, 2.0], [-0.5, 0.4, 1.5]])  # as the camera sees them
-    world = to_world(scene(camera=spadwarp.opencv_pose(rvec, tvec)).camera, spots)
+    world = to_world(scene(camera=spadwarp.scene.opencv_pose(rvec, tvec)).camera, spots)
     camera = {"width": 64, "height": 48, "horizontal_fov_deg": None, "aperture_diameter": 1e-3}
     camera |= {"fx": 70.0, "fy": 66.0, "cx": 30.3, "cy": 22.2, "distortion": coefficients}
     for seen, place in zip(spots, world, strict=True):
         one = scene(
             medium={"albedo": 0.0},
-            camera={**camera, **spadwarp.opencv_pose(rvec, tvec)},
+            camera={**camera, **spadwarp.scene.opencv_pose(rvec, tvec)},
             laser={"half_angle_deg": 3.0, "position": [0.0, 0.0, 0.0], "direction": seen.tolist()},
             targets=[{"builtin": "sphere", "size": 0.12, "translation": place.tolist()}],
         )
@@ -124,7 +124,7 @@ def test_the_domain_stands_in_the_world(device):
         targets=[],
         transport={"weight_cutoff": 0.0, "max_collisions": 1000},
     )
-    records = spadwarp.trace(one, photons=20_000, seed=1, device=device)
+    records = spadwarp.transport.trace(one, photons=20_000, seed=1, device=device)
     for index, axis in enumerate("xyz"):
         for side, corner in (("low", box["lower"]), ("high", box["upper"])):
             ended = records.ended(f"exit_{axis}_{side}")
@@ -156,7 +156,7 @@ def test_layers_of_water_stand_in_the_world(device):
     )
     along, same = (one.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) for one in (there, here))
     assert along == pytest.approx(same)
-    first, second = (spadwarp.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
+    first, second = (spadwarp.transport.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
     apart = np.linalg.norm(second.position - (first.position @ turn.T + shift), axis=1)
     # A rounding may tip one history over an edge of something; most end where they must to float32.
     assert np.quantile(apart, 0.98) < 1e-3

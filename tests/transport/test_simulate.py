@@ -111,7 +111,7 @@ def test_every_light_path_ends_for_a_reason_and_records_agree_with_the_ledger(de
         laser={"position": [0, 0, 0]},
         transport={"max_path": 6.0, "lateral_limit": 2.5, "max_collisions": 5},
     )
-    records = spadwarp.trace(one, photons=50_000, seed=4, device=device)
+    records = spadwarp.transport.trace(one, photons=50_000, seed=4, device=device)
     assert sum(records.ledger.values()) == round(50_000 / records.ledger_unit)
     for name in ("exit_z_low", "exit_z_high", "max_path", "max_collisions", "lateral_limit"):
         ended = records.ended(name)
