@@ -232,10 +232,10 @@ def provenance(device: Any = None) -> dict[str, Any]:
     """What made a result: versions, machine, date; and a device."""
     import warp as wp
 
-    import spadwarp
+    from spadwarp import __version__
 
     made = {
-        "spadwarp": spadwarp.__version__,
+        "spadwarp": __version__,
         "warp": wp.__version__,
         "numpy": np.__version__,
         "python": platform.python_version(),

@@ -29,7 +29,7 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     plain = tables(summary)
     assert plain["collected_fraction"] == twin.summary()["collected_fraction"]
     assert {Path(name).name for name in plain["files"]} == FILES | PICTURES
-    assert "closes exactly" in told.stdout
+    assert "energy balance is exact" in told.stdout
     assert "20 000 of 20 000 photons" in told.stderr
 
 
