@@ -14,8 +14,9 @@ from .analytic import (
     statistics_maps,
 )
 from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
-from .estimators import COMPONENTS, next_event_value
-from .math import one_minus_cosine, orthonormal_basis, rotate_direction, sample_lambert, snap_direction
+from .estimators import ESTIMATORS, next_event_value
+from .intersect import segment_meets_box
+from .math import one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 from .medium import (
     Layers,
     Limits,
@@ -26,6 +27,7 @@ from .medium import (
     layered_extinction,
     layered_free_path,
     layered_water,
+    make_layers,
 )
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -42,6 +44,7 @@ from .phase import (
     sphere_integral,
     two_term_henyey_greenstein_density,
 )
+from .photon import BRUTE_FORCE_FACES, Records, TransportSpec, make_records
 from .random import philox4x32, random_block, u01, u01_fine
 from .ray_cast import truth_kernel
 from .sensor import (
@@ -69,30 +72,24 @@ from .surface import (
     intersect_mesh,
     intersect_surfaces,
     lambert_brdf,
+    make_surfaces,
+    make_textures,
     offset_from_surface,
     reflectance_at,
     sample_ggx,
-    segment_meets_box,
+    sample_lambert,
+    surface_choices,
     unshadowed,
 )
-from .tally import COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, to_fixed_point
+from .tally import COMPONENTS, COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, to_fixed_point
 from .transport import (
-    BRUTE_FORCE_FACES,
-    ESTIMATORS,
     Data,
     Model,
-    Records,
-    TransportSpec,
     launch_transport,
     load_transport_kernel,
     make_data,
-    make_layers,
-    make_records,
-    make_surfaces,
-    make_textures,
     make_transport_kernel,
     read_ledger,
-    surface_choices,
 )
 
 __version__ = "0.1.0"

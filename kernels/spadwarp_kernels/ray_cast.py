@@ -3,7 +3,9 @@
 import warp as wp
 
 from spadwarp_kernels.sensor.camera import Camera, pixel_direction
-from spadwarp_kernels.surface.mesh import Surfaces, intersect_surfaces, reflectance_at
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.reflectance import reflectance_at
+from spadwarp_kernels.surface.trace import intersect_surfaces
 
 
 @wp.kernel(enable_backward=False)

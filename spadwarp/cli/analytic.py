@@ -15,8 +15,7 @@ from spadwarp.cli._app import app, say
 from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from spadwarp.analytic import AnalyticResult
-    from spadwarp.result import Truth
+    from spadwarp import AnalyticResult, Truth
 from spadwarp.cli._tables import percent
 
 
@@ -100,7 +99,7 @@ def analytic(
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     truth: Truth | None = None
     if depth is not None:
-        truth = spadwarp.result.load_truth_exr(
+        truth = spadwarp.load_truth_exr(
             depth=depth,
             camera=scene.camera,
             preset=exr_preset.value,

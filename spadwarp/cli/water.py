@@ -28,9 +28,7 @@ def water(
     Example:
       spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
     """
-    optics = spadwarp.water.water_optics(
-        wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
-    )
+    optics = spadwarp.water_optics(wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
     say(
         opt.rows(
             {

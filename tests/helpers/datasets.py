@@ -26,8 +26,7 @@ TABLES = {
 
 
 def recipe(**changes):
-    tested = spadwarp.dataset.Recipe.from_dict(TABLES)
-    return tested.with_overrides(changes) if changes else tested
+    return spadwarp.Recipe.from_dict(TABLES).with_overrides(changes) if changes else spadwarp.Recipe.from_dict(TABLES)
 
 
 def checksums(place):

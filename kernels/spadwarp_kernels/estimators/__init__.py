@@ -1,14 +1,27 @@
 """What a photon adds to the histogram."""
 
-from .contribution import COMPONENTS, Contribution, Request, make_score, next_event_value, tally_index
-from .guided import make_sample_flight
+from .analog import make_analog
+from .contribution import Request, Scored, make_event_request, make_score, next_event_value
+from .estimator import Direction, Estimator, FlightPlan
+from .flight_sampling import make_sample_flight
+from .guided import make_guided
+from .next_event import make_next_event
+from .none import make_none
+from .registry import ESTIMATORS
 
 __all__ = [
-    "COMPONENTS",
-    "Contribution",
+    "ESTIMATORS",
+    "Direction",
+    "Estimator",
+    "FlightPlan",
     "Request",
+    "Scored",
+    "make_analog",
+    "make_event_request",
+    "make_guided",
+    "make_next_event",
+    "make_none",
     "make_sample_flight",
     "make_score",
     "next_event_value",
-    "tally_index",
 ]

@@ -1,124 +1,167 @@
-"""The guided estimator: one next event per flight, drawn by distance and angle at once.
+"""The guided estimator: one next event per flight, and directions drawn towards the lens with some chance.
 
-After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joint distance-angle sampling).
+After Buras & Mayer 2011 (directions towards the detector), Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et
+al. 2013 (joint distance-angle sampling).
 """
-
-import functools
 
 import warp as wp
 
-from spadwarp_kernels.math.rotations import cotangent
+from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
 from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
-from spadwarp_kernels.phase.phase_function import PhaseGuide
+from spadwarp_kernels.phase.henyey_greenstein import (
+    HENYEY_GREENSTEIN_GUIDE,
+    henyey_greenstein_pdf,
+    sample_henyey_greenstein,
+)
+from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.random.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.sensor.camera import Camera, lens_point
+from spadwarp_kernels.sensor.gate import Gate, clip_to_gate
+from spadwarp_kernels.surface.ggx import reflection_pdf
+from spadwarp_kernels.surface.lambert import sample_cosine_law
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
+
+from .contribution import Request, make_event_request, make_score
+from .estimator import Direction, Estimator, FlightPlan
 
 
-@wp.struct
-class FlightSample:
-    """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
-    none."""
-
-    s: float
-    r: float
-    density: float
-
-
-@wp.func
-def _turn(d: float, along: float, r: float) -> wp.vec2:
-    """(1 - cos, 1 + cos) of the angle theta = atan2(d, -along), neither as a difference; r^2 = d^2 + along^2."""
-    far = r + wp.abs(along)
-    small = d * d / (r * far)
-    large = far / r
-    return wp.where(along < 0.0, wp.vec2(small, large), wp.vec2(large, small))
-
-
-@wp.func
-def _angle_of_turn(d: float, along: float, r: float) -> float:
-    return wp.atan2(d, -along)
-
-
-@wp.func
-def _chord_of_turn(d: float, along: float, r: float) -> float:
-    return wp.sqrt(2.0 * _turn(d, along, r)[0])
-
-
-@wp.func
-def _along_angle(d: float, angle: float) -> float:
-    return -d * cotangent(angle)
-
-
-@wp.func
-def _along_chord(d: float, chord: float) -> float:
-    h = 0.25 * chord * chord
-    return -d * (1.0 - 2.0 * h) / (chord * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
-
-
-@wp.func
-def _angle_slope(d: float, along: float, r: float) -> float:
-    return d / (r * r)
-
-
-@wp.func
-def _chord_slope(d: float, along: float, r: float) -> float:
-    return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
-
-
-@functools.cache
-def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Function:
-    """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``."""
-    complement, inverse, guide_density = guide.complement, guide.angle, guide.density
-    # What the guide takes: of a place on the flight, the place that has it, its derivative along the flight.
-    turn_of, along_of, slope = (
-        (_chord_of_turn, _along_chord, _chord_slope) if guide.chord else (_angle_of_turn, _along_angle, _angle_slope)
+def make_guided(spec: TransportSpec) -> Estimator:
+    """Water is scored at a point of each flight, surfaces where they are hit."""
+    request_flight, request_event = make_requests(spec)
+    return Estimator(
+        max_registers=(96, 72),
+        plan_flight=make_plan_flight(spec),
+        request_flight=request_flight,
+        request_event=request_event,
+        score=make_score(spec, flights=True),
+        direct=make_direct(spec),
     )
 
+
+def make_plan_flight(spec: TransportSpec) -> wp.Function:
+    """The part of a flight that the view and the gate show by way of a point of the lens."""
+    clip_to_view = spec.lens.clip
+    layered, bounded = spec.layered, spec.bounded
+    to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
+
     @wp.func
-    def sample_flight(
-        x: wp.vec3, u: wp.vec3, interval: wp.vec2, extinction: float, medium: Medium, xi_choice: float, xi: float
-    ) -> FlightSample:
-        """A point of the flight x + s u within the interval, x relative to the lens point.
+    def plan_flight(
+        s: PhotonState, medium: Medium, camera: Camera, gate: Gate, limits: Limits, keys: RoundKeys, id: wp.uint64
+    ) -> FlightPlan:
+        plan = FlightPlan()
+        plan.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+        plan.lens = lens_point(camera, u01(plan.block[2]), u01(plan.block[3]))
+        limit = limits.max_path - s.path
+        if wp.static(bounded):
+            limit = wp.min(limit, to_exit(limits, s.x, s.u))
+        plan.interval = clip_to_view(camera, s.view, s.x, s.u, plan.lens, limit)
+        plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        if not (wp.static(layered) or medium.extinction > 0.0):
+            plan.interval = wp.vec2(0.0, 0.0)
+        return plan
 
-        Half the points are drawn from exp(-c s), half in the angle theta(s) = atan2(D, t_c - s), D = |x cross u|, by
-        which the light must turn to reach the lens: from the guide, which follows the phase function; on flights that
-        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small for places far off.
-        """
-        sample = FlightSample()
-        s0 = interval[0]
-        s1 = interval[1]
-        width = s1 - s0
-        t_c = -wp.dot(x, u)
-        # The cross product, not |x|^2 - t_c^2, which cancels. The floor keeps float32 angles of a coaxial laser apart.
-        d = wp.max(wp.length(wp.cross(x, u)), 1.0e-7)
-        kept = 1.0 - wp.exp(-extinction * width)
-        thick = extinction * width > 1.0e-4
-        first = s0 - t_c
-        last = s1 - t_c
-        r_first = wp.sqrt(d * d + first * first)
-        r_last = wp.sqrt(d * d + last * last)
-        away = first >= 0.0
-        begin = wp.where(away, d / (r_first + first), complement(turn_of(d, first, r_first), medium))
-        end = wp.where(away, d / (r_last + last), complement(turn_of(d, last, r_last), medium))
-        span = begin - end
-        angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
+    return plan_flight
 
-        s = float(0.0)
-        if xi_choice < angular:
-            g = begin - xi * span
-            s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
-        else:
-            s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
-        s = wp.clamp(s, s0, s1)
 
-        along = s - t_c
-        r = wp.sqrt(d * d + along * along)
-        linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
-        towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)
-        angular_density = wp.where(away, d / (r * (r + along)), towards) / wp.max(span, 1.0e-30)
-        if angular == 0.0:
-            angular_density = 0.0
-        sample.s = s
-        sample.r = r
-        sample.density = (1.0 - angular) * linear_density + angular * angular_density
-        return sample
+def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
+    """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
+    local_albedo = spec.layered and not spec.random_albedo
 
-    return sample_flight
+    @wp.func
+    def request_flight(s: PhotonState) -> Request:
+        q = Request()
+        q.wanted = True
+        q.x = s.x
+        q.u = s.u
+        q.weight = wp.where(wp.static(local_albedo), s.weight.value, s.weight.value * s.albedo)
+        q.path = s.path
+        q.lens = s.flight.lens
+        q.interval = s.flight.interval
+        q.first = s.flight.sample_block[0]
+        q.second = s.flight.sample_block[1]
+        q.rounding_sample = s.flight.sample_block[2]
+        q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+        q.slot = -1
+        q.target = s.target
+        return q
+
+    return request_flight, make_event_request(spec, flights=True)
+
+
+def make_direct(spec: TransportSpec) -> wp.Function:
+    """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
+    phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
+    guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
+    has_phase_guide = spec.phase.guide is not None
+    lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
+    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    in_view, toward_axis = spec.lens.in_view, spec.lens.toward_axis
+    has_mesh, specular = spec.mesh, spec.specular
+
+    @wp.func
+    def direct(
+        s: PhotonState,
+        reflected: wp.vec3,
+        lobe: float,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        surfaces: Surfaces,
+        guiding: Guiding,
+        keys: RoundKeys,
+        id: wp.uint64,
+    ) -> Direction:
+        new = Direction()
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        snapped = snap_direction(s.u, medium.axis_threshold)
+        v = -wp.normalize(s.x)
+        if wp.static(has_phase_guide):
+            # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
+            # not have a peak narrower than the lens.
+            ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+            v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
+        inward = toward_axis(s.view, s.x)
+        to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
+        to_view_chance = float(0.0)
+        if wp.dot(inward, inward) > 0.0 and not in_view(camera, s.view, s.target, s.x):
+            to_view_chance = guiding.return_probability
+            inward = wp.normalize(inward)
+        choice = u01(s.flight.block[3])
+        here = water_at(medium, layers, s.x)
+        axis = snapped
+        t = phase_sample(u01_fine(s.flight.block[1]), here)
+        if on_surface:
+            axis = s.hit.normal
+            t = sample_cosine_law(u01(s.flight.block[1]))
+        if choice < to_lens_chance:
+            axis = v
+            t = lobe_sample(u01_fine(s.flight.block[1]), medium, guiding)
+        elif choice < to_lens_chance + to_view_chance:
+            axis = inward
+            t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), guiding.return_anisotropy)
+        new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
+        if wp.static(specular):
+            if on_surface and choice >= to_lens_chance + to_view_chance:
+                new.u = reflected
+        density = phase_pdf(one_minus_cosine(snapped, new.u), here)
+        if on_surface:
+            density = wp.max(wp.dot(new.u, s.hit.normal), 0.0) * 0.3183098861837907
+            if wp.static(specular):
+                density = reflection_pdf(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], lobe)
+        mixture = (1.0 - to_lens_chance - to_view_chance) * density
+        mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), medium, guiding)
+        if to_view_chance > 0.0:
+            mixture += to_view_chance * henyey_greenstein_pdf(
+                one_minus_cosine(inward, new.u), guiding.return_anisotropy
+            )
+        new.factor = density / wp.max(mixture, 1.0e-30)
+        return new
+
+    return direct

@@ -1,11 +1,18 @@
 """Rays against triangles, boxes and the tree of a `wp.Mesh`."""
 
-from .bvh import face_distance, face_in, face_normal, pack_bvh, walk_node
+from .box import segment_meets_box
+from .bvh import NO_NODE, LeafStep, TreeWalk, pack_bvh, step_leaf, step_node
+from .triangle import face_distance, face_in, face_normal
 
 __all__ = [
+    "NO_NODE",
+    "LeafStep",
+    "TreeWalk",
     "face_distance",
     "face_in",
     "face_normal",
     "pack_bvh",
-    "walk_node",
+    "segment_meets_box",
+    "step_leaf",
+    "step_node",
 ]

@@ -1,16 +1,7 @@
 """Directions and bits."""
 
 from .bits import bits_of, from_bits
-from .rotations import (
-    cos_sin_turn,
-    cotangent,
-    one_minus_cosine,
-    orthonormal_basis,
-    rotate_direction,
-    sample_cosine_law,
-    sample_lambert,
-    snap_direction,
-)
+from .rotations import cos_sin_turn, cotangent, one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 
 __all__ = [
     "bits_of",
@@ -20,7 +11,5 @@ __all__ = [
     "one_minus_cosine",
     "orthonormal_basis",
     "rotate_direction",
-    "sample_cosine_law",
-    "sample_lambert",
     "snap_direction",
 ]

@@ -76,15 +76,3 @@ def one_minus_cosine(u: wp.vec3, v: wp.vec3) -> float:
     """1 - cos of the angle between two unit vectors, as |u - v|^2/2: exact for small angles, in [0, 2]."""
     d = u - v
     return wp.min(0.5 * wp.dot(d, d), 2.0)
-
-
-@wp.func
-def sample_cosine_law(xi: float) -> float:
-    """t = 1 - cos(theta) of the angle to the normal, drawn from cos(theta)/pi [1/sr], for uniform xi in [0, 1)."""
-    return xi / (1.0 + wp.sqrt(1.0 - xi))
-
-
-@wp.func
-def sample_lambert(normal: wp.vec3, xi1: float, xi2: float) -> wp.vec3:
-    """A unit vector about the unit normal with density cos(theta)/pi, for uniform xi1, xi2 in [0, 1)."""
-    return rotate_direction(normal, sample_cosine_law(xi1), xi2)

@@ -9,11 +9,13 @@ from .layers import (
     layered_extinction,
     layered_free_path,
     layered_water,
+    make_layers,
 )
-from .limits import Limits, exit_distance
+from .limits import EXIT_FACES, Limits, exit_distance
 from .water import Medium, free_path
 
 __all__ = [
+    "EXIT_FACES",
     "HOMOGENEOUS",
     "LAYERED",
     "Layers",
@@ -26,4 +28,5 @@ __all__ = [
     "layered_extinction",
     "layered_free_path",
     "layered_water",
+    "make_layers",
 ]

@@ -5,6 +5,7 @@ medium alone, `LAYERED` from the layers. A boundary between equal extinctions is
 of the homogeneous one. Light passes boundaries straight on; one index holds for all layers.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import warp as wp
@@ -139,3 +140,24 @@ class Water(NamedTuple):
 
 HOMOGENEOUS = Water(_free_path, _extinction, _water)
 LAYERED = Water(layered_free_path, layered_extinction, layered_water)
+
+
+def make_layers(
+    start: Sequence[float],
+    extinction: Sequence[float],
+    albedo: Sequence[float],
+    anisotropy: Sequence[float],
+    *,
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    device: wp.DeviceLike = None,
+) -> Layers:
+    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning."""
+    columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
+    if len({len(column) for column in columns.values()}) > 1:
+        sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
+        raise ValueError(f"layers: {sizes} entries; one each for every layer are needed")
+    layers = Layers()
+    layers.axis = wp.vec3(*axis)
+    for name, column in columns.items():
+        setattr(layers, name, wp.array(column, dtype=float, device=device))
+    return layers

@@ -2,7 +2,16 @@
 
 import warp as wp
 
-from spadwarp_kernels.tally.tally import EXIT, LATERAL_LIMIT
+# Where a history may leave, in the order of `exit_face`.
+EXIT_FACES = (
+    "lateral_limit",
+    "exit_x_low",
+    "exit_x_high",
+    "exit_y_low",
+    "exit_y_high",
+    "exit_z_low",
+    "exit_z_high",
+)
 
 
 @wp.struct
@@ -59,13 +68,13 @@ def _to_faces(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
 @wp.func
 def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
     best = float(to_sides)
-    entry = LATERAL_LIMIT
+    face = int(0)
     for i in range(3):
         distance = _to_plane(x[i], u[i], limits.lower[i], limits.upper[i])
         if distance <= best:
             best = distance
-            entry = EXIT + 2 * i + wp.where(u[i] > 0.0, 1, 0)
-    return entry
+            face = 1 + 2 * i + wp.where(u[i] > 0.0, 1, 0)
+    return face
 
 
 @wp.func
@@ -99,7 +108,7 @@ def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
 
 @wp.func
 def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """Ledger entry of the limit that a ray from x along u meets first: a face of the domain, else the lateral limit."""
+    """Index into EXIT_FACES of what a ray from x along u meets first: a face of the domain, else the lateral limit."""
     return _first_face(limits, _to_sides(limits, x, u), x, u)
 
 

@@ -1,8 +1,19 @@
-"""The lanes of a CUDA warp that carry the photons."""
+"""What a kernel is compiled for, the state of a photon, its record, and the lanes of a CUDA warp that carry photons."""
 
 from .lanes import BLOCK_SIZE, count_lanes
+from .records import Records, make_records
+from .spec import BRUTE_FORCE_FACES, TransportSpec
+from .state import Flight, PhotonState, Weight, reweigh
 
 __all__ = [
     "BLOCK_SIZE",
+    "BRUTE_FORCE_FACES",
+    "Flight",
+    "PhotonState",
+    "Records",
+    "TransportSpec",
+    "Weight",
     "count_lanes",
+    "make_records",
+    "reweigh",
 ]

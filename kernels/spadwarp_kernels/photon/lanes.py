@@ -33,8 +33,8 @@ def count_lanes_before(condition: bool) -> int:
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ float stock[6 * {BLOCK_SIZE}];
-    float* mine = stock + 6u * (threadIdx.x & ~31u);
+    __shared__ float vectors[6 * {BLOCK_SIZE}];
+    float* mine = vectors + 6u * (threadIdx.x & ~31u);
     if (put) {{
         __syncwarp();
         for (int i = 0; i < 6; ++i) mine[32 * i + entry] = value[i];
@@ -49,7 +49,7 @@ def count_lanes_before(condition: bool) -> int:
 #endif
 """)
 def exchange(put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
-    """The warp's shelf of 32 vectors: every lane puts one, and later any lane takes any; CUDA alone."""
+    """32 vectors that a warp shares: every lane puts one, and later any lane takes any; CUDA alone."""
     ...
 
 
@@ -68,14 +68,14 @@ def take_photons(cursor: wp.array(dtype=int)) -> int:
     ...
 
 
-# Requests that a warp can gather: 31 that wait and 32 that come.
-GATHERED = wp.constant(64)
+# Entries of a warp's queue: 31 requests that wait and 32 that come.
+QUEUE_ENTRIES = wp.constant(64)
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 shelf[4 * 64 * {BLOCK_SIZE // 32}];
-    float4* mine = shelf + 256u * (threadIdx.x >> 5u);
+    __shared__ float4 queue[4 * 64 * {BLOCK_SIZE // 32}];
+    float4* mine = queue + 256u * (threadIdx.x >> 5u);
     if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
     const float4 held = mine[entry];
     return wp::vec4(held.x, held.y, held.z, held.w);
@@ -83,28 +83,30 @@ GATHERED = wp.constant(64)
     return value;
 #endif
 """)
-def shelf(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
-    """The warp's shelf of 4 x GATHERED vectors: puts one there, or takes one; CUDA alone."""
+def queue_vector(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
+    """Writes or reads one of the 4 x QUEUE_ENTRIES vectors of the warp's queue; CUDA alone."""
     ...
 
 
-TAKE_PLACE, COUNT_PLACES, SET_PLACES = (wp.constant(i) for i in range(3))
+ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ int counts[{BLOCK_SIZE // 32}];
-    int* count = counts + (threadIdx.x >> 5u);
-    if (act == 0) return atomicAdd(count, 1);
+    __shared__ int sizes[{BLOCK_SIZE // 32}];
+    int* size = sizes + (threadIdx.x >> 5u);
+    if (act == 0) return atomicAdd(size, 1);
     __syncwarp();
-    if (act == 1) return __shfl_sync(0xffffffffu, *count, 0);
-    if ((threadIdx.x & 31u) == 0u) *count = number;
+    if (act == 1) return __shfl_sync(0xffffffffu, *size, 0);
+    if ((threadIdx.x & 31u) == 0u) *size = number;
     __syncwarp();
 #endif
     return number;
 """)
-def places(act: int, number: int) -> int:
-    """The places of the warp's shelf that are taken: any lane takes one more and gets its index (`TAKE_PLACE`); all
-    lanes together ask how many there are (`COUNT_PLACES`), after which they see what stands there, or set that to a
-    number (`SET_PLACES`); CUDA alone."""
+def queue_size(act: int, number: int) -> int:
+    """The number of entries of the warp's queue; CUDA alone.
+
+    ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see
+    what the entries hold. SET_SIZE: all lanes together set it to a number.
+    """
     ...

@@ -10,8 +10,10 @@ tilted by less than atan(alpha).
 
 import warp as wp
 
-from spadwarp_kernels.math.rotations import cos_sin_turn, orthonormal_basis, sample_lambert
+from spadwarp_kernels.math.rotations import cos_sin_turn, orthonormal_basis
 from spadwarp_kernels.random.philox import u01
+
+from .lambert import sample_lambert
 
 _INV_PI = wp.constant(0.3183098861837907)
 

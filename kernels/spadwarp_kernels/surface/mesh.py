@@ -1,18 +1,13 @@
-"""Rays against a triangle mesh; the Lambertian surface and the pattern on it."""
+"""The target as the kernels take it: a mesh, its tree, its reflectance, images on it."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import warp as wp
 
-from spadwarp_kernels.intersect.bvh import (
-    FINISHED,
-    Stack,
-    face_distance,
-    face_in,
-    face_normal,
-    inverse_direction,
-    walk_node,
-)
-
-_INV_PI = wp.constant(0.3183098861837907)
+from spadwarp_kernels.intersect.bvh import pack_bvh
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.visibility import near_depth_map
 
 
 @wp.struct
@@ -62,198 +57,110 @@ class Surfaces:
     roughness: wp.array(dtype=float)
 
 
-@wp.struct
-class SurfaceHit:
-    """Nearest surface along a ray.
+def make_surfaces(
+    mesh: wp.Mesh | None,
+    reflectance: wp.array | float = 0.5,
+    *,
+    corner_reflectance: wp.array | None = None,
+    textures: "Textures | None" = None,
+    specular: wp.array | float | None = None,
+    roughness: wp.array | float = 0.2,
+    camera: "Camera | None" = None,
+    device: wp.DeviceLike = None,
+) -> Surfaces:
+    """The kernel's view of a mesh.
 
-    Attributes:
-        distance: [m].
-        normal: Unit vector on the ray's side.
-        face: Its index; -1 for a miss.
-        slot: Its place in the order of the mesh's tree, where that was walked; -1 for a miss.
+    Lambertian reflectance plus `specular` must not exceed 1 anywhere. `surface_choices` has the fields of
+    `TransportSpec` that go with what is returned.
+
+    Args:
+        mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew; the arrays may stay.
+        reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
+        corner_reflectance: Lambertian reflectance at the corners of each face, vec3 [faces], interpolated between them;
+            takes the place of `reflectance`.
+        textures: From `make_textures`; multiplies the corners', which default to `reflectance`.
+        specular: Reflectance of the facets of a rough specular lobe, in [0, 1]: one number or an array as above.
+        roughness: GGX width parameter of the lobe, in [0.01, 1]: one number or an array as above.
+        camera: Saves most of the rays between scattering events and its lens.
+        device: Where the empty arrays go if there is no mesh.
+
+    Raises:
+        ValueError: An array whose length is not the number of faces.
     """
+    surfaces = Surfaces()
+    device = device if mesh is None else mesh.device
+    face_count = 0 if mesh is None else mesh.indices.size // 3
 
-    distance: float
-    normal: wp.vec3
-    face: int
-    slot: int
+    def by_face(name: str, value: wp.array | float | None, dtype: type) -> wp.array:
+        if mesh is None or value is None:
+            return wp.zeros(0, dtype=dtype, device=device)
+        if not isinstance(value, wp.array):
+            value = wp.full(face_count, value, dtype=dtype, device=device)
+        if len(value) != face_count:
+            raise ValueError(f"{name} has {len(value)} entries; the mesh has {face_count} faces")
+        return value
+
+    surfaces.reflectance = by_face("reflectance", reflectance, float)
+    if textures is not None and corner_reflectance is None:
+        rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
+        corner_reflectance = wp.array(rows, dtype=wp.vec3, device=device)
+    surfaces.corner_reflectance = by_face("corner_reflectance", corner_reflectance, wp.vec3)
+    surfaces.specular = by_face("specular", specular, float)
+    surfaces.roughness = by_face("roughness", None if specular is None else roughness, float)
+    surfaces.textures = no_textures(device) if textures is None else textures
+    surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
+    surfaces.faces = wp.zeros(0, dtype=wp.vec4, device=device)
+    surfaces.order = wp.zeros(0, dtype=int, device=device)
+    surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
+    if mesh is None:
+        return surfaces
+    if textures is not None:
+        by_face("textures.face", textures.face, int)
+    points = mesh.points.numpy()
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    extent = float(abs(points).max())
+    padding = 1e-6 * extent + 1e-6
+    surfaces.mesh = mesh.id
+    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, extent)
+    surfaces.lower = wp.vec3(*(lower - padding))
+    surfaces.upper = wp.vec3(*(upper + padding))
+    if camera is not None:
+        surfaces.near_depth = near_depth_map(mesh, camera)
+    return surfaces
 
 
-@wp.func
-def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """Nearest hit of the ray x + s u, 0 <= s < max_distance, against the BVH of a `wp.Mesh`."""
-    hit = SurfaceHit()
-    hit.face = -1
-    hit.slot = -1
-    hit.distance = max_distance
-    query = wp.mesh_query_ray(mesh, x, u, max_distance)
-    if query.result:
-        hit.face = query.face
-        hit.distance = query.t
-        hit.normal = wp.where(wp.dot(query.normal, u) > 0.0, -query.normal, query.normal)
-    return hit
+def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
+    """The fields of `TransportSpec` that surfaces need: `pattern` and `specular`."""
+    return {"pattern": surfaces.corner_reflectance.size > 0, "specular": surfaces.specular.size > 0}
 
 
-@wp.func
-def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them on a GPU."""
-    hit = SurfaceHit()
-    hit.face = -1
-    hit.slot = -1
-    hit.distance = max_distance
-    nearest = int(-1)
-    for slot in range(surfaces.order.shape[0]):
-        distance = face_distance(surfaces.faces, slot, x, u)
-        if distance >= 0.0 and distance < hit.distance:
-            hit.distance = distance
-            nearest = slot
-    if nearest >= 0:
-        hit.slot = nearest
-        hit.face = face_in(surfaces.order, nearest)
-        hit.normal = face_normal(surfaces.faces, nearest, u)
-    return hit
+def no_textures(device: wp.DeviceLike = None) -> Textures:
+    textures = Textures()
+    textures.face = wp.zeros(0, dtype=int, device=device)
+    textures.coordinates = wp.zeros((0, 3), dtype=wp.vec2, device=device)
+    textures.region = wp.zeros(0, dtype=wp.vec3i, device=device)
+    textures.texels = wp.zeros(0, dtype=float, device=device)
+    return textures
 
 
-@wp.func
-def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any_hit: bool) -> SurfaceHit:
-    """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
+def make_textures(
+    face: np.ndarray, coordinates: np.ndarray, images: Sequence[np.ndarray], *, device: wp.DeviceLike = None
+) -> Textures:
+    """Images for the faces of a mesh.
 
-    Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
+    Args:
+        face: Index into `images` for each face, -1 for none; integers [faces].
+        coordinates: (u, v) at the corners of each face, [faces, 3, 2]: (0, 0) is the image's lower left corner, (1, 1)
+            its upper right one; outside of [0, 1] it repeats.
+        images: Reflectance factors in [0, 1], each [rows, columns], the first row on top.
+        device: Where to.
     """
-    hit = SurfaceHit()
-    hit.face = -1
-    hit.slot = -1
-    distance = float(max_distance)
-    found = int(-1)
-    stack = Stack()
-    stack[0] = FINISHED
-    depth = int(1)
-    node = int(0)
-    inverse = inverse_direction(u)
-    shift = wp.cw_mul(x, inverse)
-    while node != FINISHED:
-        if node > FINISHED:
-            near, far = walk_node(surfaces.nodes, node, inverse, shift, distance)
-            node = near
-            if far != FINISHED:
-                stack[depth] = far
-                depth += 1
-        else:
-            slot = -2 - node
-            struck = face_distance(surfaces.faces, slot, x, u)
-            if struck >= 0.0 and struck < distance:
-                distance = struck
-                found = slot
-                if any_hit:
-                    depth = 1
-            node = wp.where(surfaces.order[slot] < 0, node - 1, FINISHED)  # the next face of the leaf
-        if node == FINISHED and depth > 0:
-            depth -= 1
-            node = stack[depth]
-    hit.distance = distance
-    if found >= 0:
-        hit.slot = found
-        hit.face = face_in(surfaces.order, found)
-        hit.normal = face_normal(surfaces.faces, found, u)
-    return hit
-
-
-@wp.func
-def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
-    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    near = float(0.0)
-    far = float(length)
-    for i in range(3):
-        d = u[i]
-        if wp.abs(d) < 1.0e-12:
-            d = 1.0e-12
-        inverse = 1.0 / d
-        a = (lower[i] - x[i]) * inverse
-        b = (upper[i] - x[i]) * inverse
-        near = wp.max(near, wp.min(a, b))
-        far = wp.min(far, wp.max(a, b))
-    return near <= far
-
-
-@wp.func
-def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
-    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
-    same face.
-
-    The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
-    """
-    magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
-    return x + (5.0e-7 * (magnitude + distance)) * normal
-
-
-@wp.func
-def lambert_brdf(reflectance: float) -> float:
-    """Lambertian f = reflectance/pi [1/sr]; times cos(theta_out) it is the density per steradian of the reflected
-    weight."""
-    return reflectance * _INV_PI
-
-
-@wp.func
-def barycentric(mesh: wp.uint64, face: int, x: wp.vec3) -> wp.vec3:
-    """Shares of a face's three corners in the point of its plane below x, each in [0, 1], sum 1."""
-    m = wp.mesh_get(mesh)
-    p = m.points[m.indices[3 * face]]
-    e1 = m.points[m.indices[3 * face + 1]] - p
-    e2 = m.points[m.indices[3 * face + 2]] - p
-    n = wp.cross(e1, e2)
-    inverse = 1.0 / wp.dot(n, n)
-    b = wp.clamp(wp.dot(wp.cross(x - p, e2), n) * inverse, 0.0, 1.0)
-    c = wp.clamp(wp.dot(wp.cross(e1, x - p), n) * inverse, 0.0, 1.0 - b)
-    return wp.vec3(1.0 - b - c, b, c)
-
-
-@wp.func
-def texture_at(textures: Textures, index: int, uv: wp.vec2) -> float:
-    """Bilinear value of a repeating texture; its corners are at uv = (0, 0) and (1, 1), texel centres half a texel
-    inside."""
-    region = textures.region[index]
-    width = region[1]
-    height = region[2]
-    column = (uv[0] - wp.floor(uv[0])) * float(width) - 0.5
-    row = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(height) - 0.5
-    left = wp.floor(column)
-    top = wp.floor(row)
-    x0 = (int(left) + width) % width
-    y0 = (int(top) + height) % height
-    x1 = (x0 + 1) % width
-    y1 = (y0 + 1) % height
-    start = region[0]
-    upper = wp.lerp(textures.texels[start + y0 * width + x0], textures.texels[start + y0 * width + x1], column - left)
-    lower = wp.lerp(textures.texels[start + y1 * width + x0], textures.texels[start + y1 * width + x1], column - left)
-    return wp.lerp(upper, lower, row - top)
-
-
-@wp.func
-def face_reflectance(surfaces: Surfaces, face: int, x: wp.vec3) -> float:
-    """Lambertian reflectance of a face, the same all over it."""
-    return surfaces.reflectance[face]
-
-
-@wp.func
-def pattern_reflectance(surfaces: Surfaces, face: int, x: wp.vec3) -> float:
-    """Lambertian reflectance at the point x of a face: its corners' interpolated, times its texture."""
-    shares = barycentric(surfaces.mesh, face, x)
-    corners = surfaces.corner_reflectance[face]
-    # Differences, so that equal corners give their value to the bit.
-    value = corners[0] + shares[1] * (corners[1] - corners[0]) + shares[2] * (corners[2] - corners[0])
-    if surfaces.textures.face.shape[0] > 0:
-        index = surfaces.textures.face[face]
-        if index >= 0:
-            uv = shares[0] * surfaces.textures.coordinates[face, 0]
-            uv += shares[1] * surfaces.textures.coordinates[face, 1]
-            uv += shares[2] * surfaces.textures.coordinates[face, 2]
-            value *= texture_at(surfaces.textures, index, uv)
-    return value
-
-
-@wp.func
-def reflectance_at(surfaces: Surfaces, face: int, x: wp.vec3) -> float:
-    """Lambertian reflectance at the point x of a face, whether it varies or not."""
-    if surfaces.corner_reflectance.shape[0] > 0:
-        return pattern_reflectance(surfaces, face, x)
-    return surfaces.reflectance[face]
+    ends = np.cumsum([0, *(image.size for image in images)])
+    region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
+    textures = Textures()
+    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
+    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
+    textures.region = wp.array(np.array(region, np.int32), dtype=wp.vec3i, device=device)
+    texels = np.concatenate([np.asarray(image, np.float32).ravel() for image in images])
+    textures.texels = wp.array(texels, dtype=float, device=device)
+    return textures

@@ -1,27 +1,21 @@
 """Tallies in fixed point, the ledger of weights, and batches for standard errors."""
 
 from .batches import Batches
-from .tally import (
-    COUNTERS,
-    LEDGER_ENTRIES,
-    LEDGER_SLOTS,
-    LEDGER_UNIT,
-    LEDGER_WIDTH,
-    add_to_ledger,
-    deposit,
-    to_fixed_point,
-    to_ledger,
-)
+from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
+from .tally import COMPONENTS, Contribution, deposit, tally_index, to_fixed_point
 
 __all__ = [
+    "COMPONENTS",
     "COUNTERS",
     "LEDGER_ENTRIES",
     "LEDGER_SLOTS",
     "LEDGER_UNIT",
     "LEDGER_WIDTH",
     "Batches",
+    "Contribution",
     "add_to_ledger",
     "deposit",
+    "tally_index",
     "to_fixed_point",
     "to_ledger",
 ]

@@ -1,28 +1,26 @@
 """Launching the transport kernel: what it takes (Model), what it writes (Data), and the call itself."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import warp as wp
 
-from spadwarp_kernels.estimators.contribution import COMPONENTS
-from spadwarp_kernels.intersect.bvh import pack_bvh
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
+from spadwarp_kernels.photon.records import Records, make_records
+from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
 from spadwarp_kernels.random.philox import round_keys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.visibility import near_depth_map
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.surface.mesh import Surfaces, Textures
-from spadwarp_kernels.tally.tally import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
+from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
+from spadwarp_kernels.tally.ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
+from spadwarp_kernels.tally.tally import COMPONENTS
 
-from .kernel import BRUTE_FORCE_FACES, Records, TransportSpec, make_transport_kernel
+from .kernel import make_transport_kernel
 
 
 @dataclass(frozen=True)
@@ -91,148 +89,6 @@ def make_data(model: Model, *, tally: wp.array | None = None, record_count: int 
         records=make_records(record_count, device=model.device),
         cursor=wp.zeros(1, dtype=int, device=model.device),
     )
-
-
-def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
-    """Room for the terminal states of `count` photons."""
-    records = Records()
-    records.position = wp.zeros(count, dtype=wp.vec3, device=device)
-    records.direction = wp.zeros(count, dtype=wp.vec3, device=device)
-    records.weight = wp.zeros(count, dtype=float, device=device)
-    records.path = wp.zeros(count, dtype=float, device=device)
-    records.collisions = wp.zeros(count, dtype=int, device=device)
-    records.reason = wp.zeros(count, dtype=int, device=device)
-    return records
-
-
-def make_layers(
-    start: Sequence[float],
-    extinction: Sequence[float],
-    albedo: Sequence[float],
-    anisotropy: Sequence[float],
-    *,
-    axis: Sequence[float] = (0.0, 0.0, 1.0),
-    device: wp.DeviceLike = None,
-) -> Layers:
-    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning."""
-    columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
-    if len({len(column) for column in columns.values()}) > 1:
-        sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
-        raise ValueError(f"layers: {sizes} entries; one each for every layer are needed")
-    layers = Layers()
-    layers.axis = wp.vec3(*axis)
-    for name, column in columns.items():
-        setattr(layers, name, wp.array(column, dtype=float, device=device))
-    return layers
-
-
-def make_surfaces(
-    mesh: wp.Mesh | None,
-    reflectance: wp.array | float = 0.5,
-    *,
-    corner_reflectance: wp.array | None = None,
-    textures: "Textures | None" = None,
-    specular: wp.array | float | None = None,
-    roughness: wp.array | float = 0.2,
-    camera: "Camera | None" = None,
-    device: wp.DeviceLike = None,
-) -> Surfaces:
-    """The kernel's view of a mesh.
-
-    Lambertian reflectance plus `specular` must not exceed 1 anywhere. `surface_choices` has the fields of
-    `TransportSpec` that go with what is returned.
-
-    Args:
-        mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew; the arrays may stay.
-        reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
-        corner_reflectance: Lambertian reflectance at the corners of each face, vec3 [faces], interpolated between them;
-            takes the place of `reflectance`.
-        textures: From `make_textures`; multiplies the corners', which default to `reflectance`.
-        specular: Reflectance of the facets of a rough specular lobe, in [0, 1]: one number or an array as above.
-        roughness: GGX width parameter of the lobe, in [0.01, 1]: one number or an array as above.
-        camera: Saves most of the rays between scattering events and its lens.
-        device: Where the empty arrays go if there is no mesh.
-
-    Raises:
-        ValueError: An array whose length is not the number of faces.
-    """
-    surfaces = Surfaces()
-    device = device if mesh is None else mesh.device
-    face_count = 0 if mesh is None else mesh.indices.size // 3
-
-    def by_face(name: str, value: wp.array | float | None, dtype: type) -> wp.array:
-        if mesh is None or value is None:
-            return wp.zeros(0, dtype=dtype, device=device)
-        if not isinstance(value, wp.array):
-            value = wp.full(face_count, value, dtype=dtype, device=device)
-        if len(value) != face_count:
-            raise ValueError(f"{name} has {len(value)} entries; the mesh has {face_count} faces")
-        return value
-
-    surfaces.reflectance = by_face("reflectance", reflectance, float)
-    if textures is not None and corner_reflectance is None:
-        rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
-        corner_reflectance = wp.array(rows, dtype=wp.vec3, device=device)
-    surfaces.corner_reflectance = by_face("corner_reflectance", corner_reflectance, wp.vec3)
-    surfaces.specular = by_face("specular", specular, float)
-    surfaces.roughness = by_face("roughness", None if specular is None else roughness, float)
-    surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
-    surfaces.faces = wp.zeros(0, dtype=wp.vec4, device=device)
-    surfaces.order = wp.zeros(0, dtype=int, device=device)
-    surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
-    if mesh is None:
-        return surfaces
-    if textures is not None:
-        by_face("textures.face", textures.face, int)
-    points = mesh.points.numpy()
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    extent = float(abs(points).max())
-    padding = 1e-6 * extent + 1e-6
-    surfaces.mesh = mesh.id
-    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, extent)
-    surfaces.lower = wp.vec3(*(lower - padding))
-    surfaces.upper = wp.vec3(*(upper + padding))
-    if camera is not None:
-        surfaces.near_depth = near_depth_map(mesh, camera)
-    return surfaces
-
-
-def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
-    """The fields of `TransportSpec` that surfaces need: `pattern` and `specular`."""
-    return {"pattern": surfaces.corner_reflectance.size > 0, "specular": surfaces.specular.size > 0}
-
-
-def no_textures(device: wp.DeviceLike = None) -> Textures:
-    textures = Textures()
-    textures.face = wp.zeros(0, dtype=int, device=device)
-    textures.coordinates = wp.zeros((0, 3), dtype=wp.vec2, device=device)
-    textures.region = wp.zeros(0, dtype=wp.vec3i, device=device)
-    textures.texels = wp.zeros(0, dtype=float, device=device)
-    return textures
-
-
-def make_textures(
-    face: np.ndarray, coordinates: np.ndarray, images: Sequence[np.ndarray], *, device: wp.DeviceLike = None
-) -> Textures:
-    """Images for the faces of a mesh.
-
-    Args:
-        face: Index into `images` for each face, -1 for none; integers [faces].
-        coordinates: (u, v) at the corners of each face, [faces, 3, 2]: (0, 0) is the image's lower left corner, (1, 1)
-            its upper right one; outside of [0, 1] it repeats.
-        images: Reflectance factors in [0, 1], each [rows, columns], the first row on top.
-        device: Where to.
-    """
-    ends = np.cumsum([0, *(image.size for image in images)])
-    region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
-    textures = Textures()
-    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
-    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
-    textures.region = wp.array(np.array(region, np.int32), dtype=wp.vec3i, device=device)
-    texels = np.concatenate([np.asarray(image, np.float32).ravel() for image in images])
-    textures.texels = wp.array(texels, dtype=float, device=device)
-    return textures
 
 
 # Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing.

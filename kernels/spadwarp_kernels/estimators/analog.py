@@ -1,0 +1,40 @@
+"""The analog estimator: a photon counts when it passes through the aperture itself."""
+
+import warp as wp
+
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.random.philox import u01_last
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+
+from .estimator import Estimator
+
+
+def make_analog(spec: TransportSpec) -> Estimator:
+    """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
+    image_of = spec.lens.project
+
+    @wp.func
+    def cross(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:
+        """The photon's weight, if its flight passes through the aperture before anything else happens to it."""
+        found = Contribution()
+        found.index = -3
+        if s.u[2] < 0.0 and s.collisions > 0:
+            crossing = -s.x[2] / s.u[2]
+            on_lens = s.x + crossing * s.u
+            pixel = image_of(camera, s.view, s.target, s.x, on_lens)
+            radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
+            inside = radius2 <= camera.aperture_radius * camera.aperture_radius
+            if pixel >= 0 and inside and crossing <= wp.min(s.flight.distance, limits.max_path - s.path):
+                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+                if s.surface_count == 1 and s.collisions == 1:
+                    component = BALLISTIC
+                found.value = s.weight.value
+                found.index = tally_index(camera, gate, pixel, s.path + crossing, component)
+                found.rounding_sample = u01_last(s.flight.block[0])
+        return found
+
+    return Estimator(cross=cross)

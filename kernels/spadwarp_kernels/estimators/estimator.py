@@ -1,0 +1,65 @@
+"""What an estimator is: the Warp functions with which the transport kernel scores photons.
+
+An estimator is a function ``make_<name>(spec) -> Estimator`` and its line in `ESTIMATORS`.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+
+@wp.struct
+class FlightPlan:
+    """What an estimator draws for a flight before it is traced.
+
+    Attributes:
+        block: Random words of the sample.
+        lens: The point of the lens that the flight is scored through [m].
+        interval: The part of the flight that is to be scored, unless a surface stands before it [m]; empty for none.
+    """
+
+    block: wp.vec4ui
+    lens: wp.vec3
+    interval: wp.vec2
+
+
+@wp.struct
+class Direction:
+    """A new direction after an event.
+
+    Attributes:
+        u: Unit vector.
+        factor: By which the weight changes: density of the physics over that of the draw.
+    """
+
+    u: wp.vec3
+    factor: float
+
+
+class Estimator(NamedTuple):
+    """What a photon adds to the histogram, as Warp functions made for a spec; None for what the estimator does without.
+
+    Every function may be any mixture of physics and chance as long as the expectation of the histogram is that of the
+    analog walk. They take the state of the photon, `PhotonState`, and return a small struct; the kernel alone changes
+    the state.
+
+    Attributes:
+        max_registers: Registers of a CUDA thread, without and with a BVH: fewer spill, more leave too few warps to hide
+            latency.
+        cross: ``(s, camera, gate, limits) -> Contribution``, what the photon itself brings on the flight that ends in
+            its event; needs no shadow ray.
+        plan_flight: ``(s, medium, camera, gate, limits, keys, id) -> FlightPlan``, before a flight is traced.
+        request_flight: ``(s) -> Request``, the score of a flight whose planned interval is not empty.
+        request_event: ``(s, camera) -> Request``, the score of the event that the photon has come to.
+        score: ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored``; needed with either request.
+        direct: ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``, in place of
+            the phase function and the surface's law; `reflected` is the draw of a rough specular surface.
+    """
+
+    max_registers: tuple[int, int] = (64, 64)
+    cross: wp.Function | None = None
+    plan_flight: wp.Function | None = None
+    request_flight: wp.Function | None = None
+    request_event: wp.Function | None = None
+    score: wp.Function | None = None
+    direct: wp.Function | None = None

@@ -1,0 +1,124 @@
+"""The guided estimator: one next event per flight, drawn by distance and angle at once.
+
+After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joint distance-angle sampling).
+"""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.math.rotations import cotangent
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
+from spadwarp_kernels.phase.phase_function import PhaseGuide
+
+
+@wp.struct
+class FlightSample:
+    """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
+    none."""
+
+    s: float
+    r: float
+    density: float
+
+
+@wp.func
+def _turn(d: float, along: float, r: float) -> wp.vec2:
+    """(1 - cos, 1 + cos) of the angle theta = atan2(d, -along), neither as a difference; r^2 = d^2 + along^2."""
+    far = r + wp.abs(along)
+    small = d * d / (r * far)
+    large = far / r
+    return wp.where(along < 0.0, wp.vec2(small, large), wp.vec2(large, small))
+
+
+@wp.func
+def _angle_of_turn(d: float, along: float, r: float) -> float:
+    return wp.atan2(d, -along)
+
+
+@wp.func
+def _chord_of_turn(d: float, along: float, r: float) -> float:
+    return wp.sqrt(2.0 * _turn(d, along, r)[0])
+
+
+@wp.func
+def _along_angle(d: float, angle: float) -> float:
+    return -d * cotangent(angle)
+
+
+@wp.func
+def _along_chord(d: float, chord: float) -> float:
+    h = 0.25 * chord * chord
+    return -d * (1.0 - 2.0 * h) / (chord * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
+
+
+@wp.func
+def _angle_slope(d: float, along: float, r: float) -> float:
+    return d / (r * r)
+
+
+@wp.func
+def _chord_slope(d: float, along: float, r: float) -> float:
+    return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
+
+
+@functools.cache
+def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Function:
+    """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``."""
+    complement, inverse, guide_density = guide.complement, guide.angle, guide.density
+    # What the guide takes: of a place on the flight, the place that has it, its derivative along the flight.
+    turn_of, along_of, slope = (
+        (_chord_of_turn, _along_chord, _chord_slope) if guide.chord else (_angle_of_turn, _along_angle, _angle_slope)
+    )
+
+    @wp.func
+    def sample_flight(
+        x: wp.vec3, u: wp.vec3, interval: wp.vec2, extinction: float, medium: Medium, xi_choice: float, xi: float
+    ) -> FlightSample:
+        """A point of the flight x + s u within the interval, x relative to the lens point.
+
+        Half the points are drawn from exp(-c s), half in the angle theta(s) = atan2(D, t_c - s), D = |x cross u|, by
+        which the light must turn to reach the lens: from the guide, which follows the phase function; on flights that
+        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small for places far off.
+        """
+        sample = FlightSample()
+        s0 = interval[0]
+        s1 = interval[1]
+        width = s1 - s0
+        t_c = -wp.dot(x, u)
+        # The cross product, not |x|^2 - t_c^2, which cancels. The floor keeps float32 angles of a coaxial laser apart.
+        d = wp.max(wp.length(wp.cross(x, u)), 1.0e-7)
+        kept = 1.0 - wp.exp(-extinction * width)
+        thick = extinction * width > 1.0e-4
+        first = s0 - t_c
+        last = s1 - t_c
+        r_first = wp.sqrt(d * d + first * first)
+        r_last = wp.sqrt(d * d + last * last)
+        away = first >= 0.0
+        begin = wp.where(away, d / (r_first + first), complement(turn_of(d, first, r_first), medium))
+        end = wp.where(away, d / (r_last + last), complement(turn_of(d, last, r_last), medium))
+        span = begin - end
+        angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
+
+        s = float(0.0)
+        if xi_choice < angular:
+            g = begin - xi * span
+            s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
+        else:
+            s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
+        s = wp.clamp(s, s0, s1)
+
+        along = s - t_c
+        r = wp.sqrt(d * d + along * along)
+        linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
+        towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)
+        angular_density = wp.where(away, d / (r * (r + along)), towards) / wp.max(span, 1.0e-30)
+        if angular == 0.0:
+            angular_density = 0.0
+        sample.s = s
+        sample.r = r
+        sample.density = (1.0 - angular) * linear_density + angular * angular_density
+        return sample
+
+    return sample_flight

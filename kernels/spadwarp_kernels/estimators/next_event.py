@@ -1,0 +1,11 @@
+"""The next-event estimator: every event also sends its light straight to the lens."""
+
+from spadwarp_kernels.photon.spec import TransportSpec
+
+from .contribution import make_event_request, make_score
+from .estimator import Estimator
+
+
+def make_next_event(spec: TransportSpec) -> Estimator:
+    """A contribution from every collision and surface, by way of a uniform point of the lens."""
+    return Estimator(request_event=make_event_request(spec), score=make_score(spec))

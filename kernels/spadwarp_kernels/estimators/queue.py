@@ -1,0 +1,75 @@
+"""A warp's queue of requests, so that its 32 lanes score together what each of them asks for; CUDA alone."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.math.bits import bits_of, from_bits
+from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_size, queue_vector
+
+from .contribution import Request
+
+
+@functools.cache
+def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(index, size) -> Request``, for any lane.
+
+    Args:
+        flights: Whether requests have an interval and a point of the lens.
+        used: Whether there is a queue at all; else `push` does nothing.
+    """
+
+    @wp.func
+    def write(entry: int, request: Request):
+        packed = request.component + 4 * (request.slot + 1) + (int(request.rounding_sample & wp.uint32(255)) << 8)
+        queue_vector(True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
+        queue_vector(True, entry + QUEUE_ENTRIES, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
+        queue_vector(
+            True,
+            entry + 2 * QUEUE_ENTRIES,
+            wp.vec4(
+                from_bits(int(request.first)),
+                from_bits(int(request.second)),
+                from_bits(packed),
+                from_bits(request.target),
+            ),
+        )
+        if wp.static(flights):
+            queue_vector(
+                True,
+                entry + 3 * QUEUE_ENTRIES,
+                wp.vec4(request.interval[0], request.interval[1], request.lens[0], request.lens[1]),
+            )
+
+    @wp.func
+    def push(request: Request):
+        if wp.static(used):
+            if request.wanted:
+                write(queue_size(ADD_ENTRY, 0), request)
+
+    @wp.func
+    def pop(index: int, size: int) -> Request:
+        request = Request()
+        request.wanted = index < size
+        entry = wp.min(index, size - 1)
+        a = queue_vector(False, entry, wp.vec4())
+        b = queue_vector(False, entry + QUEUE_ENTRIES, wp.vec4())
+        c = queue_vector(False, entry + 2 * QUEUE_ENTRIES, wp.vec4())
+        request.x = wp.vec3(a[0], a[1], a[2])
+        request.weight = a[3]
+        request.u = wp.vec3(b[0], b[1], b[2])
+        request.path = b[3]
+        request.first = wp.uint32(bits_of(c[0]))
+        request.second = wp.uint32(bits_of(c[1]))
+        packed = bits_of(c[2])
+        request.component = packed & 3
+        request.slot = ((packed >> 2) & 63) - 1
+        request.rounding_sample = wp.uint32(packed >> 8)
+        request.target = bits_of(c[3])
+        if wp.static(flights):
+            d = queue_vector(False, entry + 3 * QUEUE_ENTRIES, wp.vec4())
+            request.interval = wp.vec2(d[0], d[1])
+            request.lens = wp.vec3(d[2], d[3], 0.0)
+        return request
+
+    return push, pop

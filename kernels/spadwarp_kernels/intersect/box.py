@@ -1,0 +1,71 @@
+"""Rays against boxes."""
+
+import warp as wp
+
+
+@wp.func
+def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
+    near = float(0.0)
+    far = float(length)
+    for i in range(3):
+        d = u[i]
+        if wp.abs(d) < 1.0e-12:
+            d = 1.0e-12
+        inverse = 1.0 / d
+        a = (lower[i] - x[i]) * inverse
+        b = (upper[i] - x[i]) * inverse
+        near = wp.max(near, wp.min(a, b))
+        far = wp.min(far, wp.max(a, b))
+    return near <= far
+
+
+@wp.func
+def _inverse(d: float) -> float:
+    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
+
+
+@wp.func
+def inverse_direction(u: wp.vec3) -> wp.vec3:
+    """1/u by components, finite."""
+    return wp.vec3(_inverse(u[0]), _inverse(u[1]), _inverse(u[2]))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4* box = reinterpret_cast<const float4*>(nodes.data) + 4 * node + 2 * child;
+    const float4 lower = __ldg(box), upper = __ldg(box + 1);
+    const float a = lower.x * inverse[0] - shift[0], b = upper.x * inverse[0] - shift[0];
+    const float c = lower.y * inverse[1] - shift[1], d = upper.y * inverse[1] - shift[1];
+    const float e = lower.z * inverse[2] - shift[2], f = upper.z * inverse[2] - shift[2];
+    return wp::vec3(
+        fmaxf(fmaxf(fminf(a, b), fminf(c, d)), fmaxf(fminf(e, f), 0.0f)),
+        fminf(fminf(fmaxf(a, b), fmaxf(c, d)), fminf(fmaxf(e, f), reach)),
+        lower.w);
+#else
+    // The three axes in a vector register; its fourth number is none to compute with.
+    typedef float vec __attribute__((ext_vector_type(4), aligned(4)));
+    typedef int32_t ivec __attribute__((ext_vector_type(4), aligned(4)));
+    const ivec* box = reinterpret_cast<const ivec*>(nodes.data) + 4 * node + 2 * child;
+    const ivec axes = {-1, -1, -1, 0};
+    const ivec lower = box[0], upper = box[1];
+    const vec factor = {inverse[0], inverse[1], inverse[2], 0.0f};
+    const vec offset = {shift[0], shift[1], shift[2], 0.0f};
+    const vec a = __builtin_bit_cast(vec, lower & axes) * factor - offset;
+    const vec b = __builtin_bit_cast(vec, upper & axes) * factor - offset;
+    const vec first = a < b ? a : b;
+    const vec last = a < b ? b : a;
+    const auto more = [](float p, float q) { return p > q ? p : q; };
+    const auto less = [](float p, float q) { return p < q ? p : q; };
+    return wp::vec3(
+        more(more(first[0], first[1]), more(first[2], 0.0f)),
+        less(less(last[0], last[1]), less(last[2], reach)),
+        reinterpret_cast<const float*>(box)[3]);
+#endif
+""")
+def box_span(
+    nodes: wp.array(dtype=wp.vec4), node: int, child: int, inverse: wp.vec3, shift: wp.vec3, reach: float
+) -> wp.vec3:
+    """Where a ray enters and leaves the box of a child, within [0, reach], and the child's bits; it misses where the
+    first exceeds the second."""
+    ...

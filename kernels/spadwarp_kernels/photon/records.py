@@ -1,0 +1,36 @@
+"""Terminal states of photons."""
+
+import warp as wp
+
+
+@wp.struct
+class Records:
+    """Terminal states by photon; arrays of length 0 where they are not asked for.
+
+    Attributes:
+        position: Where the history ended [m].
+        direction: Unit vector of its last flight.
+        weight: Weight at the end.
+        path: Geometric path [m].
+        collisions: Events, surfaces included.
+        reason: Ledger entry that took the rest of the weight.
+    """
+
+    position: wp.array(dtype=wp.vec3)
+    direction: wp.array(dtype=wp.vec3)
+    weight: wp.array(dtype=float)
+    path: wp.array(dtype=float)
+    collisions: wp.array(dtype=int)
+    reason: wp.array(dtype=int)
+
+
+def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
+    """Room for the terminal states of `count` photons."""
+    records = Records()
+    records.position = wp.zeros(count, dtype=wp.vec3, device=device)
+    records.direction = wp.zeros(count, dtype=wp.vec3, device=device)
+    records.weight = wp.zeros(count, dtype=float, device=device)
+    records.path = wp.zeros(count, dtype=float, device=device)
+    records.collisions = wp.zeros(count, dtype=int, device=device)
+    records.reason = wp.zeros(count, dtype=int, device=device)
+    return records

@@ -1,0 +1,48 @@
+"""What a transport kernel is compiled for."""
+
+from typing import NamedTuple
+
+from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
+from spadwarp_kernels.phase.phase_function import PhaseFunction
+from spadwarp_kernels.sensor.projection import PINHOLE, Lens
+
+# Meshes of at most this many faces need no BVH.
+BRUTE_FORCE_FACES = 12
+
+
+class TransportSpec(NamedTuple):
+    """Compile-time choices: the key of the kernel cache.
+
+    Attributes:
+        estimator: One of ESTIMATORS; "none" transports without a camera.
+        phase: Phase function of the water.
+        random_albedo: Draw the albedo uniformly from [0, medium.albedo] at each collision.
+        mesh: Trace rays against a mesh.
+        brute_force: On CUDA, try every face rather than walk the tree; for meshes of up to BRUTE_FORCE_FACES faces.
+        bounded: Honour the domain and the lateral limit.
+        roulette: Russian roulette in place of the weight cut-off.
+        records: Write the terminal state of each photon.
+        layered: The water is that of the layers, not that of the medium.
+        pattern: The reflectance varies within faces: corners and textures.
+        specular: Faces have a rough specular lobe beside the Lambertian one.
+        lens: How the camera images.
+        measured_beam: Emit from the laser's measured profile.
+        confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
+        rotated_domain: The domain has axes of its own.
+    """
+
+    estimator: str = "next_event"
+    phase: PhaseFunction = HENYEY_GREENSTEIN
+    random_albedo: bool = False
+    mesh: bool = True
+    brute_force: bool = False
+    bounded: bool = False
+    roulette: bool = False
+    records: bool = False
+    layered: bool = False
+    pattern: bool = False
+    specular: bool = False
+    lens: Lens = PINHOLE
+    measured_beam: bool = False
+    confocal: bool = False
+    rotated_domain: bool = False

@@ -1,0 +1,171 @@
+"""The state of a photon and of the thread that carries it."""
+
+import warp as wp
+
+from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.surface.trace import SurfaceHit
+from spadwarp_kernels.tally.ledger import to_ledger
+from spadwarp_kernels.tally.tally import Contribution
+
+# What a thread does next: a flight, the event at its end, the scattering there, a photon of its own, the end of one; or
+# no photons are left.
+FLIGHT, EVENT, SCATTER, START, END, DONE = (wp.constant(i) for i in range(6))
+
+# The ray that waits to be traced.
+NO_RAY, SURFACE_RAY, SHADOW_RAY = (wp.constant(i) for i in range(3))
+
+
+@wp.struct
+class Weight:
+    """The weight of a photon, and its account.
+
+    Attributes:
+        value: Fraction of the photon that is left.
+        ledger: The same in ledger units, as the ledger last saw it.
+        taken: By which the last change lowered it, in ledger units.
+        absorbed_water: Sum over the thread's photons of what water took, in ledger units.
+    """
+
+    value: float
+    ledger: wp.int64
+    taken: wp.int64
+    absorbed_water: wp.int64
+
+
+@wp.func
+def reweigh(w: Weight, factor: float) -> Weight:
+    """The weight times a factor.
+
+    The ledger is written where weight changes hands; water takes what is missing there.
+    """
+    before = to_ledger(w.value)
+    w.absorbed_water += w.ledger - before
+    w.value *= factor
+    w.ledger = to_ledger(w.value)
+    w.taken = before - w.ledger
+    return w
+
+
+@wp.func
+def full_weight(w: Weight) -> Weight:
+    """That of a photon that has just been emitted."""
+    w.value = 1.0
+    w.ledger = to_ledger(1.0)
+    return w
+
+
+@wp.struct
+class Flight:
+    """The flight to the next event.
+
+    Attributes:
+        block: Random words of that event.
+        sample_block: Random words of the estimator's sample of the flight.
+        distance: To the event [m].
+        reach: How far to look for surfaces [m].
+        interval: The part that an estimator wants to score [m]; empty for none.
+        lens: The point of the lens by which the flight, or its end, is scored [m].
+    """
+
+    block: wp.vec4ui
+    sample_block: wp.vec4ui
+    distance: float
+    reach: float
+    interval: wp.vec2
+    lens: wp.vec3
+
+
+@wp.func
+def is_planned(flight: Flight) -> bool:
+    """Whether an estimator wants to score a part of the flight."""
+    return flight.interval[0] < flight.interval[1]
+
+
+@wp.func
+def shorten(flight: Flight, distance: float) -> Flight:
+    """The flight up to a surface at a distance [m]."""
+    flight.distance = wp.min(flight.distance, distance)
+    flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
+    return flight
+
+
+@wp.struct
+class PhotonState:
+    """State of a thread between the stages.
+
+    A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
+    values of both branches alive around the loop and doubles the registers; attributes are assigned in place.
+
+    Attributes:
+        stage: FLIGHT ... DONE.
+        first: Number of the first of the warp's 32 new photons within the launch.
+        taken: How many of them have been taken.
+        photon: Number of the photon within the launch.
+        x, u: Position [m] and unit direction.
+        weight, analog_weight: Weight; the product of albedos and reflectances alone, at which histories end.
+        path: Geometric path [m].
+        collisions, surface_count: Events so far, and those at surfaces.
+        reason: Ledger entry of the history's end; -1 while it goes on.
+        target: Pixel that a scan scores the photon in, else -1.
+        view: Tangents (left, top, right, bottom) of what it may be seen in.
+        flight: To the next event.
+        hit: The surface there; face -1 in the water.
+        albedo: Of the water there.
+        ray: NO_RAY, SURFACE_RAY or SHADOW_RAY.
+        walk: Of the ray down the tree.
+        origin: The point that is scored, from which a shadow ray leads to the lens [m].
+        pending: The contribution that waits for the shadow ray.
+        pending_add: On the CPU the voxel and value that are still to be added, see `add_pending`.
+        absorbed_surface, directed: Sums for the ledger, in its units.
+        water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
+    """
+
+    stage: int
+    first: int
+    taken: int
+    # The photon:
+    photon: int
+    x: wp.vec3
+    u: wp.vec3
+    weight: Weight
+    analog_weight: float
+    path: float
+    collisions: int
+    surface_count: int
+    reason: int
+    target: int
+    view: wp.vec4
+    # Its next event:
+    flight: Flight
+    hit: SurfaceHit
+    albedo: float
+    # The ray to trace, and the contribution that waits for it:
+    ray: int
+    walk: TreeWalk
+    origin: wp.vec3
+    pending: Contribution
+    pending_add: wp.vec2l
+    # Sums for the ledger, and counters:
+    absorbed_surface: wp.int64
+    directed: wp.int64
+    water_collisions: int
+    surface_events: int
+    surface_queries: int
+    shadow_queries: int
+    contributions: int
+
+
+@wp.func
+def first_state(medium: Medium, camera: Camera) -> PhotonState:
+    """A thread before its first photon."""
+    s = PhotonState()
+    s.stage = START
+    s.first = -1
+    s.taken = 32
+    s.albedo = medium.albedo
+    s.view = camera.view
+    s.target = -1
+    s.walk.node = NO_NODE
+    return s

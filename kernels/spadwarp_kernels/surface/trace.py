@@ -1,0 +1,120 @@
+"""Rays against the target: its nearest face, and where the next ray starts."""
+
+import warp as wp
+
+from spadwarp_kernels.intersect.box import inverse_direction
+from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, TreeWalk, step_leaf, step_node
+from spadwarp_kernels.intersect.triangle import face_distance, face_in, face_normal
+
+from .mesh import Surfaces
+
+
+@wp.struct
+class SurfaceHit:
+    """Nearest surface along a ray.
+
+    Attributes:
+        distance: [m].
+        normal: Unit vector on the ray's side.
+        face: Its index; -1 for a miss.
+        slot: Its place in the order of the mesh's tree, where that was walked; -1 for a miss.
+    """
+
+    distance: float
+    normal: wp.vec3
+    face: int
+    slot: int
+
+
+@wp.func
+def surface_hit(surfaces: Surfaces, walk: TreeWalk, u: wp.vec3) -> SurfaceHit:
+    """What a ray along u has found on its way down the tree."""
+    hit = SurfaceHit()
+    hit.distance = walk.nearest
+    hit.slot = walk.found
+    hit.face = -1
+    if walk.found >= 0:
+        hit.face = face_in(surfaces.order, walk.found)
+        hit.normal = face_normal(surfaces.faces, walk.found, u)
+    return hit
+
+
+@wp.func
+def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
+    """Nearest hit of the ray x + s u, 0 <= s < max_distance, against the BVH of a `wp.Mesh`."""
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.slot = -1
+    hit.distance = max_distance
+    query = wp.mesh_query_ray(mesh, x, u, max_distance)
+    if query.result:
+        hit.face = query.face
+        hit.distance = query.t
+        hit.normal = wp.where(wp.dot(query.normal, u) > 0.0, -query.normal, query.normal)
+    return hit
+
+
+@wp.func
+def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
+    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them on a GPU."""
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.slot = -1
+    hit.distance = max_distance
+    nearest = int(-1)
+    for slot in range(surfaces.order.shape[0]):
+        distance = face_distance(surfaces.faces, slot, x, u)
+        if distance >= 0.0 and distance < hit.distance:
+            hit.distance = distance
+            nearest = slot
+    if nearest >= 0:
+        hit.slot = nearest
+        hit.face = face_in(surfaces.order, nearest)
+        hit.normal = face_normal(surfaces.faces, nearest, u)
+    return hit
+
+
+@wp.func
+def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any_hit: bool) -> SurfaceHit:
+    """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
+
+    Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
+    """
+    stack = Stack()
+    stack[0] = NO_NODE
+    walk = TreeWalk()
+    walk.depth = 1
+    walk.nearest = max_distance
+    walk.found = -1
+    inverse = inverse_direction(u)
+    shift = wp.cw_mul(x, inverse)
+    while walk.node != NO_NODE:
+        if walk.node > NO_NODE:
+            near, far = step_node(surfaces.nodes, walk, inverse, shift)
+            walk.node = near
+            if far != NO_NODE:
+                stack[walk.depth] = far
+                walk.depth += 1
+        else:
+            step = step_leaf(surfaces.faces, surfaces.order, walk, x, u)
+            walk.node = step.node
+            if step.hit:
+                walk.nearest = step.distance
+                walk.found = step.slot
+                if any_hit:
+                    walk.depth = 1
+        if walk.node == NO_NODE and walk.depth > 0:
+            walk.depth -= 1
+            walk.node = stack[walk.depth]
+    return surface_hit(surfaces, walk, u)
+
+
+@wp.func
+def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
+    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
+    same face.
+
+    The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
+    """
+    magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
+    return x + (5.0e-7 * (magnitude + distance)) * normal

@@ -1,0 +1,91 @@
+"""Stage collide: the end of a flight, in the water, on a surface or at a limit."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.limits import (
+    Limits,
+    exit_distance,
+    exit_distance_rotated,
+    exit_face,
+    exit_face_rotated,
+    is_outside,
+    is_outside_rotated,
+)
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import EVENT, NO_RAY, SHADOW_RAY, PhotonState
+from spadwarp_kernels.surface.trace import offset_from_surface
+from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
+
+
+@wp.struct
+class Collision:
+    """The end of a flight.
+
+    Attributes:
+        x: Where the photon is [m]; off the surface by a bound of its rounding error.
+        distance: Length of the flight [m].
+        albedo: Of the water there.
+        reason: Ledger entry of the limit that ended the history, else -1.
+    """
+
+    x: wp.vec3
+    distance: float
+    albedo: float
+    reason: int
+
+
+@functools.cache
+def make_collide(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, medium, layers, limits) -> Collision``."""
+    has_mesh, bounded = spec.mesh, spec.bounded
+    local_albedo = spec.layered and not spec.random_albedo
+    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    to_exit, face_of_exit, outside = (
+        (exit_distance_rotated, exit_face_rotated, is_outside_rotated)
+        if spec.rotated_domain
+        else (exit_distance, exit_face, is_outside)
+    )
+
+    @wp.func
+    def collide(s: PhotonState, medium: Medium, layers: Layers, limits: Limits) -> Collision:
+        c = Collision()
+        c.distance = s.flight.distance
+        c.albedo = s.albedo
+        c.reason = -1
+        limit = limits.max_path - s.path
+        if s.flight.distance > limit:
+            c.reason = MAX_PATH
+            c.distance = limit
+        if wp.static(bounded):
+            if outside(limits, s.x + c.distance * s.u):
+                c.reason = EXIT + face_of_exit(limits, s.x, s.u)
+                c.distance = wp.min(c.distance, to_exit(limits, s.x, s.u))
+        c.x = s.x + c.distance * s.u
+        if c.reason < 0:
+            if wp.static(local_albedo):
+                c.albedo = water_at(medium, layers, c.x).albedo
+            if wp.static(has_mesh):
+                if s.hit.face >= 0:
+                    c.x = offset_from_surface(c.x, s.hit.normal, c.distance)
+        return c
+
+    return collide
+
+
+@functools.cache
+def make_arrives(flights: bool) -> wp.Function:
+    """The Warp function ``s -> bool``: whether the photon is at the end of its flight, and free to collide.
+
+    A scored flight may wait for its shadow ray: without a surface nothing more is scored.
+    """
+
+    @wp.func
+    def arrives(s: PhotonState) -> bool:
+        scored = wp.static(flights) and s.ray == SHADOW_RAY and s.hit.face < 0
+        return s.stage == EVENT and (s.ray == NO_RAY or scored)
+
+    return arrives

@@ -1,0 +1,192 @@
+"""Stage scatter: the photon's weight after an event, the end of its history, or its new direction."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.estimators.estimator import Direction
+from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState, Weight, reweigh
+from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
+from spadwarp_kernels.surface.lambert import sample_cosine_law
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
+from spadwarp_kernels.tally.ledger import DIRECTED, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
+
+
+@wp.struct
+class Survival:
+    """What an event leaves of a photon: the part of its weight, and at a surface the part of that which is specular."""
+
+    part: float
+    lobe: float
+
+
+@wp.struct
+class Scattering:
+    """A photon after an event.
+
+    Attributes:
+        u: Its new unit direction.
+        weight, analog_weight: See `PhotonState`.
+        surface_count: Events at surfaces so far.
+        absorbed_surface, directed: For the ledger, in its units.
+        reason: Ledger entry that ends the history, else -1.
+    """
+
+    u: wp.vec3
+    weight: Weight
+    analog_weight: float
+    surface_count: int
+    absorbed_surface: wp.int64
+    directed: wp.int64
+    reason: int
+
+
+@functools.cache
+def make_survive(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
+    has_mesh, specular = spec.mesh, spec.specular
+    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+
+    @wp.func
+    def survive(s: PhotonState, surfaces: Surfaces) -> Survival:
+        survival = Survival()
+        survival.part = s.albedo
+        if wp.static(has_mesh):
+            if s.hit.face >= 0:
+                survival.part = reflectance_at(surfaces, s.hit.face, s.x)
+                if wp.static(specular):
+                    survival.part += surfaces.specular[s.hit.face]
+                    survival.lobe = surfaces.specular[s.hit.face] / wp.max(survival.part, 1.0e-30)
+        return survival
+
+    return survive
+
+
+@functools.cache
+def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``.
+
+    Directions follow the phase function and the surface's law, unless an estimator has a way of its own.
+    """
+    if direct is not None:
+        return direct
+    has_mesh, specular = spec.mesh, spec.specular
+    phase_sample = spec.phase.sample
+    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+
+    @wp.func
+    def turn(
+        s: PhotonState,
+        reflected: wp.vec3,
+        lobe: float,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        surfaces: Surfaces,
+        guiding: Guiding,
+        keys: RoundKeys,
+        id: wp.uint64,
+    ) -> Direction:
+        new = Direction()
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        axis = snap_direction(s.u, medium.axis_threshold)
+        t = phase_sample(u01_fine(s.flight.block[1]), water_at(medium, layers, s.x))
+        if on_surface:
+            axis = s.hit.normal
+            t = sample_cosine_law(u01(s.flight.block[1]))
+        new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
+        if wp.static(specular):
+            if on_surface:
+                new.u = reflected
+        return new
+
+    return turn
+
+
+@functools.cache
+def make_scatter(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread) ->
+    Scattering``."""
+    has_mesh, specular, roulette, directed = spec.mesh, spec.specular, spec.roulette, direct is not None
+    survive, turn = make_survive(spec), make_turn(spec, direct)
+
+    @wp.func
+    def scatter(
+        s: PhotonState,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        limits: Limits,
+        surfaces: Surfaces,
+        guiding: Guiding,
+        keys: RoundKeys,
+        id: wp.uint64,
+        ledger: wp.array(dtype=wp.int64),
+        thread: int,
+    ) -> Scattering:
+        new = Scattering()
+        new.u = s.u
+        new.weight = s.weight
+        new.surface_count = s.surface_count
+        new.reason = -1
+        on_surface = False
+        survival = survive(s, surfaces)
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        if on_surface:
+            new.weight = reweigh(s.weight, survival.part)
+            new.absorbed_surface = new.weight.taken
+            new.surface_count += 1
+        else:
+            new.weight.value *= survival.part
+        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
+        if new.analog_weight < limits.weight_cutoff or new.analog_weight <= 0.0:
+            new.reason = WEIGHT_CUTOFF
+            if wp.static(roulette):
+                chance = u01(random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
+                new.reason = ROULETTE
+                if chance < 0.1 and new.analog_weight > 0.0:
+                    new.reason = -1
+                    new.weight = reweigh(new.weight, 10.0)
+                    new.analog_weight *= 10.0
+                    add_to_ledger(ledger, thread, ROULETTE, new.weight.taken)
+        if new.reason < 0 and s.collisions >= limits.max_collisions:
+            new.reason = MAX_COLLISIONS
+        if new.reason >= 0:
+            return new
+        reflected = s.u
+        if wp.static(specular):
+            if on_surface:
+                draw = random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                roughness = surfaces.roughness[s.hit.face]
+                reflected = sample_reflection(s.u, s.hit.normal, roughness, survival.lobe, draw)
+        heading = turn(s, reflected, survival.lobe, medium, layers, camera, surfaces, guiding, keys, id)
+        new.u = heading.u
+        if wp.static(directed):
+            new.weight = reweigh(new.weight, heading.factor)
+            new.directed = new.weight.taken
+            if new.weight.value <= 0.0:
+                new.reason = DIRECTED
+        if wp.static(specular):
+            if on_surface:
+                # What one facet takes of another's light stays in the surface.
+                leaving = unshadowed(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], survival.lobe)
+                new.weight = reweigh(new.weight, leaving)
+                new.analog_weight *= leaving
+                new.absorbed_surface += new.weight.taken
+                if new.weight.value <= 0.0 and new.reason < 0:
+                    new.reason = WEIGHT_CUTOFF
+        return new
+
+    return scatter

@@ -1,0 +1,89 @@
+"""Stage traverse: rays against the target."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.estimators.contribution import Scored
+from spadwarp_kernels.intersect.box import segment_meets_box
+from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import SHADOW_RAY, PhotonState
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
+
+
+@wp.struct
+class Ray:
+    """The ray that a photon waits for: origin [m], unit direction and length [m]."""
+
+    origin: wp.vec3
+    direction: wp.vec3
+    length: float
+
+
+@functools.cache
+def make_aim(spec: TransportSpec, scores: bool) -> wp.Function:
+    """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
+
+    @wp.func
+    def aim(s: PhotonState) -> Ray:
+        ray = Ray()
+        ray.origin = s.x
+        ray.direction = s.u
+        ray.length = s.flight.reach
+        if wp.static(scores):
+            if s.ray == SHADOW_RAY:
+                ray.origin = s.origin
+                ray.direction = wp.normalize(s.flight.lens - s.origin)
+                ray.length = wp.length(s.flight.lens - s.origin)
+        return ray
+
+    return aim
+
+
+@functools.cache
+def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
+    """The Warp function ``(found, camera, surfaces) -> Scored``: whether a shadow ray is needed; by brute force it is
+    traced here."""
+    has_mesh = spec.mesh
+    may_be_hidden = spec.lens.may_be_hidden
+
+    @wp.func
+    def look(found: Scored, camera: Camera, surfaces: Surfaces) -> Scored:
+        found.seen = True
+        if wp.static(has_mesh):
+            if may_be_hidden(camera, surfaces.near_depth, found.origin):
+                to = found.lens - found.origin
+                found.seen = not segment_meets_box(found.origin, to, 1.0, surfaces.lower, surfaces.upper)
+                if wp.static(brute_force):
+                    if not found.seen:
+                        found.shadow_queries = 1
+                        length = wp.length(to)
+                        hit = intersect_faces(surfaces, found.origin, to / length, length)
+                        found.contribution.value = wp.where(hit.face < 0, found.contribution.value, 0.0)
+                        found.seen = True
+        return found
+
+    return look
+
+
+@functools.cache
+def make_begin_walk(cuda: bool) -> wp.Function:
+    """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU."""
+
+    @wp.func
+    def begin_walk(surfaces: Surfaces, ray: Ray, any_hit: bool) -> TreeWalk:
+        walk = TreeWalk()
+        walk.found = -1
+        walk.nearest = ray.length
+        walk.depth = 1  # below everything stands NO_NODE
+        if wp.static(not cuda):
+            hit = intersect_surfaces(surfaces, ray.origin, ray.direction, ray.length, any_hit)
+            walk.found = hit.slot
+            walk.nearest = hit.distance
+            walk.node = NO_NODE
+        return walk
+
+    return begin_walk
