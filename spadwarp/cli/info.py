@@ -37,7 +37,7 @@ def _told(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str,
     image, gate, medium, made = summary["image"], summary["gate"], summary["medium"], summary["provenance"]
     depth, ledger, timing = summary["truth"]["depth_m"], summary["ledger"], summary["timing"]
     fractions, counters = ledger["fractions"], summary["counters"]
-    photons = opt.count(summary["photons"]) + (", stopped early" if summary["partial"] else "")
+    photons = opt.count(summary["photons"]) + (", interrupted" if summary["partial"] else "")
     water = ", ".join(f"{name.replace('_', ' ')} {_number(value)}" for name, value in medium.items())
     collected = {name.replace("_", "-"): f"{part:.4g}" for name, part in summary["collected_fraction"].items()}
     collected |= {f"({name.replace('_', ' the ')})": f"{part:.4g}" for name, part in outside.items()}

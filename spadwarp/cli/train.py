@@ -34,7 +34,7 @@ def train(
     """Train a denoiser on the clean scenes of a dataset.
 
     Noise is drawn anew for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
-    command goes on with a run that was cut short. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    command resumes a run that was interrupted. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

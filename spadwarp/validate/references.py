@@ -65,7 +65,7 @@ SLABS = (
 
 
 class Stack(NamedTuple):
-    """Layers from the lit one on, each (anisotropy, albedo, extinction [1/m], thickness [m]); normal incidence."""
+    """Layers from the illuminated side on: (anisotropy, albedo, extinction [1/m], thickness [m]); normal incidence."""
 
     layers: tuple[tuple[float, float, float, float], ...]
     reflected: float

@@ -188,7 +188,7 @@ def _cube60(run: Run) -> list[Quantity]:
 
 CASES = (
     Case("slab", "Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows", _slabs),
-    Case("layers", "Three layers of different waters, lit from either side: adding–doubling", _stacks),
+    Case("layers", "Three layers of different waters, illuminated from either side: adding–doubling", _stacks),
     Case("exit-cosines", "What leaves a slab, by exit cosine: adding–doubling", _exit_cosines),
     Case(
         "time-resolved",

@@ -282,7 +282,7 @@ def _caption(result: Result, figure: Figure) -> None:
     if "e+" in photons:
         mantissa, power = photons.split("e+")
         photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"
-    partial = ", stopped early" if result.partial else ""
+    partial = ", interrupted" if result.partial else ""
     figure.suptitle(
         f"{photons} photons{partial}; {water}; seed {result.seed}",
         fontsize=9,

@@ -134,7 +134,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     return _Page(
         title=_name(scene),
         caption=f"{photons} photons, seed {result.seed}, {scene.transport.estimator}"
-        + (", stopped early" if result.partial else "")
+        + (", interrupted" if result.partial else "")
         + "; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),

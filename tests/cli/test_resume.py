@@ -1,4 +1,4 @@
-"""Runs that stop, go on and are added up."""
+"""Runs that are interrupted, resumed and added up."""
 
 import os
 import signal
@@ -76,7 +76,7 @@ def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
     assert result.partial and 0 < result.photons < 10**11
     assert result.ledger_report()["exact"]
     assert {path.name for path in out.iterdir()} == FILES | pictures
-    assert "stopped early" in run("info", out).stdout
+    assert "interrupted" in run("info", out).stdout
 
 
 @pytest.mark.slow

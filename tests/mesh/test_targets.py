@@ -67,7 +67,7 @@ def test_staircase_faces_the_camera_and_ends_at_the_plates_edge() -> None:
     mesh = load_target(Target(builtin="staircase"))
     assert first_depth(mesh, 2.001, 0.0) == np.inf
     assert first_depth(mesh, 0.0, -2.001) == np.inf
-    # The lit side: what looks towards −z has the plate's area, 16 m².
+    # The illuminated side: what looks towards −z has the plate's area, 16 m².
     towards = mesh.face_normals[:, 2] < -0.5
     assert mesh.area_faces[towards].sum() == pytest.approx(16.0, abs=1e-9)
 
