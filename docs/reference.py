@@ -126,7 +126,7 @@ def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> st
     if repeated:
         lines += [f"Written as `[[{name}]]`, once for each.", ""]
     lines.append(_table(model.model_fields))
-    presets = [one for one in spadwarp.presets().values() if one.section == name]
+    presets = [one for one in spadwarp.scene.presets().values() if one.section == name]
     if presets:
         lines += ['Presets (`preset = "…"`), with their sources:']
         source = None
@@ -252,7 +252,7 @@ def dataset() -> str:
         lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]
         return "\n".join(["| dataset | unit | what |", "|---|---|---|", *lines])
 
-    plan = Plan(spadwarp.load_recipe(FOLDER.parents[1] / "configs" / "datasets" / "small.toml"))
+    plan = Plan(spadwarp.dataset.load_recipe(FOLDER.parents[1] / "configs" / "datasets" / "small.toml"))
     scenes = {
         name: (unit, f"{text}; {np.dtype(kind)}" + (f" `{list(shape)}` a scene" if shape else ""))
         for name, (shape, kind, unit, text) in scene_columns(plan).items()

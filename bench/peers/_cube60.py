@@ -83,7 +83,7 @@ def measure(package: ModuleType, name: str, args: argparse.Namespace, settings: 
     from spadwarp.benchmark.cases import CASES
 
     scene = spadwarp.Scene.from_dict(CASES["cube60"].scene)
-    spread = float(spadwarp.trace(scene, photons=50_000, device=args.device).weight.std())
+    spread = float(spadwarp.transport.trace(scene, photons=50_000, device=args.device).weight.std())
     error = spread * math.sqrt((1.0 + 1.0 / args.repeats) / args.photons)
     theirs = fractions[-1]
     print(f"absorbed     {theirs:.5f}, ours {ours:.5f}: {(ours - theirs) / error:+.2f} combined standard errors apart")

@@ -24,7 +24,7 @@ STYLES = ("-", "-", "--")
 def densities(angles: np.ndarray) -> dict[str, np.ndarray]:
     """p [1/sr] of each law at angles [°]."""
     return {
-        name: spadwarp.phase_function(Medium(**WATER, **fields)).density(np.radians(angles))
+        name: spadwarp.scene.phase_function(Medium(**WATER, **fields)).density(np.radians(angles))
         for name, fields in LAWS.items()
     }
 

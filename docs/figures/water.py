@@ -27,12 +27,12 @@ def draw(path: Path) -> None:
     figure = Figure(figsize=(10.0, 3.6), layout="constrained", dpi=150)
     absorption, scattering, index = figure.subplots(1, 3)
     for chlorophyll, colour in zip(CHLOROPHYLL, COLOURS, strict=True):
-        optics = [spadwarp.water_optics(float(one), chlorophyll=chlorophyll) for one in wavelength]
+        optics = [spadwarp.water.water_optics(float(one), chlorophyll=chlorophyll) for one in wavelength]
         label = f"{chlorophyll:g} mg/m³" if chlorophyll else "pure seawater"
         absorption.semilogy(wavelength, [one.absorption for one in optics], color=colour, label=label)
         scattering.semilogy(wavelength, [one.scattering for one in optics], color=colour, label=label)
     for (label, (temperature, salinity)), style in zip(WATERS.items(), ("-", "--", ":"), strict=True):
-        group = spadwarp.group_index(wavelength, temperature=temperature, salinity=salinity)
+        group = spadwarp.water.group_index(wavelength, temperature=temperature, salinity=salinity)
         index.plot(wavelength, group, style, color="0.2", label=label)
     for axis, title in ((absorption, "absorption a [1/m]"), (scattering, "scattering b [1/m]"), (index, "group index")):
         _finish(axis, title)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from spadwarp_kernels import Data, Model
 
-__all__ = ["CASES", "GROUPS", "BenchResult", "Case", "bench", "load_report", "ratios", "report"]
+__all__ = ["CASES", "GROUPS", "BenchResult", "Case", "load_report", "ratios", "report", "run"]
 
 FORMAT, FORMAT_VERSION = "spadwarp bench", 1
 
@@ -269,7 +269,7 @@ GROUPS: dict[str, Callable[[bool], list[Case]]] = {"scaling": _scaling}
 # ---- Running them
 
 
-def bench(
+def run(
     cases: Iterable[str] | None = None,
     *,
     device: str | None = None,
@@ -417,7 +417,7 @@ def _wait(device: wp.Device) -> None:
 
 def _error(scene: Scene, device: wp.Device, photons: int, photons_per_second: float) -> float:
     """Relative error after a second at that rate; from a run of its own, since batches take time."""
-    from spadwarp.transport.simulate import simulate
+    from spadwarp.transport.simulation import simulate
 
     result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
     return result.relative_error * math.sqrt(result.photons / photons_per_second)
@@ -550,7 +550,7 @@ _KINDS = {"transport": _transport, "analytic": _analytic, "detect": _detect}
 
 def report(results: Sequence[BenchResult]) -> dict[str, Any]:
     """Results in plain values, with what they were measured on: device, driver, versions, commit, date."""
-    from spadwarp.transport.simulate import provenance
+    from spadwarp.transport.simulation import provenance
 
     device = pick_device(results[0].device if results else None)
     made = {**provenance(device), "driver": _driver() if device.is_cuda else None, "commit": _commit()}

@@ -15,7 +15,8 @@ from spadwarp.cli._app import app, say
 from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from spadwarp import AnalyticResult, Truth
+    from spadwarp.analytic import AnalyticResult
+    from spadwarp.result import Truth
 from spadwarp.cli._tables import percent
 
 
@@ -99,7 +100,7 @@ def analytic(
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     truth: Truth | None = None
     if depth is not None:
-        truth = spadwarp.load_truth_exr(
+        truth = spadwarp.result.load_truth_exr(
             depth=depth,
             camera=scene.camera,
             preset=exr_preset.value,

@@ -16,7 +16,7 @@ from spadwarp.cli._tables import new_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp.benchmark.cases import BenchResult
+    from spadwarp.benchmark import BenchResult
 
 
 @app.command()
@@ -47,7 +47,7 @@ def bench(
       spadwarp bench water staircase_5m --compare before.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark.cases import CASES, load_report, ratios, report
+    from spadwarp.benchmark import CASES, load_report, ratios, report
 
     if list_cases:
         for case in CASES.values():
@@ -67,7 +67,7 @@ def bench(
             say(_row(result))
 
     try:
-        spadwarp.bench(
+        spadwarp.benchmark.run(
             cases or None,
             device=device,
             photons=photons,

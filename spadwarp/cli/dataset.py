@@ -50,12 +50,12 @@ def make(
       spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all
       spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --shard 3/64
     """
-    recipe = spadwarp.load_recipe(recipe_path)
+    recipe = spadwarp.dataset.load_recipe(recipe_path)
     if overrides:
         recipe = recipe.with_overrides(overrides)
     engine = opt.read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
-        found = spadwarp.make_dataset(
+        found = spadwarp.dataset.make_dataset(
             recipe, out, device=device, processes=processes, engine=engine, shard=_part(shard), progress=report
         )
     summary = {
@@ -95,7 +95,7 @@ def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None)
     Example:
       spadwarp dataset verify data/small/
     """
-    wrong = spadwarp.verify_dataset(folder)
+    wrong = spadwarp.dataset.verify_dataset(folder)
     opt.write_json({"folder": folder, "wrong": wrong}, json_path)
     if wrong:
         fail("\n".join(wrong) + "\n`spadwarp dataset make` makes these anew")
@@ -128,7 +128,7 @@ def info(folder: Folder, json_path: opt.Json = None) -> None:
 
 
 class Split(enum.StrEnum):
-    """What `spadwarp.FrameReader` takes as split."""
+    """What `spadwarp.dataset.FrameReader` takes as split."""
 
     train = "train"
     validation = "validation"

@@ -135,9 +135,11 @@ def _with_options(
     if histograms.scene is not None and (clash := [*changes, *(["irf"] if irf or irf_fwhm_ps else [])]):
         raise typer.BadParameter(f"the file knows its {', '.join(clash).replace('_', ' ')}", param_hint="FILE")
     if irf is not None:
-        changes["irf"] = changes["response"] = spadwarp.instrument_response(pulse_fwhm=0.0, jitter_fwhm=0.0, shape=irf)
+        changes["irf"] = changes["response"] = spadwarp.frames.instrument_response(
+            pulse_fwhm=0.0, jitter_fwhm=0.0, shape=irf
+        )
     elif irf_fwhm_ps is not None:
-        changes["irf"] = changes["response"] = spadwarp.instrument_response(
+        changes["irf"] = changes["response"] = spadwarp.frames.instrument_response(
             pulse_fwhm=0.0, jitter_fwhm=irf_fwhm_ps * 1e-12
         )
     return dataclasses.replace(histograms, **changes)

@@ -15,7 +15,7 @@ def devices(json_path: opt.Json = None) -> None:
     Example:
       spadwarp devices
     """
-    found = spadwarp.devices()
+    found = spadwarp.device.devices()
     for device in found:
         memory = f", {opt.in_bytes(device['memory'])}" if device["memory"] else ""
         say(f"{device['name']:<8}  {device['description']}{memory}" + ("  (default)" if device["default"] else ""))

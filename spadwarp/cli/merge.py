@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
-from spadwarp.cli.simulate import bytes_needed, described, write_run
-
-if TYPE_CHECKING:
-    pass
+from spadwarp.cli.simulate import described
 
 
 @app.command()
@@ -38,12 +35,14 @@ def merge(
       spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
       spadwarp merge a/ b/ --out ab/
     """
+    from spadwarp.run import bytes_needed, write_run
+
     result = spadwarp.merge(opt.load_run(place) for place in runs)
-    needed = bytes_needed(result.scene, records=False, batches=result.batch_size > 0)
+    needed = bytes_needed(result.scene, batches=result.batch_size > 0)
     opt.prepare_directory(out, overwrite=overwrite, needed=needed)
-    written, frame = write_run(result, out, device=device)
+    files = write_run(result, out, device=device)
     if not quiet:
         ids = ", ".join(f"{opt.count(start)} to {opt.count(stop - 1)}" for start, stop in result.photon_ranges)
         say(opt.rows({"photon ids": ids}))
-        say(described(result, frame, written))
-    opt.write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": written}, json_path)
+        say(described(result, files))
+    opt.write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": files.written}, json_path)

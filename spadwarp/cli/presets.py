@@ -29,7 +29,7 @@ def presets(
     Example:
       spadwarp presets medium
     """
-    everything = spadwarp.presets()
+    everything = spadwarp.scene.presets()
     sections = list(dict.fromkeys(preset.section for preset in everything.values()))
     if section is not None and section not in sections:
         raise typer.BadParameter(f"{section!r} is not one of {', '.join(sections)}", param_hint="SECTION")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,21 +13,11 @@ import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import INTERRUPTED, app, complain, fail, say
 from spadwarp.cli._progress import progress
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from spadwarp import Result, Scene
-
-_RECORD_BYTES = 52  # of one photon's terminal state, id included
-_OTHER_BYTES = 16 << 20  # pictures, maps, text
-_NAMES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr")
-_CHECKPOINT = "checkpoint.h5"  # there while a run is not finished
-_PICTURES = tuple(
-    f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")
-)
+    from spadwarp.run import RunFiles
 
 
 @app.command()
@@ -69,8 +57,8 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Go on with the finished, interrupted or killed run in DIR until it has --photons in all (by default "
-            "what it was asked for), and write it back there.",
+            help="Resume the finished, interrupted or killed run in DIR until it has --photons in all (by default what "
+            "it was asked for), and write it back there.",
         ),
     ] = None,
     checkpoint: Annotated[
@@ -78,8 +66,8 @@ def simulate(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help="How often what is done is kept in --out, for --resume after a crash; more seldom if writing takes "
-            "long. 0: never.",
+            help="Time between checkpoints in --out, for --resume after a crash; longer where writing takes long. "
+            "0: none.",
         ),
     ] = 60.0,
     first_photon: Annotated[
@@ -102,7 +90,7 @@ def simulate(
 
     Writes to the output directory: result.h5 (everything, for `spadwarp info` and `spadwarp.load_result`), scene.toml
     (the full scene as it was run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and writes what
-    is done; after a crash --resume goes on from the last checkpoint.
+    is done; after a crash --resume continues from the last checkpoint.
 
     \b
     Examples:
@@ -115,49 +103,38 @@ def simulate(
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --engine ray --ray-address auto --out run4/
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
     """
+    from spadwarp import run
+
     earlier = None
     if resume is not None:
-        given: dict[str, Any] = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
-        given |= {
-            "--first-photon": first_photon,
-            "--shard": shard_text,
-            "--records": records,
-            "--overwrite": overwrite,
-        }
-        if clash := [name for name, value in given.items() if value]:
-            raise typer.BadParameter(f"goes without {', '.join(clash)}: the run knows them", param_hint="--resume")
+        given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
+        more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records, "--overwrite": overwrite}
+        if clash := [name for name, value in (given | more).items() if value]:
+            raise typer.BadParameter(f"goes without {', '.join(clash)}: the run has them", param_hint="--resume")
         out = resume if resume.is_dir() else resume.parent
         earlier = _earlier(resume, photons)
-        scene = earlier.scene
+        photons, scene = None if photons is None else earlier.scene.transport.photons, earlier.scene
     else:
         if scene_path is None or out is None:
             raise typer.BadParameter("is missing", param_hint="SCENE" if scene_path is None else "--out")
         scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
-    if records and (first_photon or shard_text):
-        raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
-    shard = None if shard_text is None else _shard(shard_text)
-    engine = opt.read_engine(engine_name, ray_address, workers)
-    if records and scene.transport.photons >= 2**31:
-        raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
+        photons = None
+    if records:
+        _check_records(scene, whole=not (first_photon or shard_text))
+    shard, engine = _shard(shard_text), opt.read_engine(engine_name, ray_address, workers)
     for message in spadwarp.check(scene):
         if message.level == "warning":
             complain(str(message))
-    kept = out / _CHECKPOINT
-    if kept.exists() and earlier is None and not overwrite:
-        problem = f"{out} has a run that was not finished; --resume {out} goes on with it, --overwrite begins anew"
-        raise typer.BadParameter(problem, param_hint="--out")
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
-    needed = bytes_needed(scene, records=records, batches=batches, checkpoint=checkpoint > 0)
-    opt.prepare_directory(out, overwrite=overwrite or earlier is not None, needed=needed)
-    if earlier is None:
-        _forget(kept)
+    needed = run.bytes_needed(scene, batches=batches, records=records, checkpoint=checkpoint > 0)
+    _prepare(out, needed, resume=earlier is not None, overwrite=overwrite)
     if json_path is not None:
         opt.check_writable(json_path.parent)
 
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
-            photons=photons if earlier is not None else None,
+            photons=photons,
             device=device,
             engine=engine,
             threads=threads,
@@ -167,42 +144,29 @@ def simulate(
             first_photon=first_photon,
             shard=shard,
             resume=earlier,
-            checkpoint=kept if checkpoint > 0 else None,
+            checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
             checkpoint_every=checkpoint,
         )
-    single = opt.one_device(device, engine)
-    written, frame = write_run(result, out, device=single)
-    _forget(kept)
+    device = opt.one_device(device, engine)
+    files = run.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
     if records and not result.partial:
-        written.append(_write_records(scene, result.photons, out, device=single, quiet=quiet))
-    spared = {"records.h5"} if earlier is not None else set()
-    for name in {*_NAMES, *_PICTURES} - spared:  # left from an earlier run, they would be taken for this one's
-        if out / name not in written:
-            (out / name).unlink(missing_ok=True)
-
+        files.written.append(_write_records(scene, result.photons, out, device=device, quiet=quiet))
     if not quiet:
-        say(described(result, frame, written))
+        say(described(result, files))
     error = result.relative_error if _has_errors(result) else None
-    opt.write_json({**result.summary(), "relative_error": error, "files": written}, json_path)
-    if relative_error is not None and not result.partial and (error is None or error > relative_error):
+    opt.write_json({**result.summary(), "relative_error": error, "files": files.written}, json_path)
+    if result.partial:
+        _fail_as_interrupted(result, records)
+    if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
-    if result.partial:
-        left_out = "; no records were written" if records else ""
-        asked = result.requested[1] - result.requested[0]
-        fail(
-            f"interrupted after {opt.count(result.photons)} of {opt.count(asked)} photons, "
-            f"which are written and marked partial{left_out}",
-            INTERRUPTED,
-        )
 
 
 def _earlier(place: Path, photons: int | None) -> Result:
-    """The run to resume: its result or its checkpoint, whichever is newer; its scene asks for as many photons as it
-    shall have."""
-    if place.is_dir():
-        there = [path for name in ("result.h5", _CHECKPOINT) if (path := place / name).is_file()]
-        place = max(there, key=lambda path: path.stat().st_mtime_ns, default=place)
+    """The run to resume, whose scene asks for as many photons as it shall have."""
+    from spadwarp.run import newest_result
+
+    place = newest_result(place)
     earlier = opt.load_run(place)
     start, stop = earlier.requested
     wanted = stop - start if photons is None else photons
@@ -213,85 +177,63 @@ def _earlier(place: Path, photons: int | None) -> Result:
     return replace(earlier, scene=earlier.scene.with_overrides(transport={"photons": photons}))
 
 
-def _forget(checkpoint: Path) -> None:
-    """Removes a checkpoint, and what a killed run has left of one."""
-    for path in (checkpoint, *checkpoint.parent.glob(f".{checkpoint.name}.*.tmp")):
-        path.unlink(missing_ok=True)
+def _check_records(scene: Scene, *, whole: bool) -> None:
+    if not whole:
+        raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
+    if scene.transport.photons >= 2**31:
+        raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
 
 
-def _shard(text: str) -> tuple[int, int]:
+def _shard(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
     number, _, parts = text.partition("/")
     if not (number.isdecimal() and parts.isdecimal()):
         raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint="--shard")
     return int(number), int(parts)
 
 
+def _prepare(out: Path, needed: int, *, resume: bool, overwrite: bool) -> None:
+    """Makes the directory; refuses one that holds another run or has too little space for `needed` bytes."""
+    from spadwarp import run
+
+    if (out / run.CHECKPOINT).exists() and not (resume or overwrite):
+        problem = f"{out} has a run that was not finished; --resume {out} resumes it, --overwrite replaces it"
+        raise typer.BadParameter(problem, param_hint="--out")
+    opt.prepare_directory(out, overwrite=overwrite or resume, needed=needed)
+    if not resume:
+        run.remove_checkpoint(out)
+
+
 def _has_errors(result: Result) -> bool:
     return result.second_moment is not None and result.photons >= 2 * result.batch_size
 
 
-def bytes_needed(scene: Scene, *, records: bool, batches: bool, checkpoint: bool = False) -> int:
-    """Upper bound of what a run writes; compression takes off most of it."""
-    tallies = (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
-    return (
-        (2 if checkpoint else 1) * tallies + _OTHER_BYTES + (_RECORD_BYTES * scene.transport.photons if records else 0)
-    )
-
-
-def write_run(result: Result, out: Path, *, device: str | None) -> tuple[list[Path], NDArray[np.float64]]:
-    """Files of a result as its `[output]` asks for, the one that nothing can replace first, and the depth frame."""
-    from spadwarp.result.file import save_depth_exr, save_truth_maps
-    from spadwarp.viz.result import write_previews
-
-    scene, output = result.scene, result.scene.output
-    written: list[Path] = []
-    if output.result:
-        written.append(_save(result, out / "result.h5"))
-    text = out / "scene.toml"
-    try:
-        text.write_text(scene.to_toml(), encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{text}: cannot be written: {error.strerror}") from error
-    written.append(text)
-    options: dict[str, Any] = {}
-    if output.depth_method in ("matched", "likelihood"):
-        from spadwarp.frames import detector_response
-
-        options["irf"] = detector_response(scene.detector, scene.laser)
-    frame = result.depth(method=output.depth_method, device=device, **options)
-    if output.exr:
-        written += [save_depth_exr(result, frame, out / "depth.exr"), save_truth_maps(result, out / "truth.exr")]
-    if output.png or output.pdf:
-        formats = [ending for ending in ("png", "pdf") if getattr(output, ending)]
-        written += write_previews(result, out, depth=frame, method=output.depth_method, formats=formats)
-    return written, frame
-
-
-def _save(result: Result, path: Path) -> Path:
-    """Saves the result, if need be elsewhere: hours of photons are not given up because a disk has become full."""
-    try:
-        return result.save(path)
-    except FileError as error:
-        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{os.getpid()}-result.h5"
-        result.save(refuge)
-        raise FileError(f"{error}\n{refuge}: the result is here instead") from error
-
-
 def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None, quiet: bool) -> Path:
-    from spadwarp.transport.records import save_records
+    from spadwarp.transport import save_records
 
     if not quiet:
-        complain("the photons again, for their records")
+        complain("the photons are traced again for their records")
     with progress(quiet=quiet) as report:
-        records = spadwarp.trace(scene, photons=photons, device=device, progress=report)
+        records = spadwarp.transport.trace(scene, photons=photons, device=device, progress=report)
     return save_records(records, out / "records.h5", scene=scene)
 
 
-def described(result: Result, frame: NDArray[np.float64], written: list[Path]) -> str:
+def _fail_as_interrupted(result: Result, records: bool) -> None:
+    start, stop = result.requested
+    left_out = "; no records were written" if records else ""
+    fail(
+        f"interrupted after {opt.count(result.photons)} of {opt.count(stop - start)} photons, "
+        f"which are written and marked partial{left_out}",
+        INTERRUPTED,
+    )
+
+
+def described(result: Result, files: RunFiles) -> str:
     """A run in a few lines."""
     import numpy as np
 
-    summary, truth = result.summary(), result.truth.depth
+    summary, truth, frame, written = result.summary(), result.truth.depth, files.depth, files.written
     seconds = result.timing["trace"]
     collected = summary["collected_fraction"]
     ledger = summary["ledger"]
@@ -317,8 +259,8 @@ def described(result: Result, frame: NDArray[np.float64], written: list[Path]) -
             f"{100 * result.relative_error:.3g} % in the bins that decide the depth, or less, in 95 % of the pixels"
         )
     parts = sorted(ledger["fractions"].items(), key=lambda entry: -abs(entry[1]))
-    lines["ledger"] = ("closes exactly: " if ledger["exact"] else f"OFF BY {ledger['difference']} UNITS: ") + ", ".join(
-        f"{name} {100 * part:.3g} %" for name, part in parts if part
-    )
+    lines["ledger"] = (
+        "energy balance is exact: " if ledger["exact"] else f"OFF BY {ledger['difference']} UNITS: "
+    ) + ", ".join(f"{name} {100 * part:.3g} %" for name, part in parts if part)
     lines["written"] = ", ".join(path.name for path in written) + f" in {written[0].parent}"
     return opt.rows(lines)

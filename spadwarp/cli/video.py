@@ -35,7 +35,7 @@ def video(
       spadwarp video out/ --out light.mp4 --window 40,55 --fps 20
     """
     scale: Literal["log", "linear"] = "linear" if linear else "log"
-    path = spadwarp.video(run, out, window_ns=_window(window), pictures=pictures, fps=fps, scale=scale, frame=frame)
+    path = spadwarp.viz.video(run, out, window_ns=_window(window), pictures=pictures, fps=fps, scale=scale, frame=frame)
     if not quiet:
         say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")
 

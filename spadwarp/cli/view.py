@@ -34,6 +34,6 @@ def view(
       spadwarp view out/
       spadwarp view frames/frames.h5 --frame 3 --out frame.html
     """
-    path = spadwarp.view(run, out, method=method, frame=frame, device=device)
+    path = spadwarp.viz.view(run, out, method=method, frame=frame, device=device)
     if not quiet:
         say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")

@@ -28,7 +28,9 @@ def water(
     Example:
       spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
     """
-    optics = spadwarp.water_optics(wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
+    optics = spadwarp.water.water_optics(
+        wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
+    )
     say(
         opt.rows(
             {

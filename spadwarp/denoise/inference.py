@@ -55,7 +55,7 @@ def apply(
             show more than each alone.
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`, as
-            `spadwarp.InstrumentResponse.per_bin` gives it.
+            `spadwarp.frames.InstrumentResponse.per_bin` gives it.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
         progress: Called with ("frames", done, total).

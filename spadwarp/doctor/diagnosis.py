@@ -292,12 +292,12 @@ def _self_test(device: str, progress: Callable[[str], None]) -> tuple[list[SelfT
     progress("loading kernels; the first time they are compiled")
     began = time.perf_counter()
     spadwarp.simulate(plate, photons=1, seed=1, device=device)
-    spadwarp.trace(slab, photons=1, seed=1, device=device)
+    spadwarp.transport.trace(slab, photons=1, seed=1, device=device)
     ready = time.perf_counter()
     progress("tracing")
     photons = 400_000
     result = spadwarp.simulate(plate, photons=photons, seed=1, device=device)
-    records = spadwarp.trace(slab, photons=photons, seed=1, device=device)
+    records = spadwarp.transport.trace(slab, photons=photons, seed=1, device=device)
     seconds = {"compile": ready - began, "run": time.perf_counter() - ready}
 
     # Photons that arrive without a collision are a binomial part of all; each gives Γ A / (π z²) exp(−c z) to the lens.

@@ -214,10 +214,10 @@ class Result:
     def depth(
         self, *, method: Any = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
     ) -> NDArray[np.float64]:
-        """Depth frame [m], float64 `[H, W]`, NaN where nothing returned: see `spadwarp.depth_frame`."""
+        """Depth frame [m], float64 `[H, W]`, NaN where nothing returned: see `spadwarp.frames.depth_frame`."""
         import spadwarp
 
-        return spadwarp.depth_frame(self, method=method, quantity=quantity, **options)
+        return spadwarp.frames.depth_frame(self, method=method, quantity=quantity, **options)
 
     def true_path(self) -> NDArray[np.float64]:
         """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
@@ -287,7 +287,7 @@ class Result:
         """Writes everything to one HDF5 file that `spadwarp.load_result` reads back bit for bit; returns its path."""
         import spadwarp
 
-        return spadwarp.save_result(self, path)
+        return spadwarp.result.save_result(self, path)
 
 
 def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:

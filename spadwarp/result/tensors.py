@@ -21,7 +21,7 @@ Frames = TypeVar("Frames")
 
 
 class TorchTruth(NamedTuple):
-    """`spadwarp.Truth` as tensors: `depth`, `range`, `reflectance` `[H, W]`, `normal` `[H, W, 3]`, float32."""
+    """`spadwarp.result.Truth` as tensors: `depth`, `range`, `reflectance` `[H, W]`, `normal` `[H, W, 3]`, float32."""
 
     depth: torch.Tensor
     range: torch.Tensor

@@ -1,8 +1,21 @@
-"""Our files: opened, whatever they hold, and written in other formats."""
+"""The directory of a run; our files opened, whatever they hold, and written in other formats."""
 
 from spadwarp.run.analytic_file import save_analytic
 from spadwarp.run.depth import write_depth
+from spadwarp.run.directory import CHECKPOINT, RunFiles, bytes_needed, newest_result, remove_checkpoint, write_run
 from spadwarp.run.formats import FORMATS, export
 from spadwarp.run.sources import open_source
 
-__all__ = ["FORMATS", "export", "open_source", "save_analytic", "write_depth"]
+__all__ = [
+    "CHECKPOINT",
+    "FORMATS",
+    "RunFiles",
+    "bytes_needed",
+    "export",
+    "newest_result",
+    "open_source",
+    "remove_checkpoint",
+    "save_analytic",
+    "write_depth",
+    "write_run",
+]

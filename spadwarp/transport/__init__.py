@@ -1,8 +1,8 @@
 """Photon transport: a scene in, a `Result`, truth maps or photon records out."""
 
 from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
-from spadwarp.transport.simulate import Progress, provenance, simulate
-from spadwarp.transport.tally_scale import PHOTON_CAPACITY, tally_scale
+from spadwarp.transport.simulation import Progress, provenance, simulate
+from spadwarp.transport.tally_unit import PHOTON_CAPACITY, tally_scale
 from spadwarp.transport.truth import truth_maps
 
 __all__ = [

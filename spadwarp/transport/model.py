@@ -18,7 +18,7 @@ from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.pose import rotation_matrix, to_world
-from spadwarp.transport.tally_scale import tally_scale
+from spadwarp.transport.tally_unit import tally_scale
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from spadwarp.errors import ConfigError
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
-from spadwarp.result.merge import physics_of
+from spadwarp.result.merging import physics_of
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.scene import Scene
 

@@ -18,7 +18,7 @@ from spadwarp.transport.plan import LAUNCH_SIZE, check_range
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
-    from spadwarp.transport.simulate import Progress
+    from spadwarp.transport.simulation import Progress
 
 __all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
 
@@ -121,7 +121,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     """Writes the terminal states of photons to one HDF5 file; returns its path.
 
     Args:
-        records: From `spadwarp.trace`.
+        records: From `spadwarp.transport.trace`.
         path: The file; an existing one is replaced when the new one is whole.
         scene: The scene they were traced in, to be stored with them.
 

@@ -52,7 +52,7 @@ class Run:
 
     def results(self, tables: Mapping[str, Any]) -> Iterator[Any]:
         """`Result`s of `BATCHES` independent runs; each scene has random numbers of its own."""
-        from spadwarp.transport.simulate import simulate
+        from spadwarp.transport.simulation import simulate
 
         simulated = self._scene(tables)
         photons = max(1, self.photons // BATCHES)

@@ -1,6 +1,6 @@
 """Optical properties of natural water over wavelength, temperature, salinity and chlorophyll.
 
->>> spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0).extinction
+>>> spadwarp.water.water_optics(532.0, chlorophyll=0.5, temperature=10.0).extinction
 
 Pure water absorbs as Pope & Fry (1997) measured it and scatters as Zhang, Hu & He (2009) compute it; its index is that
 of Quan & Fry (1995). What lives in it follows the chlorophyll concentration as in the open ocean, where nothing comes

@@ -30,7 +30,7 @@ def run(*words):
 
 @pytest.fixture(scope="module")
 def staircase():
-    (result,) = spadwarp.bench(["staircase_5m"], device="cpu", photons=4000, repeats=2)
+    (result,) = spadwarp.benchmark.run(["staircase_5m"], device="cpu", photons=4000, repeats=2)
     return result
 
 
@@ -62,7 +62,7 @@ def test_scenes_end_paths_with_the_gate():
 
 
 def test_plane_is_the_scene_that_comes_with_the_project():
-    shipped = spadwarp.load_scene(PEERS.parents[2] / "configs" / "scenes" / "plane_5m.toml")
+    shipped = spadwarp.load_scene(PEERS.parents[1] / "configs" / "scenes" / "plane_5m.toml")
     ours = scene("plane_5m")
     for section in ("medium", "laser", "targets"):
         assert getattr(ours, section) == getattr(shipped, section)
@@ -85,7 +85,7 @@ def test_rates_are_counts_over_the_fastest_run(staircase):
 
 def test_cube60_absorbs_what_mcx_says():
     """17.69 % (MCX's own figure); 20 000 photons know it to 0.2 %."""
-    (result,) = spadwarp.bench(["cube60"], device="cpu", photons=20_000, repeats=1)
+    (result,) = spadwarp.benchmark.run(["cube60"], device="cpu", photons=20_000, repeats=1)
     assert result.check["passed"]
     assert result.check["standard_error"] < 0.003
     # Optical depth of the mean path: 78 collisions a photon.
@@ -129,7 +129,7 @@ def test_command_writes_and_compares(kept, tmp_path):
 def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
     check = {"name": "absorbed fraction", "value": 0.2, "standard_error": 1e-3, "reference": 0.1769, "passed": False}
     cube60 = replace(staircase, case="cube60", check=check)
-    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", lambda *_, found, **__: found(cube60))
+    monkeypatch.setattr(spadwarp.benchmark, "run", lambda *_, found, **__: found(cube60))
     result = run("cube60")
     assert result.exit_code == 1
     assert "cube60: a mean is not what it should be" in result.output
@@ -140,7 +140,7 @@ def test_an_interrupted_command_keeps_what_was_measured(monkeypatch, staircase, 
         found(staircase)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", interrupted)
+    monkeypatch.setattr(spadwarp.benchmark, "run", interrupted)
     result = run("staircase_5m", "water", "--json", tmp_path / "part.json")
     assert result.exit_code == 130
     assert "staircase_5m" in result.stdout
@@ -153,21 +153,21 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
             name = f"photons_{photons}"
             found(replace(staircase, case=name, size={"photons": photons}, rates={"photons": rate}, memory=1 << 30))
 
-    monkeypatch.setattr(spadwarp.benchmark.cases, "bench", grows)
+    monkeypatch.setattr(spadwarp.benchmark, "run", grows)
     told = run("scaling").stdout
     assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in told
 
 
 def test_unknown_case_is_named():
     with pytest.raises(ConfigError, match=r"'staircase' is not one of water, .*scaling"):
-        spadwarp.bench(["staircase"])
+        spadwarp.benchmark.run(["staircase"])
     assert run("staircase").exit_code == 2
 
 
 @pytest.mark.parametrize("option", ["photons", "repeats"])
 def test_numbers_out_of_range_are_named(option):
     with pytest.raises(ConfigError, match=rf"{option} = 0 is outside \[1, "):
-        spadwarp.bench(["water"], **{option: 0})
+        spadwarp.benchmark.run(["water"], **{option: 0})
 
 
 @pytest.mark.parametrize(

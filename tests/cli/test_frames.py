@@ -82,7 +82,7 @@ def test_depth_of_measured_histograms(tmp_path):
     index, width = 1.3566, 50e-12
     arrival = 2 * 3.0 * index / 299_792_458.0
     edges = np.arange(401) * width + 20e-9
-    irf = spadwarp.instrument_response(pulse_fwhm=0.0, jitter_fwhm=300e-12)
+    irf = spadwarp.frames.instrument_response(pulse_fwhm=0.0, jitter_fwhm=300e-12)
     expected = 4000 * irf.bin_fractions(edges, arrival=arrival) + 0.5
     counts = np.random.default_rng(1).poisson(expected, (3, 4, 400)).astype(np.uint16)
     np.save(tmp_path / "counts.npy", counts)

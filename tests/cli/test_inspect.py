@@ -73,18 +73,18 @@ def test_presets_water_and_devices_are_those_of_python(tmp_path):
     summary = tmp_path / "summary.json"
     told = run("presets", "medium", "--json", summary).stdout
     names = [preset["name"] for preset in tables(summary)["presets"]]
-    assert names == list(spadwarp.presets("medium"))
+    assert names == list(spadwarp.scene.presets("medium"))
     assert all(name in told for name in names) and "picoquant" not in told
     assert "picoquant-visuv-532" in run("presets").stdout
 
     told = run("water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", summary).stdout
-    optics = spadwarp.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
+    optics = spadwarp.water.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
     assert f"{optics.extinction:.4g} 1/m" in told and f"{optics.group_index:.5f}" in told
     assert tables(summary)["absorption"] == optics.absorption
 
     assert "cpu" in run("devices", "--json", summary).stdout
-    assert tables(summary)["devices"] == spadwarp.devices()
-    assert sum(device["default"] for device in spadwarp.devices()) == 1
+    assert tables(summary)["devices"] == spadwarp.device.devices()
+    assert sum(device["default"] for device in spadwarp.device.devices()) == 1
 
 
 def test_every_help_shows_an_example():

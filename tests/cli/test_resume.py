@@ -41,7 +41,7 @@ def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
     long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=first + second, device="cpu")
     assert np.array_equal(merged.tallies, long.tallies) and merged.ledger == long.ledger
     assert tables(tmp_path / "both.json")["photon_ranges"] == [[0, first + second]]
-    assert "closes exactly" in told.stdout and (both / "depth.exr").is_file()
+    assert "energy balance is exact" in told.stdout and (both / "depth.exr").is_file()
     assert "photon ids 0 to" in run("merge", one, one, "--out", tmp_path / "twice", code=2).stderr
 
 
@@ -81,14 +81,14 @@ def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGKILL")
-def test_a_killed_run_goes_on_from_its_checkpoint(scene, tmp_path):
+def test_a_killed_run_resumes_from_its_checkpoint(scene, tmp_path):
     """Killed twice; the outcome is that of one run."""
     out, kept = tmp_path / "out", tmp_path / "out" / "checkpoint.h5"
     first = start("simulate", scene, "--out", out, *DEVICE, "--photons", "1e11", "--checkpoint", 0.1)
     before = kill_after_checkpoint(first, kept, newer_than=0)
     assert before.partial and before.ledger_report()["exact"] and before.requested == (0, 10**11)
     assert not (out / "result.h5").exists()
-    assert f"--resume {out} goes on" in run("simulate", scene, "--out", out, code=2).stderr.replace("\n", " ")
+    assert f"--resume {out} resumes it" in run("simulate", scene, "--out", out, code=2).stderr.replace("\n", " ")
     second = start("simulate", "--resume", out, *DEVICE, "--checkpoint", 0.1)
     after = kill_after_checkpoint(second, kept, newer_than=kept.stat().st_mtime_ns)
     assert after.photons > before.photons

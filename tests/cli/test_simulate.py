@@ -29,7 +29,7 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     plain = tables(summary)
     assert plain["collected_fraction"] == twin.summary()["collected_fraction"]
     assert {Path(name).name for name in plain["files"]} == FILES | PICTURES
-    assert "closes exactly" in told.stdout
+    assert "energy balance is exact" in told.stdout
     assert "20 000 of 20 000 photons" in told.stderr
 
 
@@ -77,7 +77,7 @@ def test_records_are_those_of_trace(scene, tmp_path):
     out = tmp_path / "out"
     run("simulate", scene, "--out", out, "--records", "--quiet", *DEVICE, "--photons", 1000)
     records = load_records(out / "records.h5")
-    twin = spadwarp.trace(spadwarp.load_scene(scene), photons=1000, device="cpu")
+    twin = spadwarp.transport.trace(spadwarp.load_scene(scene), photons=1000, device="cpu")
     for name in ("id", "position", "direction", "weight", "path", "collisions", "reason"):
         assert np.array_equal(getattr(records, name), getattr(twin, name)), name
     assert (records.reasons, records.ledger) == (twin.reasons, twin.ledger)
@@ -134,7 +134,7 @@ def test_a_disk_that_is_too_small_is_found_out_before_the_run(scene, tmp_path, m
         return type("usage", (), {"free": 1000})
 
     monkeypatch.setattr("shutil.disk_usage", disk_usage)
-    monkeypatch.setattr("spadwarp.transport.simulate", lambda *_, **__: pytest.fail("it ran"))
+    monkeypatch.setattr("spadwarp.transport.simulation", lambda *_, **__: pytest.fail("it ran"))
     outcome = run("simulate", scene, "--out", tmp_path / "out", code=1)
     assert "1000 bytes are free" in outcome.stderr
 

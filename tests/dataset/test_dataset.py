@@ -29,7 +29,7 @@ from spadwarp.units import SPEED_OF_LIGHT
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("dataset") / "data"
-    spadwarp.make_dataset(recipe(), place, device="cpu")
+    spadwarp.dataset.make_dataset(recipe(), place, device="cpu")
     return place
 
 
@@ -59,7 +59,7 @@ def test_every_dataset_of_a_file_has_the_same_first_dimension(folder):
 
 def test_label_noisy_and_clean_depth_agree(folder):
     deviations = []
-    for item in spadwarp.iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
+    for item in spadwarp.dataset.iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
         noisy, clean, label, bound = (item[name][0] for name in ("noisy", "clean", "label", "bound"))
         stray = label == 1
         assert np.isin(label, (0, 1)).all()
@@ -80,7 +80,7 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
     with h5py.File(folder / "scenes.h5") as file:
         profiles, edges = file["backscatter_profile"][...], file["profile_edges"][...]
     np.testing.assert_allclose((profiles * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
-    for item in spadwarp.iterate_dataset(folder, "train", fields=("noisy", "prior")):
+    for item in spadwarp.dataset.iterate_dataset(folder, "train", fields=("noisy", "prior")):
         noisy, prior = item["noisy"], item["prior"]
         assert (np.isnan(noisy) == np.isnan(prior)).all()
         bins = np.searchsorted(edges[item["scene"]], np.nan_to_num(noisy), side="right") - 1
@@ -93,7 +93,7 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
 
 def test_realised_fraction_is_the_requested_one(folder):
     values = []
-    for item in spadwarp.iterate_dataset(folder, "all", fields=("label",)):
+    for item in spadwarp.dataset.iterate_dataset(folder, "all", fields=("label",)):
         label = item["label"]
         values.append(stats.binomtest(int(label.sum()), label.size, float(item["backscatter_fraction"])).pvalue)
         assert min(abs(item["backscatter_fraction"] - one) for one in BS) < 1e-6
@@ -103,9 +103,9 @@ def test_realised_fraction_is_the_requested_one(folder):
 def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
     """Not its shard, not the number of scenes beside it, not the split of other targets changes a scene's frames."""
     other = {**TABLES, "scenes_per_shard": 2, "targets": {**TABLES["targets"], "validation": []}}
-    spadwarp.make_dataset(spadwarp.Recipe.from_dict(other), tmp_path / "other", device="cpu")
-    first = {item["sample"]: item for item in spadwarp.FrameReader(folder, "test")}
-    second = {item["sample"]: item for item in spadwarp.FrameReader(tmp_path / "other", "test")}
+    spadwarp.dataset.make_dataset(spadwarp.dataset.Recipe.from_dict(other), tmp_path / "other", device="cpu")
+    first = {item["sample"]: item for item in spadwarp.dataset.FrameReader(folder, "test")}
+    second = {item["sample"]: item for item in spadwarp.dataset.FrameReader(tmp_path / "other", "test")}
     assert first.keys() == second.keys()
     for sample, item in first.items():
         for name, value in item.items():
@@ -114,7 +114,7 @@ def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
 
 def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path):
     place, whole = tmp_path / "data", recipe(**{"frames.per_scene": 1})
-    spadwarp.make_dataset(whole, place, device="cpu")
+    spadwarp.dataset.make_dataset(whole, place, device="cpu")
     before = checksums(place)
     (place / "frames-00001.h5").unlink()
     damaged = bytearray((place / "frames-00002.h5").read_bytes())
@@ -122,22 +122,22 @@ def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path
     (place / "frames-00002.h5").write_bytes(damaged)
     (place / "shards/00003.json").write_text("{")
     (place / "scenes/scenes-00004.h5").write_bytes(b"")
-    wrong = "\n".join(spadwarp.verify_dataset(place))
+    wrong = "\n".join(spadwarp.dataset.verify_dataset(place))
     for name in ("frames-00001.h5: missing", "frames-00002.h5: damaged", "scenes-00004.h5: damaged"):
         assert name in wrong
-    report = spadwarp.make_dataset(whole, place, device="cpu")
+    report = spadwarp.dataset.make_dataset(whole, place, device="cpu")
     assert report.made == tuple(f"frames-0000{k}.h5" for k in (1, 2, 3, 4)) and len(report.kept) == 2
-    assert checksums(place) == before and not spadwarp.verify_dataset(place)
+    assert checksums(place) == before and not spadwarp.dataset.verify_dataset(place)
 
 
 def test_parts_make_one_dataset(tmp_path):
     whole = recipe(**{"frames.per_scene": 1})
-    spadwarp.make_dataset(whole, tmp_path / "one", device="cpu")
+    spadwarp.dataset.make_dataset(whole, tmp_path / "one", device="cpu")
     for part in (2, 1):
         if part == 1:
             with pytest.raises(spadwarp.FileError, match="not finished"):
-                spadwarp.FrameReader(tmp_path / "two")
-        report = spadwarp.make_dataset(whole, tmp_path / "two", device="cpu", shard=(part, 2))
+                spadwarp.dataset.FrameReader(tmp_path / "two")
+        report = spadwarp.dataset.make_dataset(whole, tmp_path / "two", device="cpu", shard=(part, 2))
         assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
     assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
 
@@ -145,12 +145,12 @@ def test_parts_make_one_dataset(tmp_path):
 def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     torch = pytest.importorskip("torch")
     images = [name for name in FIELDS if name not in ("counts", "expected")]
-    plain = spadwarp.FrameReader(folder, "train", fields=images)
-    tensors = spadwarp.SpadDataset(folder, "train", fields=images)
+    plain = spadwarp.dataset.FrameReader(folder, "train", fields=images)
+    tensors = spadwarp.dataset.SpadDataset(folder, "train", fields=images)
     assert len(plain) == len(tensors) == 6
     for name, value in plain[4].items():
         assert torch.equal(torch.nan_to_num(tensors[4][name]), torch.nan_to_num(torch.as_tensor(value)))
-    cut = spadwarp.SpadDataset(folder, "train", crop=12, augment=True, repeats=20)
+    cut = spadwarp.dataset.SpadDataset(folder, "train", crop=12, augment=True, repeats=20)
     assert len(cut) == 120
     item = cut[17]
     assert item["noisy"].shape == (1, 12, 12)
@@ -168,7 +168,7 @@ def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
 ROOT = Path(__file__).parents[2]
 MAKE = """
 import sys, spadwarp
-spadwarp.make_dataset(spadwarp.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
+spadwarp.dataset.make_dataset(spadwarp.dataset.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
 """
 
 
@@ -182,7 +182,7 @@ def start(recipe_path, out, **options):
 def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
     small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
     (tmp_path / "recipe.toml").write_text(small.to_toml())
-    spadwarp.make_dataset(small, tmp_path / "whole", device="cpu")
+    spadwarp.dataset.make_dataset(small, tmp_path / "whole", device="cpu")
     out, generator = tmp_path / "cut", np.random.default_rng(5)
     for shards in (2, 8):
         process = start(tmp_path / "recipe.toml", out)
@@ -192,7 +192,7 @@ def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.communicate()
         before = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
-    spadwarp.make_dataset(small, out, device="cpu")
+    spadwarp.dataset.make_dataset(small, out, device="cpu")
     assert checksums(out) == checksums(tmp_path / "whole")
     kept = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
     assert before and all(kept[name] == when for name, when in before.items())
@@ -204,7 +204,7 @@ def test_a_full_disk_is_told_and_loses_nothing_else(tmp_path):
     small = recipe(**{"frames.per_scene": 1})
     (tmp_path / "recipe.toml").write_text(small.to_toml())
     out = tmp_path / "data"
-    spadwarp.make_dataset(small, out, device="cpu", shard=(1, 6))
+    spadwarp.dataset.make_dataset(small, out, device="cpu", shard=(1, 6))
     before = checksums(out)
 
     def limit():
@@ -224,20 +224,20 @@ def test_folders_that_will_not_do_are_refused(folder, tmp_path):
     (tmp_path / "used/thesis.txt").write_text("")
     for place in (tmp_path / "file", tmp_path / "file/below", tmp_path / "used"):
         with pytest.raises(spadwarp.FileError, match=str(place)):
-            spadwarp.make_dataset(recipe(), place, device="cpu")
+            spadwarp.dataset.make_dataset(recipe(), place, device="cpu")
     with pytest.raises(spadwarp.ConfigError, match="another recipe"):
-        spadwarp.make_dataset(recipe(seed=12), folder, device="cpu")
+        spadwarp.dataset.make_dataset(recipe(seed=12), folder, device="cpu")
     with pytest.raises(spadwarp.FileError, match="no dataset there"):
-        spadwarp.FrameReader(tmp_path)
+        spadwarp.dataset.FrameReader(tmp_path)
     with pytest.raises(spadwarp.FileError, match="no dataset there"):
-        spadwarp.verify_dataset(tmp_path)
+        spadwarp.dataset.verify_dataset(tmp_path)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
 def test_a_read_only_folder_is_told(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(spadwarp.FileError, match="cannot be written"):
-        spadwarp.make_dataset(recipe(), tmp_path / "data", device="cpu")
+        spadwarp.dataset.make_dataset(recipe(), tmp_path / "data", device="cpu")
 
 
 def test_traced_scenes_hold_their_histograms(tmp_path):
@@ -254,10 +254,10 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
     }
     totals = {}
     for how in ("sparse", "dense"):
-        spadwarp.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
-        assert not spadwarp.verify_dataset(tmp_path / how)
+        spadwarp.dataset.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
+        assert not spadwarp.dataset.verify_dataset(tmp_path / how)
         fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
-        items = list(spadwarp.iterate_dataset(tmp_path / how, "test", fields=fields))
+        items = list(spadwarp.dataset.iterate_dataset(tmp_path / how, "test", fields=fields))
         totals[how] = [item["counts"] for item in items]
         for item in items:
             counts, expected = item["counts"], item["expected"]
@@ -282,8 +282,8 @@ def test_meshes_of_the_user_stand_with_their_centre_where_the_recipe_says(tmp_pa
     block = trimesh.creation.box(bounds=[(1.0, 2.0, 3.0), (1.2, 2.4, 3.1)])
     block.export(tmp_path / "meshes/block.stl")
     tables = {**TABLES, "targets": {"meshes": ["meshes"], "mesh_size": 2.0}, "scenes_per_target": 3}
-    (tmp_path / "recipe.toml").write_text(spadwarp.Recipe.from_dict(tables).to_toml())
-    plan = Plan(spadwarp.load_recipe(tmp_path / "recipe.toml"))
+    (tmp_path / "recipe.toml").write_text(spadwarp.dataset.Recipe.from_dict(tables).to_toml())
+    plan = Plan(spadwarp.dataset.load_recipe(tmp_path / "recipe.toml"))
     assert [one.name for one in plan.targets] == ["block"]
     for index in range(3):
         mesh = build_mesh(plan.scene(index).scene)
@@ -292,7 +292,7 @@ def test_meshes_of_the_user_stand_with_their_centre_where_the_recipe_says(tmp_pa
         assert np.ptp(mesh.bounds[:, 1]) == pytest.approx(2.0, rel=1e-5)
         assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(np.cos(turned) + 0.5 * abs(np.sin(turned)), rel=1e-5)
     filled = Plan(
-        spadwarp.load_recipe(tmp_path / "recipe.toml").with_overrides({"pose.fill": 0.5, "pose.yaw_deg": 0.0})
+        spadwarp.dataset.load_recipe(tmp_path / "recipe.toml").with_overrides({"pose.fill": 0.5, "pose.yaw_deg": 0.0})
     )
     camera = filled.scene(0).scene.camera
     height = np.ptp(build_mesh(filled.scene(0).scene).bounds[:, 1])
@@ -306,15 +306,15 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
     write_exr(tmp_path / "exports/wall_RGBD.EXR", {**dict.fromkeys("RGB", np.zeros_like(depth)), "A": depth})
     write_exr(tmp_path / "exports/wall_Base_Col.EXR", dict.fromkeys("RGB", np.full_like(depth, 0.25)))
     tables = {**TABLES, "targets": {"exports": ["exports"]}}
-    (tmp_path / "recipe.toml").write_text(spadwarp.Recipe.from_dict(tables).to_toml())
-    spadwarp.make_dataset(tmp_path / "recipe.toml", tmp_path / "data", device="cpu")
-    for item in spadwarp.iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
+    (tmp_path / "recipe.toml").write_text(spadwarp.dataset.Recipe.from_dict(tables).to_toml())
+    spadwarp.dataset.make_dataset(tmp_path / "recipe.toml", tmp_path / "data", device="cpu")
+    for item in spadwarp.dataset.iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
         clean, there = item["clean"][0], depth < 60000
         assert (np.isfinite(clean) == there).all() and item["distance"] == 15.0
         assert np.abs(clean[there] - 15.0).max() < 1e-4 and (item["albedo"][0][there] == 0.25).all()
         right = there & (item["label"][0] == 0)
         assert np.abs(item["noisy"][0][right] - 15.0).max() < 0.05
-    traced = spadwarp.load_recipe(tmp_path / "recipe.toml").with_overrides({"monte_carlo.share": 0.5})
+    traced = spadwarp.dataset.load_recipe(tmp_path / "recipe.toml").with_overrides({"monte_carlo.share": 0.5})
     with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.share"):
         Plan(traced)
 
@@ -327,22 +327,22 @@ def test_recipes_that_cannot_be_are_told_field_by_field():
         "exposure": {"pulses": 5.0, "signal_photons": 5.0},
     }
     with pytest.raises(spadwarp.ConfigError) as caught:
-        spadwarp.Recipe.from_dict({**TABLES, **wrong})
+        spadwarp.dataset.Recipe.from_dict({**TABLES, **wrong})
     text = str(caught.value)
     for words in ("pose.distance", "(0.0, inf)", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
         assert words in text
     with pytest.raises(spadwarp.ConfigError, match=r"scene: camera\.pixels"):
-        spadwarp.Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
+        spadwarp.dataset.Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
     for names in ({"test": ["boat"]}, {"test": ["car"], "validation": ["car"]}, {"builtin": ["boat"]}):
         with pytest.raises(spadwarp.ConfigError, match=r"targets\."):
-            Plan(spadwarp.Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
+            Plan(spadwarp.dataset.Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs/datasets").glob("*.toml")), ids=lambda path: path.stem)
 def test_recipes_that_come_with_spadwarp(path):
-    given = spadwarp.load_recipe(path)
+    given = spadwarp.dataset.load_recipe(path)
     plan = Plan(given)
-    assert spadwarp.Recipe.from_dict(tomllib.loads(given.to_toml())) == given
+    assert spadwarp.dataset.Recipe.from_dict(tomllib.loads(given.to_toml())) == given
     splits = {split: {one.name for one in plan.targets if one.split == split} for split in SPLITS}
     assert all(splits.values()) and "staircase" in splits["test"]
     if path.stem in ("lu2024", "montecarlo"):
@@ -400,7 +400,7 @@ def test_older_words_in_a_recipe_mean_and_draw_the_same():
     pulses = {"low": 1000.0, "high": 9000.0}
     older, now = (
         Plan(
-            spadwarp.Recipe.from_dict(
+            spadwarp.dataset.Recipe.from_dict(
                 {**TABLES, "exposure": {f"pulses{more}": pulses}, "vary": {path: [True, False], "analytic.form": forms}}
             )
         )

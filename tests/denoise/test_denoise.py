@@ -202,7 +202,7 @@ def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "set"
     fractions, camera = [0.042, 0.48], {"preset": "lu2024", "width": 64, "height": 48}
     changes = {"frames.per_scene": 6, "frames.backscatter_fraction": fractions, "scene.camera": camera}
-    spadwarp.make_dataset(recipe(scenes_per_target=1, **{"pose.yaw_deg": 0.0}, **changes), folder, device="cpu")
+    spadwarp.dataset.make_dataset(recipe(scenes_per_target=1, **{"pose.yaw_deg": 0.0}, **changes), folder, device="cpu")
     return folder
 
 
@@ -378,8 +378,8 @@ def test_a_sweep_over_photons(wall, tmp_path):
 
 @pytest.mark.parametrize("test_recipe", ["lu2024", "small"])
 def test_training_and_test_share_no_target_and_no_seed(test_recipe):
-    trained = Plan(spadwarp.load_recipe("configs/datasets/training.toml"))
-    tested = Plan(spadwarp.load_recipe(f"configs/datasets/{test_recipe}.toml"))
+    trained = Plan(spadwarp.dataset.load_recipe("configs/datasets/training.toml"))
+    tested = Plan(spadwarp.dataset.load_recipe(f"configs/datasets/{test_recipe}.toml"))
     seen = {target.name for target in trained.targets if target.split in ("train", "validation")}
     unseen = {target.name for target in tested.targets if target.split == "test"}
     assert "staircase" in unseen and seen.isdisjoint(unseen)

@@ -67,7 +67,7 @@ def test_background_is_that_of_all_frames_together(tmp_path):
     counts[..., 120:123] += np.array([2, 4, 2])
     np.save(tmp_path / "a.npy", counts)
     histograms = read_histograms(tmp_path / "a.npy")
-    irf = spadwarp.InstrumentResponse(sigma=80e-12)
+    irf = spadwarp.frames.InstrumentResponse(sigma=80e-12)
     known = type(histograms)(values=counts, bin_width=1e-10, irf=irf, response=irf)
     reduced = depth_of(known, method="likelihood", group_index=1.0, device="cpu")
     assert reduced.values.shape == (60, 2, 2) and reduced.quantity == "range"

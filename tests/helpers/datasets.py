@@ -26,7 +26,8 @@ TABLES = {
 
 
 def recipe(**changes):
-    return spadwarp.Recipe.from_dict(TABLES).with_overrides(changes) if changes else spadwarp.Recipe.from_dict(TABLES)
+    tested = spadwarp.dataset.Recipe.from_dict(TABLES)
+    return tested.with_overrides(changes) if changes else tested
 
 
 def checksums(place):

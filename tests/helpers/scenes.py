@@ -3,6 +3,7 @@
 from spadwarp.scene import Scene
 
 WATER = {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.8, "group_index": 1.0}
+PLATE = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
 
 def scene(**sections):
@@ -12,7 +13,7 @@ def scene(**sections):
         "laser": {"half_angle_deg": 20.0, "position": [-0.1, 0.0, 0.0]},
         "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 50.0, "aperture_diameter": 0.4},
         "gate": {"start_ns": 0.0, "bin_width_ps": 3335.64095, "bins": 8},  # 1 m of path a bin
-        "targets": [{"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}],
+        "targets": [PLATE],
         "transport": {"photons": 100_000, "seed": 1, "max_collisions": 12, "axis_threshold": 1.0},
     }
     for name, fields in sections.items():

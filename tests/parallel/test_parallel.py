@@ -170,8 +170,8 @@ def test_what_ray_cannot_do_is_said(cluster):
 @pytest.mark.slow
 def test_a_dataset_whose_workers_are_killed_has_the_files_of_a_local_one(cluster, tmp_path):
     small, killer = recipe(**{"frames.per_scene": 1, "scenes_per_target": 3}), Killer(2, seed=3)
-    spadwarp.make_dataset(small, tmp_path / "here", device="cpu")
-    spadwarp.make_dataset(
+    spadwarp.dataset.make_dataset(small, tmp_path / "here", device="cpu")
+    spadwarp.dataset.make_dataset(
         small,
         tmp_path / "ray",
         engine=Ray(workers=2),
@@ -179,4 +179,4 @@ def test_a_dataset_whose_workers_are_killed_has_the_files_of_a_local_one(cluster
     )
     assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == 2
     assert checksums(tmp_path / "ray") == checksums(tmp_path / "here")
-    assert not spadwarp.verify_dataset(tmp_path / "ray")
+    assert not spadwarp.dataset.verify_dataset(tmp_path / "ray")

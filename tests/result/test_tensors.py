@@ -48,7 +48,7 @@ def test_tallies_of_the_caller(scene, result, kind, options):
 
 
 def test_results_share_their_memory(result):
-    view = spadwarp.to_torch(result)
+    view = spadwarp.result.to_torch(result)
     assert view.tallies.data_ptr() == result.tallies.ctypes.data
     assert view.truth.depth.data_ptr() == result.truth.depth.ctypes.data
     assert np.array_equal(view.histogram.numpy(), result.histogram)
@@ -59,9 +59,9 @@ def test_results_share_their_memory(result):
         view.component("fog")
 
     flat = torch.from_numpy(result.tallies).flatten()
-    assert spadwarp.to_torch(result, tallies=flat).tallies.shape == SHAPE
+    assert spadwarp.result.to_torch(result, tallies=flat).tallies.shape == SHAPE
     with pytest.raises(ValueError, match=r"torch\.int32 \(384,\); torch\.int64 \(3, 4, 4, 8\) is needed"):
-        spadwarp.to_torch(result, tallies=flat.int())
+        spadwarp.result.to_torch(result, tallies=flat.int())
 
 
 MODES = {
@@ -79,7 +79,7 @@ def test_frames_are_the_same_in_torch(result, mode):
     fields = {name: options.pop(name) for name in ("mode", "dead_time_ns") if name in options}
     detector = result.scene.with_overrides(detector=fields).detector
     expected = spadwarp.detect(result, detector=detector, summed=summed, **options)
-    frames = spadwarp.detect(spadwarp.to_torch(result), detector=detector, summed=summed, **options)
+    frames = spadwarp.detect(spadwarp.result.to_torch(result), detector=detector, summed=summed, **options)
     for name in ("counts", "expected", "background", "intensity"):
         one, other = getattr(frames, name), getattr(expected, name)
         assert isinstance(one, torch.Tensor) and one.numpy().dtype == other.dtype, name
@@ -101,7 +101,7 @@ def test_frames_are_the_same_in_torch(result, mode):
 
 def test_frames_share_their_memory(result):
     frames = spadwarp.detect(result, seed=5, device="cpu")
-    view = spadwarp.to_torch(frames)
+    view = spadwarp.result.to_torch(frames)
     for name in ("counts", "expected", "background"):
         assert np.shares_memory(getattr(view, name).numpy(), getattr(frames, name))
     assert dataclasses.replace(view, counts=frames.counts).seed == frames.seed
@@ -113,9 +113,9 @@ def test_laws_are_the_same_in_torch():
     assert isinstance(law, torch.Tensor)
     assert np.array_equal(law.numpy(), first_photon_probabilities(hazard, device="cpu"))
     counts = np.random.default_rng(2).poisson(3.0, (2, 3, 8))
-    corrected = spadwarp.coates(torch.from_numpy(counts), pulses=1000)
+    corrected = spadwarp.frames.coates(torch.from_numpy(counts), pulses=1000)
     assert isinstance(corrected, torch.Tensor)
-    assert np.array_equal(corrected.numpy(), spadwarp.coates(counts, pulses=1000, device="cpu"))
+    assert np.array_equal(corrected.numpy(), spadwarp.frames.coates(counts, pulses=1000, device="cpu"))
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_npy(origin, frames, detection, tmp_path):
 
 def test_tensors_are_exported_too(detection, tmp_path):
     pytest.importorskip("torch")
-    spadwarp.export(spadwarp.to_torch(detection), tmp_path / "a.npy")
+    spadwarp.export(spadwarp.result.to_torch(detection), tmp_path / "a.npy")
     assert np.array_equal(np.load(tmp_path / "a.npy"), detection.counts)
 
 
@@ -230,12 +230,12 @@ RECIPE = {
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     place = tmp_path_factory.mktemp("dataset") / "traced"
-    spadwarp.make_dataset(spadwarp.Recipe.from_dict(RECIPE), place, device="cpu")
+    spadwarp.dataset.make_dataset(spadwarp.dataset.Recipe.from_dict(RECIPE), place, device="cpu")
     return place
 
 
 def test_datasets_with_histograms(dataset, tmp_path):
-    items = list(spadwarp.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
+    items = list(spadwarp.dataset.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
     written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
     assert len(written) == len(items) == 4
     for path, item in zip(written, items, strict=True):
@@ -260,7 +260,7 @@ def test_datasets_with_histograms(dataset, tmp_path):
 
 def test_datasets_of_depth(dataset, tmp_path):
     """Images of a frame with those of its scene; a split of its own."""
-    items = list(spadwarp.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
+    items = list(spadwarp.dataset.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
     written = spadwarp.export(dataset, tmp_path / "a.exr", split="test")
     assert len(written) == len(items)
     for path, item in zip(written, items, strict=True):

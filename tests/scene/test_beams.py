@@ -13,7 +13,7 @@ from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport.tally_scale import PHOTON_CAPACITY, tally_scale
+from spadwarp.transport.tally_unit import PHOTON_CAPACITY, tally_scale
 from spadwarp_kernels import profile_tables
 
 PROFILE = np.random.default_rng(1).gamma(0.7, size=(12, 20))
@@ -32,7 +32,7 @@ def test_photons_leave_as_the_profile_was_measured(direction, device, tmp_path):
     np.save(tmp_path / "beam.npy", PROFILE)
     one = scene(**CLEAR, laser=measured(tmp_path / "beam.npy", direction=list(direction)))
     photons = 400_000
-    u = spadwarp.trace(one, photons=photons, seed=3, device=device).direction.astype(np.float64)
+    u = spadwarp.transport.trace(one, photons=photons, seed=3, device=device).direction.astype(np.float64)
     axis = np.array(direction) / np.linalg.norm(direction)
     right = np.array([axis[2], 0.0, -axis[0]]) if abs(axis[1]) < 1 else np.array([1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
@@ -140,7 +140,7 @@ def fields(one, level="warning"):
 def test_checks_know_pose_and_frames():
     aside = {"position": [3.0, 0.0, 0.0]}
     assert "in the camera frame" in fields(scene(camera=aside))["targets[0]"]
-    looking = scene(camera=spadwarp.look_at((3.0, 0.0, 0.0), (0.0, 0.0, 2.2)), gate={"bins": 20})
+    looking = scene(camera=spadwarp.scene.look_at((3.0, 0.0, 0.0), (0.0, 0.0, 2.2)), gate={"bins": 20})
     assert "targets[0]" not in fields(looking)
     # A laser that stays behind lights what the camera has turned to, or does not.
     stays = looking.with_overrides(laser={"frame": "world"})

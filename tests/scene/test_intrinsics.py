@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.opencv import project_points
-from spadwarp import load_scene, look_at, opencv_pose
+from spadwarp import load_scene
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import Camera
+from spadwarp.scene import Camera, look_at, opencv_pose
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.intrinsics import image_points, image_tangents, pixel_views, view_box
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_camera, to_world

@@ -25,11 +25,11 @@ def problems(**fields):
 
 
 def test_each_phase_function_is_the_one_of_its_fields():
-    hg = spadwarp.phase_function(Medium(**WATER, anisotropy=0.7))
-    two = spadwarp.phase_function(
+    hg = spadwarp.scene.phase_function(Medium(**WATER, anisotropy=0.7))
+    two = spadwarp.scene.phase_function(
         Medium(**WATER, phase_function="two_term_henyey_greenstein", g1=0.9, g2=-0.2, alpha=0.75)
     )
-    ff = spadwarp.phase_function(Medium(**WATER, phase_function="fournier_forand"))
+    ff = spadwarp.scene.phase_function(Medium(**WATER, phase_function="fournier_forand"))
     angle = np.radians([5.0, 90.0, 180.0])
     np.testing.assert_allclose(hg.density(angle), henyey_greenstein(np.cos(angle), 0.7), rtol=1e-12)
     mixture = 0.75 * henyey_greenstein(np.cos(angle), 0.9) + 0.25 * henyey_greenstein(np.cos(angle), -0.2)
@@ -41,7 +41,7 @@ def test_each_phase_function_is_the_one_of_its_fields():
 
 def test_petzolds_average_particle_has_its_published_moments():
     """Backscatter fraction 0.0183, mean cosine 0.924 (Mobley et al. 1993), values as published but for their sum."""
-    law = spadwarp.phase_function(PETZOLD)
+    law = spadwarp.scene.phase_function(PETZOLD)
     assert law.backscatter_fraction == pytest.approx(0.0183, abs=1e-4)
     assert law.mean_cosine == pytest.approx(0.924, abs=5e-4)
     # Mobley integrates from point to point by other means: one per cent.
@@ -54,7 +54,7 @@ def test_petzolds_average_particle_has_its_published_moments():
 
 
 def test_parts_below_an_angle():
-    ff = spadwarp.phase_function(Medium(**WATER, phase_function="fournier_forand"))
+    ff = spadwarp.scene.phase_function(Medium(**WATER, phase_function="fournier_forand"))
     expected = fournier_forand.cumulative(2 * np.sin(np.radians([0.1, 60.0]) / 2) ** 2, 1.10, 3.5835)
     assert [ff.fraction_below(math.radians(angle)) for angle in (0.1, 60.0)] == pytest.approx(expected, rel=1e-9)
     assert ff.fraction_below(math.pi) == pytest.approx(1.0, rel=1e-9)
@@ -89,8 +89,8 @@ def test_a_check_warns_of_a_peak_narrower_than_the_near_axis_rule():
 @pytest.mark.parametrize("name", PHASE_TABLES)
 def test_shipped_tables_are_sourced_and_offered(name):
     assert len(PHASE_TABLES[name][1]) > 30
-    assert any(preset.values.get("phase_table") == name for preset in spadwarp.presets("medium").values())
-    assert spadwarp.phase_function(Medium(**WATER, phase_function="tabulated", phase_table=name)).mean_cosine > 0
+    assert any(preset.values.get("phase_table") == name for preset in spadwarp.scene.presets("medium").values())
+    assert spadwarp.scene.phase_function(Medium(**WATER, phase_function="tabulated", phase_table=name)).mean_cosine > 0
 
 
 def test_a_table_may_have_comments_and_a_line_of_names(tmp_path):
@@ -117,14 +117,14 @@ def test_a_bad_table_is_named(text, error, tmp_path):
     path.write_text(text)
     medium = Medium(**WATER, phase_function="tabulated", phase_table=str(path))
     with pytest.raises(ConfigError, match=error) as caught:
-        spadwarp.phase_function(medium)
+        spadwarp.scene.phase_function(medium)
     assert str(path) in str(caught.value)
 
 
 def test_a_missing_table_is_named(tmp_path):
     medium = Medium(**WATER, phase_function="tabulated", phase_table=str(tmp_path / "none.csv"))
     with pytest.raises(FileError, match=r"none\.csv: cannot be read: No such file"):
-        spadwarp.phase_function(medium)
+        spadwarp.scene.phase_function(medium)
 
 
 def test_fields_belong_to_their_phase_function():

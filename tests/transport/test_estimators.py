@@ -8,7 +8,8 @@ import pytest
 
 import spadwarp
 import spadwarp_kernels as sk
-from helpers.scenes import scene
+from helpers.estimators import agreeing_cells, cells
+from helpers.scenes import PLATE, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
@@ -16,63 +17,29 @@ from spadwarp.transport.model import build_model, transport_spec
 
 pytestmark = pytest.mark.physics
 
-SEEDS = 32
-
-
-def _cells(estimator, device, photons, **sections):
-    """Tallies summed over pixels: [seeds, component x bin], as fractions of emitted photons."""
-    sections.setdefault("transport", {})["estimator"] = estimator
-    one = scene(**sections)
-    rows = []
-    for seed in range(SEEDS):
-        result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
-        assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-        rows.append(result.tallies.sum(axis=(1, 2)).ravel() * result.unit / photons)
-    return np.array(rows)
+TABLE = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
 def test_estimators_agree_in_every_component(axis_threshold, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
-    cells = {
-        estimator: _cells(estimator, device, photons, transport={"axis_threshold": axis_threshold})
-        for estimator, photons in {"analog": 60_000, "next_event": 30_000, "guided": 30_000}.items()
-    }
-    assert equal_means_p(cells["analog"], cells["next_event"]) > 1e-3
-    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
-    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
-    # The comparison has teeth: every component is seen, the guided estimate of the total to 1 %.
-    total = cells["guided"].sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
-    assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
+    cells = agreeing_cells(scene(transport={"axis_threshold": axis_threshold}), device)
+    assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.slow
 def test_estimators_agree_with_a_tabulated_phase_function(device):
     """Two terms, one of them backward, under a raised near-axis threshold."""
-    water = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
-    cells = {
-        estimator: _cells(estimator, device, photons, medium=water, transport={"axis_threshold": 0.97})
-        for estimator, photons in {"analog": 40_000, "next_event": 20_000, "guided": 20_000}.items()
-    }
-    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
-    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
-    total = cells["guided"].sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+    photons = {"analog": 40_000, "next_event": 20_000, "guided": 20_000}
+    agreeing_cells(scene(medium=TABLE, transport={"axis_threshold": 0.97}), device, photons=photons)
 
 
 @pytest.mark.slow
 def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
     """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
-    water = {"phase_function": "fournier_forand"}
-    analog, guided = (
-        _cells(estimator, device, photons, medium=water)
-        for estimator, photons in (("analog", 60_000), ("guided", 15_000))
-    )
-    assert equal_means_p(analog, guided) > 1e-3
-    total = guided.sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
+    photons = {"analog": 60_000, "guided": 15_000}
+    agreeing_cells(scene(medium={"phase_function": "fournier_forand"}), device, photons=photons)
 
 
 @pytest.mark.slow
@@ -82,7 +49,8 @@ def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
     value = sk.henyey_greenstein_density(2.0 * np.sin(np.radians(angle) / 2) ** 2, 0.8)
     np.savetxt(tmp_path / "hg.csv", np.column_stack([angle, value]), delimiter=",", header="angle_deg,value")
     table = {"phase_function": "tabulated", "phase_table": str(tmp_path / "hg.csv")}
-    one, other = (_cells("guided", device, 20_000, medium=water) for water in ({}, table))
+    guided = {"estimator": "guided"}
+    one, other = (cells(scene(medium=water, transport=guided), device, 20_000) for water in ({}, table))
     assert equal_means_p(one, other) > 1e-3
     assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
 
@@ -118,29 +86,21 @@ def test_reflectance_scales_the_ballistic_return(device):
     """Half the reflectance, half the light: one surface each, the same photons, so equal to the rounding of the
     tally."""
     bright, dark = (
-        spadwarp.simulate(
-            scene(targets=[{"builtin": "plane", "size": [3.0, 3.0], "translation": [0, 0, 2.2], "reflectance": rho}]),
-            photons=50_000,
-            seed=2,
-            device=device,
-        )
-        .component("ballistic")
-        .sum()
+        spadwarp.simulate(scene(targets=[{**PLATE, "reflectance": rho}]), photons=50_000, seed=2, device=device)
         for rho in (0.8, 0.4)
     )
-    assert bright == pytest.approx(2 * dark, rel=1e-5)
+    assert bright.component("ballistic").sum() == pytest.approx(2 * dark.component("ballistic").sum(), rel=1e-5)
 
 
 def test_a_blocker_casts_a_shadow(device):
     """A black screen between plate and lens removes the plate's light from the pixels that it covers, and only
     there."""
-    plate = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
     screen = {"builtin": "plane", "size": [2.0, 2.0], "translation": [1.0, 0.0, 1.0], "reflectance": 0.0}
     sections = {"medium": {"albedo": 0.0}, "camera": {"aperture_diameter": 0.02}}
-    open_view = spadwarp.simulate(scene(**sections), photons=200_000, seed=6, device=device).intensity
-    shaded = spadwarp.simulate(
-        scene(**sections, targets=[plate, screen]), photons=200_000, seed=6, device=device
-    ).intensity
+    open_view, shaded = (
+        spadwarp.simulate(scene(**sections, targets=targets), photons=200_000, seed=6, device=device).intensity
+        for targets in ([PLATE], [PLATE, screen])
+    )
     # The lens is 2 cm wide: half a pixel's percent of penumbra at the screen's edge.
     assert (shaded[:, 2:] <= 0.02 * open_view[:, 2:]).all()
     np.testing.assert_allclose(shaded[:, 0], open_view[:, 0], rtol=0.05)
@@ -160,9 +120,8 @@ def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
     tallies, rays = [], []
     for surfaces in (model.surfaces, sk.make_surfaces(model.mesh, model.surfaces.reflectance)):
         data = sk.make_data(model)
-        sk.launch_transport(
-            spec, dataclasses.replace(model, surfaces=surfaces), data, seed=3, first_id=0, photon_count=100_000
-        )
+        changed = dataclasses.replace(model, surfaces=surfaces)
+        sk.launch_transport(spec, changed, data, seed=3, first_id=0, photon_count=100_000)
         tallies.append(data.tally.numpy())
         rays.append(sk.read_ledger(data)[1]["shadow_queries"])
     np.testing.assert_array_equal(*tallies)

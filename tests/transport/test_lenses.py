@@ -6,23 +6,16 @@ import numpy as np
 import pytest
 
 import spadwarp
+from helpers.estimators import agreeing_cells
 from helpers.opencv import project_points
-from helpers.scenes import scene
-from helpers.statistics_of_samples import equal_means_p
+from helpers.scenes import PLATE, scene
 from spadwarp.errors import ConfigError
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_world
 
 pytestmark = pytest.mark.physics
 
-SEEDS = 32
-BENT = {
-    "horizontal_fov_deg": None,
-    "fx": 4.3,
-    "fy": 4.6,
-    "cx": 1.2,
-    "cy": 1.9,
-    "distortion": [-0.15, 0.02, 0.01, -0.02, 0],
-}
+BENT = {"horizontal_fov_deg": None, "fx": 4.3, "fy": 4.6, "cx": 1.2, "cy": 1.9}
+BENT["distortion"] = [-0.15, 0.02, 0.01, -0.02, 0]
 CAMERAS = {
     "thin lens": {"camera": {"focus_distance": 1.2}},
     "calibrated, posed, laser in the world": {
@@ -32,36 +25,15 @@ CAMERAS = {
 }
 
 
-def _cells(estimator, device, photons, **sections):
-    """Fractions of emitted photons [seeds, cells]: each component's bins over all pixels, and each pixel over all
-    bins."""
-    one = scene(**sections).with_overrides({"transport.estimator": estimator})
-    rows = []
-    for seed in range(SEEDS):
-        result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
-        assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-        both = [result.tallies.sum(axis=(1, 2)).ravel(), result.tallies.sum(axis=(0, 3)).ravel()]
-        rows.append(np.concatenate(both) * (result.unit / photons))
-    return np.array(rows)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
-    cells = {
-        estimator: _cells(estimator, device, photons, **CAMERAS[camera])
-        for estimator, photons in {"analog": 60_000, "next_event": 30_000, "guided": 30_000}.items()
-    }
     # What next_event has not yet seen often has no normal mean: it is left out.
-    assert equal_means_p(cells["analog"], cells["next_event"], converged=0.1) > 1e-3
-    assert equal_means_p(cells["guided"], cells["next_event"], converged=0.1) > 1e-3
-    assert equal_means_p(cells["analog"], cells["guided"], converged=0.1) > 1e-3
-    # The comparison has teeth: every component and pixel is seen, the guided estimate of the total to 1 %.
+    cells = agreeing_cells(scene(**CAMERAS[camera]), device, pixels=True, converged=0.1)
+    # Every component and pixel is seen.
     pixels = cells["guided"][:, -16:]
-    assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(SEEDS) < 0.1).all()
-    total = pixels.sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
-    assert (cells["guided"][:, :24].reshape(SEEDS, 3, 8).sum(axis=(0, 2)) > 0).all()
+    assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(32) < 0.1).all()
+    assert (cells["guided"][:, :24].reshape(32, 3, 8).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
@@ -82,17 +54,11 @@ def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
 def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
     """Radius a·|1/z − 1/focus| as a tangent: for a small spot at z its image is even, and ends there."""
     z, radius, pixel = 1.0, 0.05, 2e-3
+    camera = {"width": 64, "height": 64, "horizontal_fov_deg": None, "fx": 1 / pixel}
     one = scene(
         medium={"albedo": 0.0},
         laser={"half_angle_deg": 0.2, "position": [0.0, 0.0, 0.0]},
-        camera={
-            "width": 64,
-            "height": 64,
-            "horizontal_fov_deg": None,
-            "fx": 1 / pixel,
-            "aperture_diameter": 2 * radius,
-            "focus_distance": focus,
-        },
+        camera={**camera, "aperture_diameter": 2 * radius, "focus_distance": focus},
         targets=[{"builtin": "plane", "size": 4e-3, "translation": [0.0, 0.0, z], "reflectance": 1.0}],
     )
     image = spadwarp.simulate(one, photons=200_000, seed=4, device=device).intensity
@@ -111,22 +77,13 @@ def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
 def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
     rvec, tvec, coefficients = (0.2, -0.3, 0.4), (0.1, -0.05, 1.0), (-0.25, 0.05, 0.01, -0.008, 0.0)
     spots = np.array([[0.55, 0.35, 2.0], [-0.5, 0.4, 1.5]])  # as the camera sees them
-    world = to_world(scene(camera=spadwarp.opencv_pose(rvec, tvec)).camera, spots)
+    world = to_world(scene(camera=spadwarp.scene.opencv_pose(rvec, tvec)).camera, spots)
+    camera = {"width": 64, "height": 48, "horizontal_fov_deg": None, "aperture_diameter": 1e-3}
+    camera |= {"fx": 70.0, "fy": 66.0, "cx": 30.3, "cy": 22.2, "distortion": coefficients}
     for seen, place in zip(spots, world, strict=True):
         one = scene(
             medium={"albedo": 0.0},
-            camera={
-                **BENT,
-                "width": 64,
-                "height": 48,
-                "fx": 70.0,
-                "fy": 66.0,
-                "cx": 30.3,
-                "cy": 22.2,
-                "distortion": coefficients,
-                **spadwarp.opencv_pose(rvec, tvec),
-                "aperture_diameter": 1e-3,
-            },
+            camera={**camera, **spadwarp.scene.opencv_pose(rvec, tvec)},
             laser={"half_angle_deg": 3.0, "position": [0.0, 0.0, 0.0], "direction": seen.tolist()},
             targets=[{"builtin": "sphere", "size": 0.12, "translation": place.tolist()}],
         )
@@ -144,21 +101,11 @@ def test_moving_everything_together_changes_nothing(device):
     """Camera, laser and target under one rigid motion: the same histories to float32, so the same histogram."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
     here = spadwarp.simulate(scene(), photons=100_000, seed=3, device=device)
-    target = {
-        "builtin": "plane",
-        "size": [3.0, 3.0],
-        "translation": (turn @ [0, 0, 2.2] + shift).tolist(),
-        "rotation_deg": [25.0, -40.0, 70.0],
-        "reflectance": 0.7,
-    }
+    target = {**PLATE, "translation": (turn @ [0, 0, 2.2] + shift).tolist(), "rotation_deg": [25.0, -40.0, 70.0]}
     camera = {"position": shift.tolist(), "rotation_deg": rotation_angles(turn)}
-    riding = scene(camera=camera, targets=[target])
-    standing = scene(
-        camera=camera,
-        targets=[target],
-        laser={"position": (turn @ [-0.1, 0, 0] + shift).tolist(), "direction": turn[:, 2].tolist(), "frame": "world"},
-    )
-    for moved in (riding, standing):
+    standing = {"position": (turn @ [-0.1, 0, 0] + shift).tolist(), "direction": turn[:, 2].tolist(), "frame": "world"}
+    for laser in ({}, standing):  # it rides on the camera, or stands in the world
+        moved = scene(camera=camera, targets=[target], laser=laser)
         there = spadwarp.simulate(moved, photons=100_000, seed=3, device=device)
         np.testing.assert_allclose(there.truth.range, here.truth.range, rtol=1e-5)
         np.testing.assert_allclose(there.truth.normal, here.truth.normal, atol=1e-5)
@@ -177,7 +124,7 @@ def test_the_domain_stands_in_the_world(device):
         targets=[],
         transport={"weight_cutoff": 0.0, "max_collisions": 1000},
     )
-    records = spadwarp.trace(one, photons=20_000, seed=1, device=device)
+    records = spadwarp.transport.trace(one, photons=20_000, seed=1, device=device)
     for index, axis in enumerate("xyz"):
         for side, corner in (("low", box["lower"]), ("high", box["upper"])):
             ended = records.ended(f"exit_{axis}_{side}")
@@ -201,18 +148,15 @@ def test_layers_of_water_stand_in_the_world(device):
     layers = [{"start": 0.7, "extinction": 3.0, "albedo": 0.5}, {"start": 1.5, "extinction": 0.2, "albedo": 0.9}]
     here = scene(medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]}, targets=[])
     start = float(turn @ [0.6, 0.0, 0.8] @ shift)
+    moved = [{**layer, "start": layer["start"] + start} for layer in layers]
     there = scene(
-        medium={
-            "layers": [{**layer, "start": layer["start"] + start} for layer in layers],
-            "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist(),
-        },
+        medium={"layers": moved, "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist()},
         camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn)},
         targets=[],
     )
-    assert there.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) == pytest.approx(
-        here.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0))
-    )
-    first, second = (spadwarp.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
+    along, same = (one.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) for one in (there, here))
+    assert along == pytest.approx(same)
+    first, second = (spadwarp.transport.trace(one, photons=20_000, seed=1, device=device) for one in (here, there))
     apart = np.linalg.norm(second.position - (first.position @ turn.T + shift), axis=1)
     # A rounding may tip one history over an edge of something; most end where they must to float32.
     assert np.quantile(apart, 0.98) < 1e-3

@@ -80,7 +80,7 @@ def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
 def test_devices_that_do_not_go_together_are_refused():
     with pytest.raises(spadwarp.DeviceError, match="not one of cpu"):
         spadwarp.simulate(scene(), photons=10, device="cpu,cuda:99")
-    if not any(one["name"] == "cuda:0" for one in spadwarp.devices()):
+    if not any(one["name"] == "cuda:0" for one in spadwarp.device.devices()):
         with pytest.raises(spadwarp.DeviceError, match="cuda:0"):
             spadwarp.simulate(scene(), photons=10, device="cuda:all")
 

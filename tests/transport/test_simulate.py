@@ -47,16 +47,13 @@ def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, devic
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_the_ledger_closes_exactly(estimator, **values):
     """Emitted weight = the sum of all entries, in integers, for random waters, limits and targets in a box of water."""
-    transport = {name: values[name] for name in ("weight_cutoff", "max_collisions", "max_path", "lateral_limit")}
+    limits = ("weight_cutoff", "max_collisions", "max_path", "lateral_limit")
+    transport = {"estimator": estimator, **{name: values[name] for name in limits}}
     one = scene(
         medium={name: values[name] for name in ("extinction", "albedo", "anisotropy")},
         domain={"shape": "box", "lower": [-3.0, -2.0, -1.0], "upper": [3.0, 2.0, 4.0]},
         targets=[{"builtin": "box", "size": [0.9], "translation": [0.2, 0, 1.5], "reflectance": values["reflectance"]}],
-        transport={
-            **transport,
-            "estimator": estimator,
-            "termination": "roulette" if values["roulette"] else "cutoff",
-        },
+        transport=transport | {"termination": "roulette" if values["roulette"] else "cutoff"},
     )
     result = spadwarp.simulate(one, photons=2000, seed=values["seed"], device="cpu")
     report = result.ledger_report()
@@ -85,12 +82,8 @@ def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
         "cutoff": {"weight_cutoff": 0.85},
     }.items():
         one = scene(transport={"estimator": "guided", "max_collisions": 40, **transport})
-        values[name] = np.array(
-            [
-                spadwarp.simulate(one, photons=20_000, seed=seed, device=device).component("backscatter").sum()
-                for seed in range(32)
-            ]
-        )
+        runs = (spadwarp.simulate(one, photons=20_000, seed=seed, device=device) for seed in range(32))
+        values[name] = np.array([run.component("backscatter").sum() for run in runs])
     error = {name: v.std(ddof=1) / np.sqrt(32) for name, v in values.items()}
     mean = {name: v.mean() for name, v in values.items()}
     assert abs(mean["roulette"] - mean["exact"]) < 4 * np.hypot(error["roulette"], error["exact"])
@@ -118,7 +111,7 @@ def test_every_light_path_ends_for_a_reason_and_records_agree_with_the_ledger(de
         laser={"position": [0, 0, 0]},
         transport={"max_path": 6.0, "lateral_limit": 2.5, "max_collisions": 5},
     )
-    records = spadwarp.trace(one, photons=50_000, seed=4, device=device)
+    records = spadwarp.transport.trace(one, photons=50_000, seed=4, device=device)
     assert sum(records.ledger.values()) == round(50_000 / records.ledger_unit)
     for name in ("exit_z_low", "exit_z_high", "max_path", "max_collisions", "lateral_limit"):
         ended = records.ended(name)
@@ -136,12 +129,10 @@ def test_every_light_path_ends_for_a_reason_and_records_agree_with_the_ledger(de
 
 def test_what_falls_outside_the_gate_is_counted():
     """The same light in a wide and in a narrow gate: inside + before + after is conserved."""
-    wide = spadwarp.simulate(scene(transport={"estimator": "next_event"}), photons=50_000, seed=3, device="cpu")
-    narrow = spadwarp.simulate(
-        scene(gate={"start_ns": 3.33564095 * 2, "bins": 6}, transport={"estimator": "next_event"}),
-        photons=50_000,
-        seed=3,
-        device="cpu",
+    one = scene(transport={"estimator": "next_event"})
+    wide, narrow = (
+        spadwarp.simulate(one.with_overrides(gate=gate), photons=50_000, seed=3, device="cpu")
+        for gate in ({}, {"start_ns": 3.33564095 * 2, "bins": 6})
     )
     total = wide.tallies.sum() * wide.unit
     parts = (narrow.tallies.sum() + narrow.counters["before_gate"]) * narrow.unit
@@ -201,11 +192,8 @@ def test_a_cube_that_cannot_fit_is_refused_before_anything_runs():
 def test_results_are_complete():
     result = spadwarp.simulate(scene(), photons=5000, seed=9, device="cpu")
     assert dataclasses.is_dataclass(result)
-    np.testing.assert_allclose(
-        result.histogram,
-        sum(result.component(name) for name in ("ballistic", "forward_scattered", "backscatter")),
-        rtol=1e-12,
-    )
+    components = sum(result.component(name) for name in ("ballistic", "forward_scattered", "backscatter"))
+    np.testing.assert_allclose(result.histogram, components, rtol=1e-12)
     assert result.detections.sum() > 0
     assert np.isfinite(result.truth.depth).all()
     np.testing.assert_allclose(result.truth.depth, 2.2, rtol=1e-6)

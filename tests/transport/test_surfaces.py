@@ -13,8 +13,8 @@ import trimesh
 from PIL import Image
 
 import spadwarp
+from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
-from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
 from spadwarp.mesh.colours import srgb_to_linear
@@ -243,12 +243,13 @@ def test_a_lost_image_is_named(tmp_path):
 
 
 def test_more_light_than_arrives_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"specular = 0.6 and reflectance = 0.5 reflect more than arrives"):
-        scene(targets=[{"builtin": "plane", "reflectance": 0.5, "specular": 0.6}])
-    with pytest.raises(ConfigError, match=r"reflectance = 'from_file' goes with mesh only"):
-        scene(targets=[{"builtin": "plane", "reflectance": "from_file"}])
-    with pytest.raises(ConfigError, match=r"reflectance_scale = 0.5 goes with reflectance = 'from_file' only"):
-        scene(targets=[{"builtin": "plane", "reflectance_scale": 0.5}])
+    for fields, text in (
+        ({"reflectance": 0.5, "specular": 0.6}, "specular = 0.6 and reflectance = 0.5 reflect more than arrives"),
+        ({"reflectance": "from_file"}, "reflectance = 'from_file' goes with mesh only"),
+        ({"reflectance_scale": 0.5}, "reflectance_scale = 0.5 goes with reflectance = 'from_file' only"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            scene(targets=[{"builtin": "plane", **fields}])
     path = shaded_square(tmp_path / "white.ply", greens=(255, 0, 0, 0))
     with pytest.raises(MeshError, match=r"reaches 1; times reflectance_scale = 0.9, plus specular = 0.2, that is 1.1"):
         build_mesh(scene(targets=[target(path, reflectance_scale=0.9, specular=0.2)]))
@@ -268,21 +269,7 @@ def _corner(path) -> list[dict]:
 @pytest.mark.slow
 def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     targets = _corner(shaded_square(tmp_path / "square.ply", greens=(40, 120, 180, 200)))
-    cells = {}
-    for estimator, photons in {"analog": 60_000, "next_event": 30_000, "guided": 30_000}.items():
-        one = scene(targets=targets, transport={"estimator": estimator})
-        rows = []
-        for seed in range(24):
-            result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
-            assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-            assert result.ledger_report()["exact"]
-            rows.append(result.tallies.sum(axis=(1, 2)).ravel() * result.unit / photons)
-        cells[estimator] = np.array(rows)
-    assert equal_means_p(cells["analog"], cells["next_event"]) > 1e-3
-    assert equal_means_p(cells["guided"], cells["next_event"]) > 1e-3
-    assert equal_means_p(cells["analog"], cells["guided"]) > 1e-3
-    total = cells["guided"].sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(24) < 0.01
+    agreeing_cells(scene(targets=targets), device, seeds=24)
 
 
 def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(device):

@@ -6,17 +6,9 @@ import warp as wp
 from scipy import stats
 
 import spadwarp
+from helpers.runs import same
 from helpers.scenes import scene
 from spadwarp_kernels import Batches
-
-
-def _same(a, b):
-    assert a.tallies.tobytes() == b.tallies.tobytes()
-    assert a.ledger == b.ledger and a.counters == b.counters
-    assert a.photons == b.photons and a.photon_ranges == b.photon_ranges
-    assert (a.second_moment is None) == (b.second_moment is None)
-    if a.second_moment is not None:
-        np.testing.assert_array_equal(a.second_moment, b.second_moment)
 
 
 def test_squares_are_exact_to_128_bits(device):
@@ -57,7 +49,7 @@ def test_batches_do_not_depend_on_how_the_run_is_cut_up():
     one = scene()
     whole = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=1, uncertainty=True)
     cut = spadwarp.simulate(one, photons=20_000, seed=5, device="cpu", threads=2, launch_size=100, uncertainty=True)
-    _same(whole, cut)
+    same(whole, cut)
     assert whole.photons >= 20_000 and whole.photons % whole.batch_size == 0
     plain = spadwarp.simulate(one, photons=whole.photons, seed=5, device="cpu")
     assert plain.tallies.tobytes() == whole.tallies.tobytes() and plain.ledger == whole.ledger
@@ -75,7 +67,7 @@ def test_a_resumed_run_equals_one_long_run(uncertainty, tmp_path):
         short = _first_batches(one, whole, 12)
     short.save(tmp_path / "short.h5")
     resumed = spadwarp.simulate(one, photons=65_536, device="cpu", resume=spadwarp.load_result(tmp_path / "short.h5"))
-    _same(resumed, whole)
+    same(resumed, whole)
     assert not resumed.partial
 
 
@@ -97,19 +89,14 @@ def _first_batches(one, whole, count):
 @pytest.mark.parametrize("uncertainty", [False, True])
 def test_merged_parts_equal_one_long_run(uncertainty):
     one = scene()
-    whole = spadwarp.simulate(one, photons=65_536, seed=5, device="cpu", uncertainty=uncertainty)
-    parts = [
-        spadwarp.simulate(
-            one, photons=65_536, seed=5, device="cpu", uncertainty=uncertainty, first_photon=first * 65_536
-        )
-        for first in (2, 0, 1)
-    ]
+    options = {"photons": 65_536, "seed": 5, "device": "cpu", "uncertainty": uncertainty}
+    parts = [spadwarp.simulate(one, **options, first_photon=first * 65_536) for first in (2, 0, 1)]
     gap = spadwarp.merge([parts[0], parts[1]])
     assert gap.photon_ranges == ((0, 65_536), (131_072, 196_608))
-    _same(spadwarp.merge([gap, parts[2]]), spadwarp.merge(parts))
-    _same(parts[1], whole)
+    same(spadwarp.merge([gap, parts[2]]), spadwarp.merge(parts))
+    same(parts[1], spadwarp.simulate(one, **options))
     if not uncertainty:
-        _same(spadwarp.merge(parts), spadwarp.simulate(one, photons=196_608, seed=5, device="cpu"))
+        same(spadwarp.merge(parts), spadwarp.simulate(one, photons=196_608, seed=5, device="cpu"))
 
 
 def test_what_cannot_be_merged_is_refused():

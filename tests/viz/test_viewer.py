@@ -42,7 +42,7 @@ def frames(result, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(result, tmp_path_factory):
-    return spadwarp.view(result, tmp_path_factory.mktemp("page") / "view.html", device="cpu")
+    return spadwarp.viz.view(result, tmp_path_factory.mktemp("page") / "view.html", device="cpu")
 
 
 def carried(page):
@@ -95,7 +95,7 @@ def test_a_page_holds_the_results_numbers(result, page):
 
 def test_histograms_that_are_too_large_are_merged_and_keep_their_sum(result, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "HISTOGRAM_BYTES", 900)
-    page = spadwarp.view(result, tmp_path / "small.html", device="cpu")
+    page = spadwarp.viz.view(result, tmp_path / "small.html", device="cpu")
     data = carried(page)
     block, merged = data["block"], data["merged"]
     assert block > 1 and merged > 1
@@ -110,7 +110,7 @@ def test_histograms_that_are_too_large_are_merged_and_keep_their_sum(result, tmp
 def test_a_page_of_frames_holds_counts_to_the_last(frames):
     import h5py
 
-    page = spadwarp.view(frames, frames / "view.html", frame=1)
+    page = spadwarp.viz.view(frames, frames / "view.html", frame=1)
     data = carried(page)
     with h5py.File(frames / "frames.h5") as file:
         counts, expected = file["counts"][1], file["expected"][...] * file.attrs["pulses"]
@@ -121,21 +121,21 @@ def test_a_page_of_frames_holds_counts_to_the_last(frames):
     np.testing.assert_allclose(values[bright], expected[bright], rtol=0.034)
     np.testing.assert_array_equal(unpacked(data["images"]["depth"], "<f4", depth.shape), depth)
     with pytest.raises(ValueError, match=r"frame = 2 is outside \[0, 2\)"):
-        spadwarp.view(frames, frame=2)
+        spadwarp.viz.view(frames, frame=2)
     with pytest.raises(ValueError, match="method = 'likelihood' is not one of centroid, peak"):
-        spadwarp.view(frames, method="likelihood")
+        spadwarp.viz.view(frames, method="likelihood")
 
 
 def test_what_a_page_cannot_be_made_of(result, frames, tmp_path, monkeypatch):
     with pytest.raises(FileError, match=r"holds no frames\.h5 and no result\.h5"):
-        spadwarp.view(tmp_path)
+        spadwarp.viz.view(tmp_path)
     save_result(result, tmp_path / "result.h5")
     shutil.copy(frames / "frames.h5", tmp_path)
     with pytest.raises(FileError, match=r"holds frames.h5 and result.h5; name the file"):
-        spadwarp.view(tmp_path)
+        spadwarp.viz.view(tmp_path)
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(FileError, match=r"pip install 'spadwarp\[view\]'"):
-        spadwarp.view(result, tmp_path / "view.html")
+        spadwarp.viz.view(result, tmp_path / "view.html")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome")
@@ -179,7 +179,7 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
 
 @pytest.mark.slow
 def test_a_film_is_bright_when_the_target_answers(result, tmp_path):
-    path = spadwarp.video(result, tmp_path / "light.gif", scale="linear", fps=10)
+    path = spadwarp.viz.video(result, tmp_path / "light.gif", scale="linear", fps=10)
     lit = np.flatnonzero(result.detections.any(axis=(0, 1)))
     brightness = []
     durations = 0
@@ -196,7 +196,7 @@ def test_a_film_is_bright_when_the_target_answers(result, tmp_path):
 
 def test_pictures_are_merged_and_windows_cut(result, frames, tmp_path):
     edges = 1e9 * result.bin_edges
-    path = spadwarp.video(frames, tmp_path / "some.gif", window_ns=(edges[10] + 0.01, edges[30] - 0.01), pictures=5)
+    path = spadwarp.viz.video(frames, tmp_path / "some.gif", window_ns=(edges[10] + 0.01, edges[30] - 0.01), pictures=5)
     with Image.open(path) as film:
         assert film.n_frames == 5
     for wrong, said in (
@@ -207,19 +207,19 @@ def test_pictures_are_merged_and_windows_cut(result, frames, tmp_path):
         ({"path": tmp_path / "x.avi"}, "ends neither in .gif nor in .mp4"),
     ):
         with pytest.raises(ValueError, match=said):
-            spadwarp.video(frames, **{"path": tmp_path / "x.gif", **wrong})
+            spadwarp.viz.video(frames, **{"path": tmp_path / "x.gif", **wrong})
 
 
 def test_an_mp4_is_one_or_says_what_is_missing(result, tmp_path, monkeypatch):
     try:
-        path = spadwarp.video(result, tmp_path / "light.mp4", pictures=8)
+        path = spadwarp.viz.video(result, tmp_path / "light.mp4", pictures=8)
         assert path.read_bytes()[4:8] == b"ftyp"
     except FileError as error:
         assert "pip install 'spadwarp[video]'" in str(error)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(FileError, match=r"an MP4 needs ffmpeg: pip install 'spadwarp\[video\]', or write a \.gif"):
-        spadwarp.video(result, tmp_path / "none.mp4", pictures=2)
+        spadwarp.viz.video(result, tmp_path / "none.mp4", pictures=2)
     assert not (tmp_path / "none.mp4").exists()
 
 

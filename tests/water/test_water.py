@@ -7,9 +7,9 @@ import pytest
 
 import spadwarp
 from helpers.scenes import scene as make_scene
-from spadwarp import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.preset import WATER_INDICES
+from spadwarp.water import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 
 TABLES = {
     "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01},
@@ -200,8 +200,8 @@ def test_the_water_s_own_scattering_is_in_the_phase_function(chlorophyll, law):
     medium = Medium(chlorophyll=chlorophyll, **law)
     optics = water_optics(532.0, chlorophyll=chlorophyll)
     share = optics.water_scattering / optics.scattering
-    particles = spadwarp.phase_function(Medium(extinction=1.0, albedo=0.5, **law))
-    both = spadwarp.phase_function(medium)
+    particles = spadwarp.scene.phase_function(Medium(extinction=1.0, albedo=0.5, **law))
+    both = spadwarp.scene.phase_function(medium)
     angles = np.radians([1.0, 45.0, 90.0, 135.0, 180.0])
     # 3/(4 pi) (1 + delta + (1 - delta) cos^2)/(4 + 2 delta): at 90 degrees 0.0608, at 180 degrees 0.1171 per steradian.
     molecules = 3.0 / (4.0 * np.pi) * (1.039 + 0.961 * np.cos(angles) ** 2) / 4.078

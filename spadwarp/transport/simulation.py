@@ -18,13 +18,13 @@ from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.result import Result, Tallies
-from spadwarp.result.merge import add_timing, check_capacity, check_targets, join_provenance
+from spadwarp.result.merging import add_timing, check_capacity, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
 from spadwarp.scene import Scene
 from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, make_plan
-from spadwarp.transport.tally_scale import tally_scale
+from spadwarp.transport.tally_unit import tally_scale
 
 __all__ = ["Progress", "provenance", "simulate"]
 
@@ -80,8 +80,8 @@ def simulate(
             the time at most.
         tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
             the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
-            memory; `spadwarp.to_torch(result, tallies=…)` makes histograms of it where it lies. For one device, without
-            `resume`.
+            memory; `spadwarp.result.to_torch(result, tallies=…)` makes histograms of it where it lies. For one
+            device, without `resume`.
 
     Returns:
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
@@ -232,10 +232,10 @@ def provenance(device: Any = None) -> dict[str, Any]:
     """What made a result: versions, machine, date; and a device."""
     import warp as wp
 
-    import spadwarp
+    from spadwarp import __version__
 
     made = {
-        "spadwarp": spadwarp.__version__,
+        "spadwarp": __version__,
         "warp": wp.__version__,
         "numpy": np.__version__,
         "python": platform.python_version(),

@@ -1,0 +1,111 @@
+"""The directory of a run: its result, scene, depth, truth and pictures, while it is not finished its checkpoint."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import FileError
+from spadwarp.frames import detector_response
+from spadwarp.io.atomic import atomic_path
+from spadwarp.result import Result, save_depth_exr, save_truth_maps
+from spadwarp.scene import Scene
+
+__all__ = ["CHECKPOINT", "RunFiles", "bytes_needed", "newest_result", "remove_checkpoint", "write_run"]
+
+CHECKPOINT = "checkpoint.h5"
+"""Name of the partial result that is there while a run is not finished."""
+
+_NAMES = {"result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr"}
+_PICTURES = {f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")}
+
+_RECORD_BYTES = 52  # of one photon's terminal state, id included
+_OTHER_BYTES = 16 << 20  # pictures, maps, text
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """The files of a run.
+
+    Attributes:
+        written: Their paths.
+        depth: Depth frame [m], float64 `[H, W]`, by `output.depth_method`; NaN where nothing returned.
+    """
+
+    written: list[Path]
+    depth: NDArray[np.float64]
+
+
+def write_run(result: Result, out: str | Path, *, device: str | None = None, keep: Sequence[str] = ()) -> RunFiles:
+    """Writes the files that a result's `[output]` asks for to a directory, the result first.
+
+    result.h5, scene.toml, depth.exr, truth.exr, and depth, intensity, histogram and truth as PNG and PDF. Files of
+    these names that an earlier run has left, its checkpoint and records included, are removed.
+
+    Args:
+        result: From `spadwarp.simulate` or `spadwarp.merge`.
+        out: The directory, made if it is not there.
+        device: Warp device for the depth frame.
+        keep: Names of earlier files that are not removed.
+
+    Raises:
+        FileError: A file cannot be written; a result that does not fit goes to the folder for temporary files instead,
+            which the text names.
+    """
+    folder, scene, output = Path(out), result.scene, result.scene.output
+    written = [_save(result, folder / "result.h5")] if output.result else []
+    with atomic_path(folder / "scene.toml") as temporary:
+        temporary.write_text(scene.to_toml(), encoding="utf-8")
+    written.append(folder / "scene.toml")
+    options: dict[str, Any] = {}
+    if output.depth_method in ("matched", "likelihood"):
+        options["irf"] = detector_response(scene.detector, scene.laser)
+    depth = result.depth(method=output.depth_method, device=device, **options)
+    if output.exr:
+        written += [save_depth_exr(result, depth, folder / "depth.exr"), save_truth_maps(result, folder / "truth.exr")]
+    if formats := [ending for ending in ("png", "pdf") if getattr(output, ending)]:
+        from spadwarp.viz.result import write_previews
+
+        written += write_previews(result, folder, depth=depth, method=output.depth_method, formats=formats)
+    remove_checkpoint(folder)
+    for name in (_NAMES | _PICTURES) - set(keep) - {path.name for path in written}:
+        (folder / name).unlink(missing_ok=True)
+    return RunFiles(written, depth)
+
+
+def _save(result: Result, path: Path) -> Path:
+    """Saves the result, if need be elsewhere: a full disk must not cost hours of photons."""
+    try:
+        return result.save(path)
+    except FileError as error:
+        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{os.getpid()}-result.h5"
+        result.save(refuge)
+        raise FileError(f"{error}\n{refuge}: the result is here instead") from error
+
+
+def newest_result(place: str | Path) -> Path:
+    """A file itself; of a directory its result or its checkpoint, whichever is newer, or where there is none itself."""
+    folder = Path(place)
+    found = [path for name in ("result.h5", CHECKPOINT) if (path := folder / name).is_file()]
+    return max(found, key=lambda path: path.stat().st_mtime_ns, default=folder)
+
+
+def remove_checkpoint(out: str | Path) -> None:
+    """Removes the checkpoint of a directory, and what a killed run has left of one."""
+    folder = Path(out)
+    for path in (folder / CHECKPOINT, *folder.glob(f".{CHECKPOINT}.*.tmp")):
+        path.unlink(missing_ok=True)
+
+
+def bytes_needed(scene: Scene, *, batches: bool = False, records: bool = False, checkpoint: bool = False) -> int:
+    """Upper bound of what a run writes [bytes]; compression takes off most of it."""
+    tallies = (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+    photons = scene.transport.photons if records else 0
+    return (2 if checkpoint else 1) * tallies + _OTHER_BYTES + _RECORD_BYTES * photons
