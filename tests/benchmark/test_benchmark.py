@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import DEVICE, run
 from spadwarp.benchmark.cases import CASES, GROUPS, load_report, ratios, report
-from spadwarp.cli import app
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
@@ -22,10 +21,6 @@ PEERS = Path(__file__).parents[2] / "bench" / "peers"
 
 def scene(name):
     return Scene.from_dict(CASES[name].scene)
-
-
-def run(*words):
-    return CliRunner().invoke(app, ["bench", *map(str, words)])
 
 
 @pytest.fixture(scope="module")
@@ -115,10 +110,8 @@ def test_ratios_are_now_over_before(staircase, kept):
 @pytest.mark.slow
 def test_command_writes_and_compares(kept, tmp_path):
     out = tmp_path / "new.json"
-    result = run(
-        "staircase_5m", "--device", "cpu", "--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept
-    )
-    assert result.exit_code == 0, result.output
+    options = ("--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept)
+    result = run("bench", "staircase_5m", *DEVICE, *options)
     assert "120" in result.output
     assert "×" in result.output
     again = load_report(out)
@@ -130,8 +123,7 @@ def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
     check = {"name": "absorbed fraction", "value": 0.2, "standard_error": 1e-3, "reference": 0.1769, "passed": False}
     cube60 = replace(staircase, case="cube60", check=check)
     monkeypatch.setattr(spadwarp.benchmark, "run", lambda *_, found, **__: found(cube60))
-    result = run("cube60")
-    assert result.exit_code == 1
+    result = run("bench", "cube60", code=1)
     assert "cube60: a mean is not what it should be" in result.output
 
 
@@ -141,8 +133,7 @@ def test_an_interrupted_command_keeps_what_was_measured(monkeypatch, staircase, 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(spadwarp.benchmark, "run", interrupted)
-    result = run("staircase_5m", "water", "--json", tmp_path / "part.json")
-    assert result.exit_code == 130
+    result = run("bench", "staircase_5m", "water", "--json", tmp_path / "part.json", code=130)
     assert "staircase_5m" in result.stdout
     assert [row["case"] for row in load_report(tmp_path / "part.json")["results"]] == ["staircase_5m"]
 
@@ -154,14 +145,14 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
             found(replace(staircase, case=name, size={"photons": photons}, rates={"photons": rate}, memory=1 << 30))
 
     monkeypatch.setattr(spadwarp.benchmark, "run", grows)
-    told = run("scaling").stdout
+    told = run("bench", "scaling").stdout
     assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in told
 
 
 def test_unknown_case_is_named():
     with pytest.raises(ConfigError, match=r"'staircase' is not one of water, .*scaling"):
         spadwarp.benchmark.run(["staircase"])
-    assert run("staircase").exit_code == 2
+    run("bench", "staircase", code=2)
 
 
 @pytest.mark.parametrize("option", ["photons", "repeats"])
@@ -210,7 +201,7 @@ def test_runs_are_repeated_until_enough():
 
 
 def test_cases_are_listed():
-    listed = run("--list").output
+    listed = run("bench", "--list").output
     assert all(name in listed for name in [*CASES, "scaling"])
 
 
@@ -218,13 +209,8 @@ def test_cases_are_listed():
 def test_a_peer_that_is_missing_is_said_and_is_no_failure(script, tmp_path):
     for module in ("pmcx", "pmcxcl", "pmmc", "mitsuba"):
         (tmp_path / f"{module}.py").write_text("raise ImportError('not here')")
-    done = subprocess.run(
-        [sys.executable, PEERS / f"{script}.py"],
-        capture_output=True,
-        text=True,
-        env={"PYTHONPATH": str(tmp_path)},
-        check=False,
-    )
+    command, paths = [sys.executable, PEERS / f"{script}.py"], {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=paths, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("not run: ")
     assert "pip install" in done.stdout

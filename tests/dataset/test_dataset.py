@@ -9,17 +9,15 @@ import subprocess
 import sys
 import time
 import tomllib
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from scipy import stats
-from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import DEVICE, ENVIRONMENT, ROOT, run, tables
 from helpers.datasets import BS, TABLES, checksums, recipe
-from spadwarp.cli import app
 from spadwarp.dataset import FIELDS, SPLITS, Plan
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
@@ -165,7 +163,6 @@ def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     assert any(np.array_equal(np.nan_to_num(a), np.nan_to_num(b)) for a in windows for b in turned)
 
 
-ROOT = Path(__file__).parents[2]
 MAKE = """
 import sys, spadwarp
 spadwarp.dataset.make_dataset(spadwarp.dataset.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
@@ -173,9 +170,8 @@ spadwarp.dataset.make_dataset(spadwarp.dataset.load_recipe(sys.argv[1]), sys.arg
 
 
 def start(recipe_path, out, **options):
-    paths = os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))
     command = [sys.executable, "-c", MAKE, str(recipe_path), str(out)]
-    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, **options)
+    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, **options)
 
 
 @pytest.mark.slow
@@ -241,17 +237,9 @@ def test_a_read_only_folder_is_told(tmp_path):
 
 
 def test_traced_scenes_hold_their_histograms(tmp_path):
-    changes = {
-        "targets.builtin": ["staircase"],
-        "targets.validation": [],
-        "frames.per_scene": 2,
-        "monte_carlo.share": 1.0,
-        "monte_carlo.photons": 40_000,
-        "scene.camera.width": 12,
-        "scene.camera.height": 8,
-        "gate.bins": 64,
-        "scenes_per_target": 1,
-    }
+    changes = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 2, "gate.bins": 64}
+    changes |= {"scene.camera.width": 12, "scene.camera.height": 8, "scenes_per_target": 1}
+    changes |= {"monte_carlo.share": 1.0, "monte_carlo.photons": 40_000}
     totals = {}
     for how in ("sparse", "dense"):
         spadwarp.dataset.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
@@ -357,27 +345,24 @@ def test_recipes_that_come_with_spadwarp(path):
 @pytest.mark.slow
 def test_commands(tmp_path):
     (tmp_path / "recipe.toml").write_text(recipe().to_toml())
-    out = str(tmp_path / "data")
-    runner = CliRunner()
+    out = tmp_path / "data"
 
-    def run(*words, code=0):
-        outcome = runner.invoke(app, ["dataset", *words])
-        assert outcome.exit_code == code, outcome.output
-        return outcome.output
+    def dataset(*words, code=0):
+        return run("dataset", *words, code=code).output
 
-    make = ["make", str(tmp_path / "recipe.toml"), "--out", out, "--device", "cpu", "--set", "frames.per_scene=1"]
-    told = run(*make, "--shard", "1/2")
+    make = ["make", tmp_path / "recipe.toml", "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
+    told = dataset(*make, "--shard", "1/2")
     assert "3 shards with 3 frames" in told and "3 shards that others are to make" in told
-    assert "frames-00001.h5: missing" in run("verify", out, code=1)
-    assert "3 shards that were there" in run(*make, "--json", str(tmp_path / "told.json"))
-    assert json.loads((tmp_path / "told.json").read_text())["frames"] == 3
-    assert "whole" in run("verify", out)
-    told = run("info", out)
+    assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
+    assert "3 shards that were there" in dataset(*make, "--json", tmp_path / "told.json")
+    assert tables(tmp_path / "told.json")["frames"] == 3
+    assert "whole" in dataset("verify", out)
+    told = dataset("info", out)
     assert "staircase" in told and "36 x 24 pixels" in told
-    run("preview", out, "--frames", "4", "--out", str(tmp_path / "sheet.png"))
+    dataset("preview", out, "--frames", "4", "--out", tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
     for wrong in (["--shard", "3/2"], ["--shard", "x"], ["--engine", "cloud"]):
-        run(*make, *wrong, code=2)
+        dataset(*make, *wrong, code=2)
 
 
 def test_hugging_face_reads_the_frames(folder, tmp_path):
@@ -398,17 +383,12 @@ def test_plan_needs_no_order():
 
 def test_older_words_in_a_recipe_mean_and_draw_the_same():
     pulses = {"low": 1000.0, "high": 9000.0}
-    older, now = (
-        Plan(
-            spadwarp.dataset.Recipe.from_dict(
-                {**TABLES, "exposure": {f"pulses{more}": pulses}, "vary": {path: [True, False], "analytic.form": forms}}
-            )
-        )
-        for more, path, forms in (
-            ("", "detector.fold", ["paper", "radiometric"]),
-            ("_per_depth_frame", "detector.wrap", ["lu2024", "radiometric"]),
-        )
+    words = (("pulses", "detector.fold", "paper"), ("pulses_per_depth_frame", "detector.wrap", "lu2024"))
+    tables = (
+        {**TABLES, "exposure": {name: pulses}, "vary": {path: [True, False], "analytic.form": [form, "radiometric"]}}
+        for name, path, form in words
     )
+    older, now = (Plan(spadwarp.dataset.Recipe.from_dict(one)) for one in tables)
     drawn = [older.scene(index).scene for index in range(older.scene_count)]
     assert drawn == [now.scene(index).scene for index in range(now.scene_count)]
     assert {scene.detector.wrap for scene in drawn} == {True, False}

@@ -1,26 +1,18 @@
 """`spadwarp doctor`: it measures what is known, and says what is wrong."""
 
-import json
 import re
 
 import pytest
 import warp as wp
-from typer.testing import CliRunner
 
 import spadwarp
-from spadwarp.cli import app
+from helpers.cli import DEVICE, run, tables
 from spadwarp.doctor import diagnosis as health
 
 
-def run(*arguments, code=0):
-    outcome = CliRunner().invoke(app, ["doctor", *map(str, arguments)])
-    assert outcome.exit_code == code, outcome.output
-    return outcome
-
-
 def test_self_test_measures_what_is_known(tmp_path):
-    told = run("--device", "cpu", "--json", tmp_path / "report.json").stdout
-    report = json.loads((tmp_path / "report.json").read_text())
+    told = run("doctor", *DEVICE, "--json", tmp_path / "report.json").stdout
+    report = tables(tmp_path / "report.json")
     assert report["healthy"] and not report["problems"]
     for test in report["tests"]:
         assert abs(test["value"] - test["reference"]) <= 4.5 * test["standard_error"] < 0.02
@@ -32,7 +24,7 @@ def test_self_test_measures_what_is_known(tmp_path):
 
 def test_a_wrong_simulator_is_found_out(monkeypatch):
     monkeypatch.setattr(health, "_TRANSMITTED", 0.67)
-    outcome = run("--device", "cpu", "--quiet", code=1)
+    outcome = run("doctor", *DEVICE, "--quiet", code=1)
     assert "self-test: let through by the slab" in outcome.stderr and "FAILED" in outcome.stderr
     assert outcome.stdout == ""
 

@@ -4,11 +4,10 @@ import numpy as np
 import OpenEXR
 import pytest
 from scipy import io, sparse, stats
-from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import run
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.cli import app
 from spadwarp.errors import FileError
 from spadwarp.frames import record_frames
 from spadwarp.frames.measured import read_histograms
@@ -133,8 +132,7 @@ def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
     ranges = {}
     for name, options in {"own": (), "given": ("--gate-start-ns", 0)}.items():
         arguments = ("depth", path, "--group-index", 1.3638, *options, "--device", "cpu", "--out", tmp_path / name)
-        done = CliRunner().invoke(app, [str(argument) for argument in arguments])
-        assert done.exit_code == 0, done.output
+        run(*arguments)
         ranges[name] = np.load(tmp_path / name / "range.npy")
     later = 0.5 * SPEED_OF_LIGHT / 1.3638 * detection.gate_start
     assert np.nanmedian(ranges["own"] - ranges["given"]) == pytest.approx(later, rel=1e-4)
@@ -189,22 +187,19 @@ def test_what_cannot_be_written_is_named(frames, detection, result, tmp_path):
 
 
 def test_command(frames, tmp_path):
-    def run(source, out, *options, code=0):
-        arguments = ["export", source, "--format", "npy", "--out", tmp_path / out, *options]
-        outcome = CliRunner().invoke(app, list(map(str, arguments)))
-        assert outcome.exit_code == code, outcome.output
-        return outcome.output
+    def told(source, out, *options, code=0):
+        return run("export", source, "--format", "npy", "--out", tmp_path / out, *options, code=code).output
 
-    assert "frames-00000.mat to frames-00001.mat (2 files)" in run(frames.parent, "a", "--format", "mat")
+    assert "frames-00000.mat to frames-00001.mat (2 files)" in told(frames.parent, "a", "--format", "mat")
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy"]
-    run(frames, "b", "--frames", "1:2", "--quiet")
+    told(frames, "b", "--frames", "1:2", "--quiet")
     assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
-    assert "holds no frames.h5 and no result.h5" in run(tmp_path, "c", code=1)
-    assert "outside" in run(frames, "d", "--frames", 9, code=2)
-    assert "none of them in 5:" in run(frames, "d", "--frames", "5:", code=2)
+    assert "holds no frames.h5 and no result.h5" in told(tmp_path, "c", code=1)
+    assert "outside" in told(frames, "d", "--frames", 9, code=2)
+    assert "none of them in 5:" in told(frames, "d", "--frames", "5:", code=2)
     make_result(make_scene()).save(tmp_path / "result.h5")
-    assert "draw frames first" in run(tmp_path / "result.h5", "e", "--format", "mat", code=2)
+    assert "draw frames first" in told(tmp_path / "result.h5", "e", "--format", "mat", code=2)
     assert not list((tmp_path / "e").iterdir())  # the array neither
 
 
@@ -270,6 +265,5 @@ def test_datasets_of_depth(dataset, tmp_path):
     with pytest.raises(FileError, match="name the dataset's folder"):
         spadwarp.export(next(dataset.glob("frames-*.h5")), tmp_path / "b.npy")
     options = ("--split", "test", "--frames", "0:1", "--format", "exr")
-    outcome = CliRunner().invoke(app, ["export", str(dataset), *options, "--out", str(tmp_path / "c")])
-    assert outcome.exit_code == 0, outcome.output
+    run("export", dataset, *options, "--out", tmp_path / "c")
     assert [path.name for path in (tmp_path / "c").iterdir()] == ["traced.exr"]

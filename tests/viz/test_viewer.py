@@ -10,12 +10,11 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import run
 from helpers.headless import BROWSER, Browser
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.cli import app
 from spadwarp.errors import FileError
 from spadwarp.frames import record_frames
 from spadwarp.result.file import save_result
@@ -227,8 +226,6 @@ def test_commands_write_page_and_film(result, tmp_path):
     save_result(result, tmp_path / "result.h5")
     for command, name in ((["view", "--device", "cpu"], "page.html"), (["video", "--pictures", "3"], "light.gif")):
         out = tmp_path / name
-        told = CliRunner().invoke(app, [command[0], str(tmp_path), "--out", str(out), *command[1:]])
-        assert told.exit_code == 0, told.output
+        told = run(command[0], tmp_path, "--out", out, *command[1:])
         assert told.stdout.startswith(f"written: {out} (") and out.is_file()
-    wrong = CliRunner().invoke(app, ["video", str(tmp_path), "--window", "a"])
-    assert wrong.exit_code == 2 and "two numbers" in wrong.output
+    assert "two numbers" in run("video", tmp_path, "--window", "a", code=2).output
