@@ -33,7 +33,7 @@ FORMAT_VERSION = 1
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
 _TRUTH = ("depth", "range", "normal", "reflectance")
-_OLDER_NAMES = {"second_moment": "squares"}  # of datasets in files of today's format version 1
+_OLDER_NAMES = {"second_moment": "squares", "importance_sampling_residual": "directed"}  # in files of format version 1
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
@@ -108,8 +108,16 @@ def load_result(path: str | Path) -> Result:
             photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
             requested=_requested(file),
             truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
-            **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS},
+            ledger=read_ledger(file),
+            **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS if name != "ledger"},
         )
+
+
+def read_ledger(file: Any) -> dict[str, int]:
+    """The ledger in an open file of a result or of photon records, its entries by the names of today."""
+    newer = {older: name for name, older in _OLDER_NAMES.items()}
+    ledger: dict[str, int] = json.loads(file["ledger"].asstr()[()])
+    return {newer.get(name, name): value for name, value in ledger.items()}
 
 
 def _second_moment(file: Any) -> NDArray[np.uint64] | None:

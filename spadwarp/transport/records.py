@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.mesh import build_mesh
+from spadwarp.result.file import read_ledger
 from spadwarp.scene.pose import rotation_matrix, to_world
 from spadwarp.transport.plan import LAUNCH_SIZE, check_range
 
@@ -157,6 +158,6 @@ def load_records(path: str | Path) -> PhotonRecords:
         return PhotonRecords(
             **{name: file[name][...] for name in _ARRAYS},
             reasons=tuple(file.attrs["reasons"]),
-            ledger=json.loads(file["ledger"].asstr()[()]),
+            ledger=read_ledger(file),
             ledger_unit=float(file.attrs["ledger_unit"]),
         )

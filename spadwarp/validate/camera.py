@@ -82,11 +82,11 @@ def _ledger(run: Run) -> list[Quantity]:
                 emitted = result.photons / result.ledger_unit
                 entries = {name: value for name, value in result.ledger.items() if name != "emitted"}
                 missing += abs(round(emitted) - sum(entries.values()))
-                gains.append([entries.get(name, 0) / emitted for name in ("roulette", "directed")])
+                gains.append([entries.get(name, 0) / emitted for name in ("roulette", "importance_sampling_residual")])
             name = f"{estimator}, {termination}"
             quantities.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
             for entry, gain, possible in zip(
-                ("roulette", "directed"),
+                ("roulette", "importance_sampling_residual"),
                 batch_means(gains),
                 (termination == "roulette", estimator == "guided"),
                 strict=True,

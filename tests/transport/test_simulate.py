@@ -59,15 +59,17 @@ def test_the_ledger_closes_exactly(estimator, **values):
     report = result.ledger_report()
     assert report["difference"] == 0 and report["exact"]
     assert result.counters["invalid"] == 0
-    entries = {name: value for name, value in result.ledger.items() if name not in ("roulette", "directed")}
+    entries = {
+        name: value for name, value in result.ledger.items() if name not in ("roulette", "importance_sampling_residual")
+    }
     assert all(value >= 0 for value in entries.values())
 
 
 def test_signed_entries_of_the_ledger_have_expectation_zero(device):
-    """Directed bounces and roulette move weight between photons and create none, on the mean over 32 seeds."""
+    """Guided directions and roulette move weight between photons and create none, on the mean over 32 seeds."""
     one = scene(transport={"estimator": "guided", "termination": "roulette", "weight_cutoff": 0.2})
     rows = [spadwarp.simulate(one, photons=20_000, seed=seed, device=device).ledger for seed in range(32)]
-    for name in ("directed", "roulette"):
+    for name in ("importance_sampling_residual", "roulette"):
         values = np.array([row[name] for row in rows], np.float64)
         assert values.std() > 0
         assert abs(values.mean()) < 4.5 * values.std(ddof=1) / np.sqrt(len(values))

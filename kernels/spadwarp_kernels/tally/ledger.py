@@ -22,7 +22,7 @@ LEDGER_ENTRIES = (
     "max_path",
     *EXIT_FACES,
     "roulette",
-    "directed",
+    "importance_sampling_residual",
 )
 COUNTERS = (
     "water_collisions",
@@ -38,7 +38,8 @@ COUNTERS = (
 LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS)
 
 ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT, ROULETTE, DIRECTED = (
-    wp.constant(LEDGER_ENTRIES.index(name)) for name in (*LEDGER_ENTRIES[:5], EXIT_FACES[0], "roulette", "directed")
+    wp.constant(LEDGER_ENTRIES.index(name))
+    for name in (*LEDGER_ENTRIES[:5], EXIT_FACES[0], "roulette", "importance_sampling_residual")
 )
 (
     WATER_COLLISIONS,
