@@ -30,6 +30,7 @@ _ROOMS = {
     "benchmark": (),
     "doctor": (),
     "device": (),
+    "io": (),
     "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
 _HOMES = {name: room for room, names in _ROOMS.items() for name in names}

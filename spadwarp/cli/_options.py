@@ -140,9 +140,7 @@ def one_device(devices: str | None, engine: Ray | None) -> str | None:
 
 def load_run(place: Path) -> Result:
     """The result in a file, or in the directory of a run."""
-    from spadwarp.io.atomic import file_within
-
-    return spadwarp.load_result(file_within(place, ("result.h5",)))
+    return spadwarp.load_result(spadwarp.io.file_within(place, ("result.h5",)))
 
 
 def prepare_directory(out: Path, *, overwrite: bool, needed: int) -> None:
@@ -172,15 +170,8 @@ def check_writable(directory: Path) -> None:
 
 def write_json(summary: dict[str, Any], path: Path | None) -> None:
     """The machine-readable twin of what a command tells; numbers that are not finite become null."""
-    if path is None:
-        return
-    from spadwarp.io.text import json_text
-
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json_text(summary), encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+    if path is not None:
+        spadwarp.io.write_json(summary, path)
 
 
 # Numbers for people

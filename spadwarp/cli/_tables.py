@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -76,15 +75,3 @@ def percent(value: float) -> str:
     if math.isnan(value):
         return "-"
     return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
-
-
-def write_csv(path: Path, table: Sequence[dict[str, Any]]) -> Path:
-    import csv
-
-    from spadwarp.io.atomic import atomic_path
-
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(table[0]))
-        writer.writeheader()
-        writer.writerows(table)
-    return path

@@ -76,7 +76,7 @@ def analytic(
       spadwarp analytic scene.toml --depth cat_RGBD.EXR --depth-channel A --depth-scale 0.01 \\
           --normal cat_Surf_Norm.EXR --albedo cat_Base_Col.EXR --out cat/
     """
-    from spadwarp.viz.frames import draw_analytic
+    from spadwarp.viz import draw_analytic
 
     scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
     given = {

@@ -15,7 +15,7 @@ from spadwarp.errors import ArgumentError
 
 if TYPE_CHECKING:
     pass
-from spadwarp.cli._tables import budget_table, write_csv
+from spadwarp.cli._tables import budget_table
 
 
 @app.command()
@@ -57,7 +57,10 @@ def budget(
     written = []
     if out is not None:
         plot_budget(found, out / "budget.png")
-        written = [out / "budget.png", write_csv(out / "budget.csv", [dataclasses.asdict(row) for row in found])]
+        written = [
+            out / "budget.png",
+            spadwarp.io.write_csv([dataclasses.asdict(row) for row in found], out / "budget.csv"),
+        ]
     if not quiet:
         opt.show_table(budget_table([row.medium for row in found], "water", found))
         if written:

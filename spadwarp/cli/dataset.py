@@ -151,7 +151,7 @@ def preview(
     Example:
       spadwarp dataset preview data/small/ --out sheet.png
     """
-    from spadwarp.viz.contact_sheet import draw_dataset
+    from spadwarp.viz import draw_dataset
 
     path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
     say(f"written: {path}")

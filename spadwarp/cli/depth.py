@@ -79,14 +79,12 @@ def depth(
       spadwarp depth counts.npy --bin-width-ps 55 --group-index 1.3566 --horizontal-fov-deg 15 \\
           --irf-fwhm-ps 200 --method likelihood --out depth/
     """
-    from spadwarp.frames import read_histograms
-    from spadwarp.frames.depth import depth_of
-    from spadwarp.io.atomic import file_within
-    from spadwarp.run.depth import write_depth
+    from spadwarp.frames import depth_of, read_histograms
+    from spadwarp.run import write_depth
 
     if ply is not None:
         opt.check_writable(ply.parent)
-    histograms = read_histograms(file_within(path, ("frames.h5", "result.h5")), variable=variable)
+    histograms = read_histograms(spadwarp.io.file_within(path, ("frames.h5", "result.h5")), variable=variable)
     opt.prepare_directory(out, overwrite=overwrite, needed=8 * histograms.values.size // histograms.values.shape[-1])
     histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
     reduced = depth_of(

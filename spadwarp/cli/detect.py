@@ -58,7 +58,7 @@ def detect(
       spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
     """
     from spadwarp.frames import record_frames
-    from spadwarp.viz.frames import draw_recording
+    from spadwarp.viz import draw_recording
 
     result = _with_detector(opt.load_run(run), overrides)
     chosen: Any = [one.value for one in method or opt.Estimator]

@@ -81,11 +81,9 @@ def export(
 
 def _inside(place: Path) -> Path:
     """The file, or the one that can be exported in a directory."""
-    from spadwarp.io.atomic import file_within
-
     if (place / "manifest.json").is_file():
         return place
-    return file_within(place, ("frames.h5", "result.h5", "analytic.h5"))
+    return spadwarp.io.file_within(place, ("frames.h5", "result.h5", "analytic.h5"))
 
 
 def _frames(text: str | None) -> int | slice | None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from spadwarp import Scene
     from spadwarp.analytic import DepthErrorRow
-from spadwarp.cli._tables import budget_table, new_table, percent, short, write_csv
+from spadwarp.cli._tables import budget_table, new_table, percent, short
 
 
 class Quantity(enum.StrEnum):
@@ -61,7 +61,7 @@ def sweep(
     values, some = list(curves.values), list[Any](curves.rows)
     found = [dataclasses.asdict(row) for row in some]
     table = [{curves.field: value, **row} for value, row in zip(values, found, strict=True)]
-    written = [out / "sweep.png", write_csv(out / "sweep.csv", table)]
+    written = [out / "sweep.png", spadwarp.io.write_csv(table, out / "sweep.csv")]
     if not quiet:
         names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in values]
         opt.show_table(

@@ -32,7 +32,7 @@ def targets(
     Example:
       spadwarp targets --out pictures/
     """
-    from spadwarp.viz.targets import describe_targets, draw_targets
+    from spadwarp.viz import describe_targets, draw_targets
 
     if out is not None:
         opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)

@@ -1,1 +1,7 @@
-"""Files that appear whole or not at all: HDF5, EXR, PLY."""
+"""Files that appear whole or not at all: HDF5, EXR, PLY, JSON, CSV."""
+
+from spadwarp.io.atomic import atomic_path, file_within
+from spadwarp.io.exr import read_exr, write_exr
+from spadwarp.io.text import json_text, read_toml, write_csv, write_json
+
+__all__ = ["atomic_path", "file_within", "json_text", "read_exr", "read_toml", "write_csv", "write_exr", "write_json"]

@@ -1,17 +1,20 @@
-"""Text formats: TOML files in, JSON out."""
+"""Text formats: TOML files in, JSON and CSV out."""
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import tomllib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from spadwarp.errors import ConfigError, FileError
+from spadwarp.io.atomic import atomic_path
 
-__all__ = ["json_text", "read_toml"]
+__all__ = ["json_text", "read_toml", "write_csv", "write_json"]
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -27,6 +30,22 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def json_text(value: Any, *, indent: int = 2) -> str:
     """A value as JSON with a line end; numbers that are not finite become null, paths text."""
     return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
+
+
+def write_json(value: Any, path: str | Path) -> Path:
+    """Writes `json_text` of a value; returns the path. Raises `FileError`."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_text(value), encoding="utf-8")
+    return Path(path)
+
+
+def write_csv(table: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
+    """Writes rows with the same names as CSV with a header; returns the path. Raises `FileError`."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
+    return Path(path)
 
 
 def _plain(value: Any) -> Any:
