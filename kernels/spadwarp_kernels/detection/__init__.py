@@ -1,17 +1,16 @@
 """SPAD and TCSPC: counts from expected detections, and arrival times from histograms."""
 
 from .arrival_time import PHASES, arrival_bins, first_invalid_row
-from .spad import (
-    EVENT_LIMIT,
+from .events import EVENT_LIMIT, event_counts
+from .expected import (
     add_crosstalk,
     coates,
     dark_count_rates,
-    event_counts,
     expected_detections,
-    first_photon_counts,
     first_photon_probabilities,
     free_running_probabilities,
 )
+from .first_photon import first_photon_counts
 
 __all__ = [
     "EVENT_LIMIT",

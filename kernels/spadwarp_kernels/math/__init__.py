@@ -1,14 +1,19 @@
 """Directions and bits."""
 
 from .bits import bits_of, from_bits
+from .float64 import expm1, log1p, normal_cdf, one_minus_exp
 from .rotations import cos_sin_turn, cotangent, one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 
 __all__ = [
     "bits_of",
     "cos_sin_turn",
     "cotangent",
+    "expm1",
     "from_bits",
+    "log1p",
+    "normal_cdf",
     "one_minus_cosine",
+    "one_minus_exp",
     "orthonormal_basis",
     "rotate_direction",
     "snap_direction",

@@ -1,6 +1,6 @@
 """Random numbers: Philox, uniforms, binomial counts, quantiles, tabulated densities."""
 
-from .binomial import binomial, expm1, log1p, uniforms
+from .binomial import binomial, uniforms
 from .density_tables import (
     DensityTables,
     fold,
@@ -29,10 +29,8 @@ __all__ = [
     "DensityTables",
     "RoundKeys",
     "binomial",
-    "expm1",
     "fold",
     "folded_quadrature",
-    "log1p",
     "make_density_tables",
     "philox4x32",
     "random_block",

@@ -6,6 +6,8 @@ process of that mean. Small p keeps all its digits, and so does 1 − p where p 
 
 import warp as wp
 
+from spadwarp_kernels.math.float64 import expm1, log1p
+
 from .philox import STREAM_DETECTOR, random_block
 
 wp.set_module_options({"enable_backward": False})
@@ -41,26 +43,6 @@ def uniforms(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.uint3
         (wp.float64(words[0] >> wp.uint32(5)) * high + wp.float64(words[1] >> wp.uint32(6))) * scale,
         (wp.float64(words[2] >> wp.uint32(5)) * high + wp.float64(words[3] >> wp.uint32(6))) * scale,
     )
-
-
-@wp.func
-def expm1(x: wp.float64) -> wp.float64:
-    """exp(x) − 1 without cancellation: relative error below 1e-13."""
-    if wp.abs(x) > wp.float64(0.01):
-        return wp.exp(x) - wp.float64(1.0)
-    series = wp.float64(1.0) + x * (
-        wp.float64(1.0 / 2.0) + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0)))
-    )
-    return x * series
-
-
-@wp.func
-def log1p(x: wp.float64) -> wp.float64:
-    """ln(1 + x) without cancellation (Kahan's correction)."""
-    y = wp.float64(1.0) + x
-    if y == wp.float64(1.0):
-        return x
-    return x * wp.log(y) / (y - wp.float64(1.0))
 
 
 @wp.func

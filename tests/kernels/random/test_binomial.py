@@ -6,7 +6,8 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import launched, on_device
-from spadwarp_kernels.random import binomial, expm1, log1p
+from spadwarp_kernels.math import expm1, log1p
+from spadwarp_kernels.random import binomial
 
 pytestmark = pytest.mark.physics
 

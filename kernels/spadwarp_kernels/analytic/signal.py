@@ -1,0 +1,202 @@
+"""The light that comes back from the target, one thread a pixel: detections per pulse and arrival time.
+
+Equation numbers are those of *A Simulation Method for Underwater SPAD Depth Imaging Datasets*, Sensors 24, 3886 (2024).
+Times are from the emission of the pulse; everything in float64.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
+from spadwarp_kernels.pixels import launch_pixels
+
+from .lidar import Lidar, beam_direction, beam_fluence, beam_path
+
+# Unrolled loops would make the compilation for a GPU take a minute.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+
+@wp.func
+def pulse_fluence(energy: wp.float64, extinction: wp.float64, distance: wp.float64, tan2: wp.float64) -> wp.float64:
+    """Energy of a pulse per area on the target [J/m^2] (eq 3)."""
+    return energy * wp.exp(-extinction * distance) / (PI * distance * distance * tan2)
+
+
+@wp.func
+def footprint_energy(
+    fluence: wp.float64, distance: wp.float64, pixel_area: wp.float64, focal_length: wp.float64
+) -> wp.float64:
+    """Energy on the part of the target that a pixel of W x H = pixel_area [m^2] sees [J] (eq 4)."""
+    return fluence * distance * distance * pixel_area / (focal_length * focal_length)
+
+
+@wp.func
+def lens_fluence(
+    energy: wp.float64, reflectance: wp.float64, extinction: wp.float64, distance: wp.float64
+) -> wp.float64:
+    """Energy per area that comes back to the lens, reflected evenly into the half-space [J/m^2] (eq 5)."""
+    return reflectance * energy * wp.exp(-extinction * distance) / (TWO * PI * distance * distance)
+
+
+@wp.func
+def pixel_energy(fluence: wp.float64, pdp: wp.float64, focal_length: wp.float64, f_number: wp.float64) -> wp.float64:
+    """Energy collected by the lens and detected with probability pdp [J] (eq 6)."""
+    radius = focal_length / (TWO * f_number)
+    return pdp * fluence * PI * radius * radius
+
+
+@wp.func
+def lu2024_signal(lidar: Lidar, distance: wp.float64, reflectance: wp.float64) -> wp.float64:
+    """Signal detections per pulse, eq 3 to 6 in a row, which is eq 7 with K = 8.
+
+    The focal length cancels; here it is 1 m: the pixel's sides are pixel_tangent, the f-number is 1/(2 radius).
+    """
+    rho = pulse_fluence(lidar.photons, lidar.extinction, distance, lidar.tan2)
+    on_target = footprint_energy(rho, distance, lidar.pixel_tangent * lidar.pixel_tangent, ONE)
+    at_lens = lens_fluence(on_target, reflectance, lidar.extinction, distance)
+    f_number = HALF / wp.sqrt(lidar.aperture_area / PI)
+    return pixel_energy(at_lens, lidar.pde, ONE, f_number)
+
+
+@wp.func
+def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin: wp.bool) -> wp.vec3d:
+    """Origin or direction of the ray at a quantile of the beam's radius and azimuth, both in [0, 1)."""
+    sign = wp.where(lidar.axis[2] < ZERO, -ONE, ONE)
+    a = -ONE / (sign + lidar.axis[2])
+    b = lidar.axis[0] * lidar.axis[1] * a
+    b1 = wp.vec3d(ONE + sign * lidar.axis[0] * lidar.axis[0] * a, sign * b, -sign * lidar.axis[0])
+    b2 = wp.vec3d(b, sign + lidar.axis[1] * lidar.axis[1] * a, -lidar.axis[1])
+    phi = TWO * PI * azimuth
+    across = wp.cos(phi) * b1 + wp.sin(phi) * b2
+    if out_origin:
+        if lidar.profile == 2:
+            return lidar.laser + lidar.radius * wp.sqrt(radial) * across
+        return lidar.laser
+    if lidar.profile == 0:
+        t = lidar.spread * radial
+        return (ONE - t) * lidar.axis + wp.sqrt(t * (TWO - t)) * across
+    if lidar.profile == 1:
+        tangent = wp.sqrt(-HALF * lidar.tan2 * wp.log(ONE - radial))
+        return wp.normalize(lidar.axis + tangent * across)
+    return lidar.axis
+
+
+@wp.func
+def _small_spot_signal(
+    lidar: Lidar, x: wp.vec3d, view: wp.vec3d, normal: wp.vec3d, reflectance: wp.float64
+) -> wp.float64:
+    """Signal where the beam lights part of the pixel: its rays are followed to the surface's tangent plane at x."""
+    total = wp.float64(0.0)
+    half = HALF * lidar.pixel_tangent
+    for i in range(16):
+        for j in range(16):
+            radial = (wp.float64(i) + HALF) / wp.float64(16.0)
+            azimuth = (wp.float64(j) + HALF) / wp.float64(16.0)
+            origin = _beam_ray(lidar, radial, azimuth, True)
+            u = _beam_ray(lidar, radial, azimuth, False)
+            facing = -wp.dot(normal, u)
+            if facing > wp.float64(1.0e-6):
+                s = wp.dot(normal, origin - x) / facing
+                hit = origin + s * u
+                inside = wp.abs(hit[0] - view[0] / view[2] * hit[2]) <= half * hit[2]
+                inside = inside and wp.abs(hit[1] - view[1] / view[2] * hit[2]) <= half * hit[2]
+                r = wp.length(hit)
+                cos_out = -wp.dot(normal, hit) / r
+                if s > ZERO and inside and cos_out > ZERO:
+                    total += cos_out * (hit[2] / r) / (r * r) * wp.exp(-lidar.extinction * (s + r))
+    scale = lidar.photons * lidar.pde * reflectance / PI * lidar.aperture_area
+    return scale * total / wp.float64(256.0)
+
+
+@wp.func
+def radiometric_signal(
+    lidar: Lidar, view: wp.vec3d, distance: wp.float64, normal: wp.vec3d, reflectance: wp.float64
+) -> wp.float64:
+    """Signal detections per pulse by radiometry: eq 7 with K = 4, cos(theta_in) cos^4(psi) and the beam's own fluence.
+
+    A surface that fills the pixel has no cos(theta_out), because its footprint grows by the inverse. A beam narrower
+    than the pixel carries cos(theta_out) and not cos(theta_in).
+    """
+    x = distance * view
+    path = beam_path(lidar, x)
+    if path <= ZERO:
+        return ZERO
+    footprint = distance * lidar.pixel_tangent
+    spot = lidar.radius
+    if lidar.profile != 2:
+        spot = path * wp.sqrt(lidar.tan2)
+    if spot < TWO * footprint:
+        return _small_spot_signal(lidar, x, view, normal, reflectance)
+    fluence = beam_fluence(lidar, x)
+    if lidar.profile != 1:
+        # A pixel on the rim of the beam is lit in part.
+        lit = wp.int32(0)
+        for corner in range(4):
+            du = (wp.float64(corner % 2) - HALF) * lidar.pixel_tangent * x[2]
+            dv = (wp.float64(corner / 2) - HALF) * lidar.pixel_tangent * x[2]
+            if beam_fluence(lidar, x + wp.vec3d(du, dv, ZERO)) > ZERO:
+                lit += 1
+        if lit > 0 and lit < 4:
+            fluence = ZERO
+            for i in range(64):
+                du = ((wp.float64(i % 8) + HALF) / wp.float64(8.0) - HALF) * lidar.pixel_tangent * x[2]
+                dv = ((wp.float64(i / 8) + HALF) / wp.float64(8.0) - HALF) * lidar.pixel_tangent * x[2]
+                fluence += beam_fluence(lidar, x + wp.vec3d(du, dv, ZERO)) / wp.float64(64.0)
+    cos_in = wp.max(-wp.dot(normal, beam_direction(lidar, x)), ZERO)
+    cos_psi2 = view[2] * view[2]
+    collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
+    attenuation = wp.exp(-lidar.extinction * (path + distance))
+    return lidar.photons * lidar.pde * fluence * cos_in * reflectance / PI * collected * attenuation
+
+
+@wp.kernel
+def _signal(
+    first: int,
+    lidar: Lidar,
+    view: wp.array(dtype=wp.vec3d),
+    distance: wp.array(dtype=wp.float64),
+    normal: wp.array(dtype=wp.vec3d),
+    reflectance: wp.array(dtype=wp.float64),
+    # Out:
+    signal: wp.array(dtype=wp.float64),
+    arrival: wp.array(dtype=wp.float64),
+):
+    """Launch grid: pixels."""
+    i = first + wp.tid()
+    r = distance[i]
+    gamma = reflectance[i]
+    value = wp.float64(0.0)
+    time = wp.float64(wp.nan)
+    if r > ZERO:
+        time = (beam_path(lidar, r * view[i]) + r) / lidar.speed
+        if lidar.lu2024 == 1:
+            value = lu2024_signal(lidar, r, gamma)
+        else:
+            value = radiometric_signal(lidar, view[i], r, normal[i], gamma)
+        if not (value > ZERO):
+            value = ZERO
+    signal[i] = value
+    arrival[i] = time
+
+
+def signal_map(
+    lidar: Any, view: wp.array, distance: wp.array, normal: wp.array, reflectance: wp.array
+) -> tuple[wp.array, wp.array]:
+    """Signal detections per pulse and arrival time of each pixel.
+
+    Args:
+        lidar: A `Lidar`.
+        view: vec3d `[pixel]`, unit line of sight.
+        distance: float64 `[pixel]` [m]; NaN or 0 where nothing is hit.
+        normal: vec3d `[pixel]`, unit, towards the camera.
+        reflectance: float64 `[pixel]`.
+
+    Returns:
+        Signal float64 `[pixel]` (0 without a target) and arrival time float64 `[pixel]` [s] (NaN without a target).
+    """
+    count, device = view.shape[0], view.device
+    signal = wp.empty(count, dtype=wp.float64, device=device)
+    arrival = wp.empty(count, dtype=wp.float64, device=device)
+    launch_pixels(_signal, count, [lidar, view, distance, normal, reflectance, signal, arrival], device=device)
+    return signal, arrival

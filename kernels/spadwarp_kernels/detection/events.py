@@ -1,0 +1,269 @@
+"""Counts of a detector that is followed event by event: dead time and afterpulses.
+
+Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not depend on how a launch is cut up.
+"""
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.math.float64 import log1p
+from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.random.binomial import uniforms
+
+from .first_photon import zeroed_counts
+
+wp.set_module_options({"enable_backward": False})
+
+_EVENTS = wp.constant(wp.uint32(1))
+_ONE = wp.constant(wp.uint32(1))
+
+EVENT_LIMIT = 2**27
+"""Most detections of a pixel in one frame of the event-driven detector: random blocks are numbered in 28 bits."""
+
+
+@wp.func
+def _last_not_above(values: wp.array2d(dtype=wp.float64), row: int, x: wp.float64) -> int:
+    """Index i of the interval [values[i], values[i + 1]) of a rising row that holds x, clamped to the row."""
+    low = int(0)
+    high = values.shape[1] - 1
+    while high - low > 1:
+        middle = (low + high) / 2
+        if values[row, middle] <= x:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.kernel(enable_backward=False)
+def _cumulative_kernel(
+    first_pixel: int, offset: int, hazard: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=wp.float64)
+):
+    pixel = first_pixel + wp.tid()
+    total = wp.float64(0.0)
+    cumulative[pixel, 0] = total
+    for k in range(hazard.shape[1]):
+        total += wp.float64(hazard[offset + pixel, k])
+        cumulative[pixel, k + 1] = total
+
+
+@wp.struct
+class Moment:
+    """A time since the start of the window of a pulse [s]; `pulse` at the number of pulses stands for never."""
+
+    pulse: wp.int64
+    time: wp.float64
+
+
+@wp.func
+def _next_primary(
+    cumulative: wp.array2d(dtype=wp.float64),
+    edges: wp.array2d(dtype=wp.float64),
+    local: int,
+    pulses: wp.int64,
+    pulse: wp.int64,
+    passed: wp.float64,
+    xi: wp.float64,
+) -> Moment:
+    """The next photon or dark count after the hazard `passed` of a pulse. The hazard repeats with the period."""
+    zero = wp.float64(0.0)
+    found = Moment()
+    found.pulse = pulses
+    total = cumulative[local, cumulative.shape[1] - 1]
+    if total > zero:
+        target = passed - wp.log(wp.float64(1.0) - xi)
+        periods = wp.floor(target / total)
+        if periods < wp.float64(pulses - pulse):
+            target = wp.max(target - periods * total, zero)
+            k = _last_not_above(cumulative, local, target)
+            span = cumulative[local, k + 1] - cumulative[local, k]
+            part = zero
+            if span > zero:
+                part = wp.clamp((target - cumulative[local, k]) / span, zero, wp.float64(1.0))
+            found.pulse = pulse + wp.int64(periods)
+            found.time = edges[0, k] + part * (edges[0, k + 1] - edges[0, k])
+    return found
+
+
+@wp.func
+def _next_afterpulse(
+    first: Moment,
+    now: Moment,
+    pulses: wp.int64,
+    period: wp.float64,
+    time_constant: wp.float64,
+    trapped: wp.float64,
+    xi: wp.float64,
+) -> Moment:
+    """The next afterpulse if it comes before `first`, else that: the traps empty as one exponential, because all share
+    the time constant."""
+    wait = -wp.log(wp.float64(1.0) - xi)
+    if wait < trapped:
+        later = now.time - time_constant * log1p(-wait / trapped)
+        periods = wp.floor(later / period)
+        if periods < wp.float64(pulses - now.pulse):
+            after = Moment()
+            after.pulse = now.pulse + wp.int64(periods)
+            after.time = later - periods * period
+            if after.pulse < first.pulse or (after.pulse == first.pulse and after.time < first.time):
+                return after
+    return first
+
+
+@wp.kernel(enable_backward=False)
+def _event_kernel(
+    first_row: int,
+    # Pixels `offset` … of an image of `pixels`:
+    cumulative: wp.array2d(dtype=wp.float64),
+    offset: int,
+    pixels: int,
+    edges: wp.array2d(dtype=wp.float64),
+    recorded: int,
+    pulses: wp.int64,
+    period: wp.float64,
+    gated: int,
+    dead_time: wp.float64,
+    afterpulsing: wp.float64,
+    time_constant: wp.float64,
+    first_frame: wp.int64,
+    depth: int,
+    seed: wp.uint64,
+    write_tags: int,
+    tag_start: wp.array(dtype=wp.int64),
+    # Out, counts zero before:
+    counts: wp.array2d(dtype=int),
+    tag_count: wp.array(dtype=int),
+    tag_pulse: wp.array(dtype=wp.int64),
+    tag_bin: wp.array(dtype=int),
+):
+    tid = first_row + wp.tid()
+    local = tid % cumulative.shape[0]
+    frame = tid / cumulative.shape[0]
+    pixel = offset + local
+    row = frame * pixels + pixel
+    id = (wp.uint64(first_frame) + wp.uint64(frame)) * wp.uint64(pixels) + wp.uint64(pixel)
+    bins = edges.shape[1] - 1
+    end = edges[0, bins]
+    zero = wp.float64(0.0)
+    block = wp.uint32(0)
+    tags = int(0)
+    now = Moment()
+    passed = wp.float64(0.0)  # hazard of the window up to now
+    trapped = wp.float64(0.0)  # mean number of afterpulses still to come
+    while now.pulse < pulses:
+        draw = uniforms(seed, id, _EVENTS, block)
+        block = block + _ONE
+        found = _next_primary(cumulative, edges, local, pulses, now.pulse, passed, draw[0])
+        found = _next_afterpulse(found, now, pulses, period, time_constant, trapped, draw[1])
+        if found.pulse >= pulses:
+            now.pulse = pulses
+        else:
+            elapsed = wp.float64(found.pulse - now.pulse) * period + (found.time - now.time)
+            trapped = trapped * wp.exp(-elapsed / time_constant)
+            now.pulse = found.pulse
+            now.time = found.time
+            fires = gated == 0 or now.time < end  # between two windows a gated detector is off
+            if fires:
+                k = _last_not_above(edges, 0, now.time)
+                if k < recorded and now.time < edges[0, recorded]:
+                    if write_tags == 1:
+                        tag_pulse[tag_start[row] + wp.int64(tags)] = now.pulse
+                        tag_bin[tag_start[row] + wp.int64(tags)] = k
+                    elif counts[row, k] < depth:
+                        counts[row, k] = counts[row, k] + 1
+                    tags += 1
+            if gated == 1:
+                off = period - now.time
+                trapped = trapped * wp.exp(-off / time_constant)
+                if fires:
+                    trapped += afterpulsing * wp.exp(-wp.max(off - dead_time, zero) / time_constant)
+                now.pulse = now.pulse + wp.int64(1)
+                now.time = zero
+                passed = zero
+            else:
+                # `afterpulsing` is what is left of the traps when the dead time ends.
+                trapped = trapped * wp.exp(-dead_time / time_constant) + afterpulsing
+                later = now.time + dead_time
+                periods = wp.floor(later / period)
+                now.pulse = now.pulse + wp.int64(periods)
+                now.time = later - periods * period
+                k = _last_not_above(edges, 0, now.time)
+                part = wp.clamp((now.time - edges[0, k]) / (edges[0, k + 1] - edges[0, k]), zero, wp.float64(1.0))
+                passed = cumulative[local, k] + part * (cumulative[local, k + 1] - cumulative[local, k])
+    tag_count[row] = tags
+
+
+def event_counts(
+    hazard: wp.array,
+    *,
+    edges: np.ndarray,
+    recorded: int,
+    period: float,
+    pulses: int,
+    gated: bool = False,
+    dead_time: float = 0.0,
+    afterpulsing_probability: float = 0.0,
+    afterpulsing_time_constant: float = 1.0,
+    frames: int = 1,
+    first_frame: int = 0,
+    counter_depth: int = 0,
+    tags: bool = False,
+    seed: int,
+    counts: wp.array | None = None,
+) -> tuple[wp.array, dict[str, np.ndarray] | None]:
+    """Counts of a detector followed event by event through `pulses` periods; the cost is per detection.
+
+    The hazard of photons and dark counts repeats with every period. A detection is followed by the dead time (which
+    photons that meet it do not extend) and by afterpulses: on average `afterpulsing_probability` of them after the dead
+    time, with exponential delay; afterpulses have afterpulses.
+
+    Args:
+        hazard: λ, float32 `[pixel, bin]`.
+        edges: of its bins [s], float64 `[bin + 1]`, from 0 to at most `period`; no photon comes after the last.
+        recorded: the first `recorded` bins are histogrammed; in the others the detector fires unseen.
+        gated: off from a detection, or from the last edge, to the next pulse: first-photon TCSPC. Else free-running.
+        dead_time, afterpulsing_time_constant: [s].
+        tags: also return the stream of detections.
+        pulses, frames, first_frame, counter_depth, seed, counts: as in `first_photon_counts`.
+
+    Returns:
+        int32 `[frames · pixel, recorded]` and, with `tags`, the arrays `row` (frame · pixels + pixel, int64), `pulse`
+        (int64) and `bin` (int32) in the order of row and time; otherwise None.
+    """
+    device = hazard.device
+    pixels, bins = hazard.shape
+    rows = frames * pixels
+    counts = zeroed_counts(counts, (rows, recorded), device)
+    number = wp.zeros(rows, dtype=int, device=device)
+    # A period without dead time holds any number of detections: only then does the mean have to be looked up.
+    most = 1.0 if gated else period / dead_time + 1.0 if dead_time > 0 else np.inf
+    if pulses * most > EVENT_LIMIT:
+        most = min(most, float(hazard.numpy().sum(axis=1, dtype=np.float64).max()) / (1.0 - afterpulsing_probability))
+    if pulses * most > EVENT_LIMIT:
+        raise ValueError(f"a pixel may see {pulses * most:.3g} counts in a frame, above {EVENT_LIMIT}: use more frames")
+    edge_row = wp.array(np.asarray(edges, np.float64)[None, :], dtype=wp.float64, device=device)
+    chunk = max(1, min(pixels, 2**25 // (bins + 1)))
+
+    def run(write: int, start: wp.array, pulse: wp.array, bin: wp.array) -> None:
+        for offset in range(0, pixels, chunk):
+            size = min(chunk, pixels - offset)
+            cumulative = wp.empty((size, bins + 1), dtype=wp.float64, device=device)
+            launch_pixels(_cumulative_kernel, size, [offset, hazard, cumulative], device=device)
+            inputs = [cumulative, offset, pixels, edge_row, recorded, pulses, period, int(gated), dead_time]
+            inputs += [afterpulsing_probability, afterpulsing_time_constant, first_frame]
+            inputs += [counter_depth or 2**31 - 1, seed, write, start, counts, number, pulse, bin]
+            launch_pixels(_event_kernel, frames * size, inputs, device=device)
+
+    none = wp.zeros(1, dtype=wp.int64, device=device)
+    run(0, none, none, wp.zeros(1, dtype=int, device=device))
+    if not tags:
+        return counts, None
+    # The same draws again, now that each row's place in the stream is known.
+    per_row = number.numpy().astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(per_row)])
+    pulse = wp.empty(max(int(start[-1]), 1), dtype=wp.int64, device=device)
+    bin = wp.empty(max(int(start[-1]), 1), dtype=int, device=device)
+    run(1, wp.array(start, dtype=wp.int64, device=device), pulse, bin)
+    stream = {"row": np.repeat(np.arange(rows), per_row)}
+    stream |= {"pulse": pulse.numpy()[: start[-1]], "bin": bin.numpy()[: start[-1]]}
+    return counts, stream

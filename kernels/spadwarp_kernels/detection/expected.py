@@ -1,0 +1,231 @@
+"""Expected detections of a SPAD per pulse and bin, and what a histogram of counts says about them.
+
+λ[pixel, bin] is a hazard: the mean number of detections that a pulse would cause in the bin if the detector were always
+ready.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.math.float64 import expm1, log1p
+from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.random.binomial import uniforms
+
+wp.set_module_options({"enable_backward": False})
+
+_PATTERN = wp.constant(wp.uint32(2))
+_ONE = wp.constant(wp.uint32(1))
+
+
+@cache
+def _response_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def respond(
+        first_pixel: int,
+        source: wp.array2d(dtype=dtype),
+        # Sparse rows, one a detector bin:
+        row_start: wp.array(dtype=int),
+        source_bin: wp.array(dtype=int),
+        weight: wp.array(dtype=float),
+        width: wp.array(dtype=float),
+        noise_rate: wp.array(dtype=float),
+        # Out:
+        hazard: wp.array2d(dtype=float),
+    ):
+        pixel = first_pixel + wp.tid()
+        noise = noise_rate[pixel]
+        for k in range(width.shape[0]):
+            total = float(noise * width[k])
+            for entry in range(row_start[k], row_start[k + 1]):
+                total += weight[entry] * float(source[pixel, source_bin[entry]])
+            hazard[pixel, k] = total
+
+    return respond
+
+
+@wp.kernel(enable_backward=False)
+def _dark_count_kernel(
+    first_pixel: int,
+    seed: wp.uint64,
+    median: float,
+    spread: float,
+    hot_fraction: float,
+    hot_rate: float,
+    offset: float,
+    # Out:
+    rate: wp.array(dtype=float),
+):
+    pixel = first_pixel + wp.tid()
+    id = wp.uint64(pixel)
+    u = uniforms(seed, id, _PATTERN, wp.uint32(0))
+    chance = uniforms(seed, id, _PATTERN, _ONE)
+    if chance[0] < wp.float64(hot_fraction):
+        rate[pixel] = hot_rate + offset
+    else:
+        # Box–Muller
+        radius = wp.sqrt(wp.float64(-2.0) * wp.log(wp.float64(1.0) - u[0]))
+        normal = radius * wp.cos(wp.float64(6.283185307179586) * u[1])
+        rate[pixel] = median * float(wp.exp(wp.float64(spread) * normal)) + offset
+
+
+@wp.kernel(enable_backward=False)
+def _crosstalk_kernel(
+    first_pixel: int,
+    width: int,
+    probability: float,
+    detections: wp.array2d(dtype=float),
+    # In and out:
+    hazard: wp.array2d(dtype=float),
+):
+    pixel = first_pixel + wp.tid()
+    x = pixel % width
+    for k in range(hazard.shape[1]):
+        light = float(0.0)
+        if x > 0:
+            light += detections[pixel - 1, k]
+        if x < width - 1:
+            light += detections[pixel + 1, k]
+        if pixel >= width:
+            light += detections[pixel - width, k]
+        if pixel + width < hazard.shape[0]:
+            light += detections[pixel + width, k]
+        hazard[pixel, k] = hazard[pixel, k] + probability * light
+
+
+@cache
+def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def law(first_pixel: int, hazard: wp.array2d(dtype=dtype), probability: wp.array2d(dtype=dtype)):
+        pixel = first_pixel + wp.tid()
+        before = wp.float64(0.0)
+        for k in range(hazard.shape[1]):
+            h = wp.float64(hazard[pixel, k])
+            probability[pixel, k] = probability.dtype(-wp.exp(-before) * expm1(-h))
+            before += h
+
+    return law
+
+
+@wp.kernel(enable_backward=False)
+def _free_running_kernel(
+    first_pixel: int,
+    hazard: wp.array2d(dtype=float),
+    dead_time: float,
+    period: float,
+    probability: wp.array2d(dtype=float),
+):
+    pixel = first_pixel + wp.tid()
+    total = float(0.0)
+    for k in range(hazard.shape[1]):
+        total += hazard[pixel, k]
+    ready = 1.0 / (1.0 + total * dead_time / period)
+    for k in range(hazard.shape[1]):
+        probability[pixel, k] = hazard[pixel, k] * ready
+
+
+@wp.kernel(enable_backward=False)
+def _coates_kernel(
+    first_pixel: int, counts: wp.array2d(dtype=int), pulses: wp.float64, hazard: wp.array2d(dtype=wp.float64)
+):
+    pixel = first_pixel + wp.tid()
+    left = wp.float64(pulses)
+    for k in range(counts.shape[1]):
+        n = wp.float64(counts[pixel, k])
+        if n < left:
+            hazard[pixel, k] = -log1p(-n / left)
+        else:
+            hazard[pixel, k] = wp.float64(wp.nan)
+        left = left - n
+
+
+def dark_count_rates(
+    pixels: int,
+    *,
+    median: float,
+    spread: float = 0.0,
+    hot_fraction: float = 0.0,
+    hot_rate: float = 0.0,
+    offset: float = 0.0,
+    seed: int = 0,
+    device: Any = None,
+) -> wp.array:
+    """Dark count rate of every pixel [1/s], float32.
+
+    Lognormal about `median` with `spread` the standard deviation of ln(rate); hot pixels, a `hot_fraction` of all, have
+    `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure.
+    """
+    rate = wp.empty(pixels, dtype=float, device=device)
+    inputs = [seed, median, spread, hot_fraction, hot_rate, offset, rate]
+    launch_pixels(_dark_count_kernel, pixels, inputs, device=rate.device)
+    return rate
+
+
+def expected_detections(
+    source: wp.array,
+    *,
+    row_start: np.ndarray,
+    source_bin: np.ndarray,
+    weight: np.ndarray,
+    width: np.ndarray,
+    noise_rate: wp.array,
+) -> wp.array:
+    """λ per pulse in each detector bin, float32 `[pixel, detector bin]`.
+
+    λ_k = Σ weight · source[source_bin] over the entries row_start[k] … row_start[k + 1] + noise_rate · width_k.
+
+    Args:
+        source: `[pixel, source bin]`, detections per pulse.
+        row_start, source_bin, weight: sparse matrix (CSR) of the response, detector bins by source bins.
+        width: of the detector bins [s].
+        noise_rate: of dark counts and ambient light per pixel [1/s], float32.
+    """
+    device = source.device
+    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
+    matrix = [
+        wp.array(row_start, dtype=int, device=device),
+        wp.array(source_bin, dtype=int, device=device),
+        wp.array(weight, dtype=float, device=device),
+        wp.array(width, dtype=float, device=device),
+    ]
+    inputs = [source, *matrix, noise_rate, hazard]
+    launch_pixels(_response_kernel(source.dtype), source.shape[0], inputs, device=device)
+    return hazard
+
+
+def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, probability: float) -> None:
+    """Add `probability` times the four neighbours' expected detections to λ, in place; both float32 `[pixel, bin]`."""
+    inputs = [image_width, probability, detections, hazard]
+    launch_pixels(_crosstalk_kernel, hazard.shape[0], inputs, device=hazard.device)
+
+
+def first_photon_probabilities(hazard: wp.array) -> wp.array:
+    """P(first photon in bin k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)), of λ's shape `[pixel, bin]` and float type."""
+    law = wp.empty(hazard.shape, dtype=hazard.dtype, device=hazard.device)
+    launch_pixels(_first_photon_law_kernel(hazard.dtype), hazard.shape[0], [hazard, law], device=hazard.device)
+    return law
+
+
+def free_running_probabilities(hazard: wp.array, *, dead_time: float, period: float) -> wp.array:
+    """Mean detections per pulse and bin behind a dead time, λ_k / (1 + Σλ · dead_time / period), `[pixel, bin]`.
+
+    Exact in the sum for a steady rate; the shadow that a strong return casts over the bins behind it is spread out.
+    """
+    seen = wp.empty(hazard.shape, dtype=float, device=hazard.device)
+    inputs = [hazard, dead_time, period, seen]
+    launch_pixels(_free_running_kernel, hazard.shape[0], inputs, device=hazard.device)
+    return seen
+
+
+def coates(counts: wp.array, *, pulses: float) -> wp.array:
+    """Coates' correction: λ̂_k = −ln(1 − n_k / (pulses − Σ_{j<k} n_j)), float64 `[pixel, bin]` of int32 counts.
+
+    NaN from the bin on that holds the last pulse left: nothing can be said of what follows.
+    Source: P. B. Coates, "The correction for photon pile-up in the measurement of radiative lifetimes", J. Phys. E 1,
+    878 (1968).
+    """
+    hazard = wp.empty(counts.shape, dtype=wp.float64, device=counts.device)
+    launch_pixels(_coates_kernel, counts.shape[0], [counts, pulses, hazard], device=counts.device)
+    return hazard

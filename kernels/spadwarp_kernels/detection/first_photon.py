@@ -1,0 +1,118 @@
+"""Counts of first-photon TCSPC: at most one count a pulse and pixel.
+
+Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not depend on how a launch is cut up.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.random.binomial import binomial, uniforms
+
+wp.set_module_options({"enable_backward": False})
+
+_COUNTS = wp.constant(wp.uint32(0))
+_ONE = wp.constant(wp.uint32(1))
+
+_SPARSE = wp.constant(
+    wp.float64(2.0)
+)  # mean counts in a bin below which waiting times are cheaper than a binomial draw
+
+
+@wp.func
+def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.uint32) -> wp.float64:
+    """Waiting time of unit rate, finite."""
+    u = uniforms(seed, id, purpose, block)
+    return -wp.log(wp.float64(1.0) - u[0])
+
+
+@wp.kernel(enable_backward=False)
+def _first_photon_kernel(
+    first_row: int,
+    hazard: wp.array2d(dtype=float),
+    pulses: int,
+    first_frame: wp.int64,
+    summed: int,
+    depth: int,
+    seed: wp.uint64,
+    # Out, zero before:
+    counts: wp.array2d(dtype=int),
+):
+    row = first_row + wp.tid()
+    pixels = hazard.shape[0]
+    pixel = row % pixels
+    for part in range(summed):
+        frame = wp.uint64(first_frame) + wp.uint64(row / pixels * summed + part)
+        id = frame * wp.uint64(pixels) + wp.uint64(pixel)
+        block = wp.uint32(0)
+        left = int(pulses)  # pulses without a count so far
+        waiting = int(0)
+        wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+        for k in range(hazard.shape[1]):
+            h = wp.float64(hazard[pixel, k])
+            if h > wp.float64(0.0) and left > 0:
+                count = int(0)
+                if wp.float64(left) * h < _SPARSE:
+                    # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+                    if waiting == 0:
+                        wait = _exponential(seed, id, _COUNTS, block)
+                        block = block + _ONE
+                        waiting = 1
+                    while left > 0 and wait < wp.float64(left) * h:
+                        h = h - wait / wp.float64(left)
+                        left = left - 1
+                        count = count + 1
+                        wait = _exponential(seed, id, _COUNTS, block)
+                        block = block + _ONE
+                    wait = wait - wp.float64(left) * h
+                else:
+                    # Exponential waits have no memory: the one begun may be dropped.
+                    waiting = 0
+                    count, block = binomial(left, h, seed, id, _COUNTS, block)
+                    left = left - count
+                if count > 0:
+                    counts[row, k] = counts[row, k] + wp.min(count, depth)
+
+
+def first_photon_counts(
+    hazard: wp.array,
+    *,
+    pulses: int,
+    frames: int = 1,
+    first_frame: int = 0,
+    summed: bool = False,
+    counter_depth: int = 0,
+    seed: int,
+    counts: wp.array | None = None,
+) -> wp.array:
+    """Counts of first-photon TCSPC, drawn exactly: bin after bin a binomial of the pulses that have not counted yet.
+
+    Args:
+        hazard: λ, float32 `[pixel, bin]`, not negative.
+        pulses: per frame, below 2^31.
+        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call.
+        summed: add the frames up.
+        counter_depth: largest count of a bin and frame, 0: unlimited.
+        seed: 64 bits.
+        counts: the caller's own contiguous array of that size to write into.
+
+    Returns:
+        int32 `[frames · pixel, bin]`, or `[pixel, bin]` if summed. At most one count per pulse and pixel.
+    """
+    pixels, bins = hazard.shape
+    rows = pixels if summed else frames * pixels
+    counts = zeroed_counts(counts, (rows, bins), hazard.device)
+    inputs = [hazard, pulses, first_frame, frames if summed else 1, counter_depth or 2**31 - 1, seed, counts]
+    launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
+    return counts
+
+
+def zeroed_counts(array: wp.array | None, shape: tuple[int, int], device: Any) -> wp.array:
+    """The caller's array of counts, or a new one, set to zero."""
+    if array is None:
+        return wp.zeros(shape, dtype=int, device=device)
+    if array.dtype is not wp.int32 or array.size != shape[0] * shape[1] or not array.is_contiguous:
+        raise ValueError(f"counts are {array.dtype.__name__} {array.shape}; contiguous int32 {shape} is needed")
+    array.zero_()
+    return array.reshape(shape)
