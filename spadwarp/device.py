@@ -6,6 +6,7 @@ import ctypes
 import functools
 import os
 import platform
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spadwarp.errors import DeviceError
@@ -13,7 +14,16 @@ from spadwarp.errors import DeviceError
 if TYPE_CHECKING:
     import warp as wp
 
-__all__ = ["core_count", "devices", "physical_memory", "pick_device", "pick_devices", "processor_name", "start_warp"]
+__all__ = [
+    "core_count",
+    "devices",
+    "nvidia_driver",
+    "physical_memory",
+    "pick_device",
+    "pick_devices",
+    "processor_name",
+    "start_warp",
+]
 
 
 def pick_devices(names: str | None = None) -> list[wp.Device]:
@@ -131,3 +141,12 @@ def core_count() -> int:
 def physical_memory() -> int | None:
     """Memory of the machine [bytes]; None where the system does not report it."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
+
+
+def nvidia_driver() -> str | None:
+    """Release of the NVIDIA driver, such as "580.65.06", where Linux reports it; else None."""
+    try:
+        words = Path("/proc/driver/nvidia/version").read_text().split()
+    except OSError:
+        return None
+    return next((word for word in words if word[0].isdigit() and "." in word), None)

@@ -85,7 +85,7 @@ def compare(
     Returns:
         Our absorbed fraction of the light.
     """
-    from spadwarp.benchmark.cases import CASES, TransportRun
+    from spadwarp.benchmark import CASES, TransportRun
     from spadwarp.device import core_count, pick_device
     from spadwarp_kernels import LEDGER_UNIT
 

@@ -80,7 +80,7 @@ def measure(package: ModuleType, name: str, args: argparse.Namespace, settings: 
 
     # One seed, since MCX compiles it in: its runs repeat each other, ours do not.
     import spadwarp
-    from spadwarp.benchmark.cases import CASES
+    from spadwarp.benchmark import CASES
 
     scene = spadwarp.Scene.from_dict(CASES["cube60"].scene)
     spread = float(spadwarp.transport.trace(scene, photons=50_000, device=args.device).weight.std())

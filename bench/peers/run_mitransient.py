@@ -29,7 +29,7 @@ def staircase(folder: str) -> str:
     """The target as a PLY file in the camera frame."""
     import trimesh
 
-    from spadwarp.benchmark.cases import CASES
+    from spadwarp.benchmark import CASES
     from spadwarp.mesh import build_mesh
     from spadwarp.scene import Scene
 
@@ -126,7 +126,7 @@ if __name__ == "__main__":
     import drjit
 
     import spadwarp
-    from spadwarp.benchmark.cases import CASES
+    from spadwarp.benchmark import CASES
 
     samples = max(1, args.photons // SIZE**2)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,5 +1,7 @@
-"""How fast this machine is: named cases, each a scene that `run` times."""
+"""How fast this machine is, in numbers that can be kept and compared: `run` measures named cases."""
 
-from spadwarp.benchmark.cases import CASES, BenchResult, load_report, ratios, report, run
+from spadwarp.benchmark.cases import CASES, GROUPS, Case
+from spadwarp.benchmark.results import BenchResult, load_report, ratios, report
+from spadwarp.benchmark.runs import TransportRun, run
 
-__all__ = ["CASES", "BenchResult", "load_report", "ratios", "report", "run"]
+__all__ = ["CASES", "GROUPS", "BenchResult", "Case", "TransportRun", "load_report", "ratios", "report", "run"]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
 from spadwarp.cli._tables import new_table
@@ -47,11 +46,11 @@ def bench(
       spadwarp bench water staircase_5m --compare before.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark import CASES, load_report, ratios, report
+    from spadwarp.benchmark import CASES, load_report, ratios, report, run
 
     if list_cases:
         for case in CASES.values():
-            say(f"{case.name:<20}  {case.about}")
+            say(f"{case.name:<20}  {case.summary}")
         say(f"{'scaling':<20}  how cost and memory grow with photons, faces and bins")
         return
     before = None if compare is None else load_report(compare)
@@ -67,12 +66,12 @@ def bench(
             say(_row(result))
 
     try:
-        spadwarp.benchmark.run(
+        run(
             cases or None,
             device=device,
             photons=photons,
             repeats=repeats,
-            progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
+            progress=None if quiet else lambda case: complain(f"{case.name}: {case.summary}"),
             found=found,
         )
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then

@@ -31,7 +31,7 @@ def doctor(
       spadwarp doctor
       spadwarp doctor --device cpu --json report.json
     """
-    found = spadwarp.doctor.diagnosis.doctor(device=device, self_test=self_test, progress=None if quiet else complain)
+    found = spadwarp.doctor.diagnose(device=device, self_test=self_test, progress=None if quiet else complain)
     if not quiet:
         for title, facts in found.facts.items():
             say(f"{title}\n{opt.rows(facts, indent='  ')}")
@@ -40,14 +40,14 @@ def doctor(
         if found.tests:
             took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
             say(f"Self-test ({took})")
-            say(opt.rows({test.name: _told(test) for test in found.tests}, indent="  "))
+            say(opt.rows({test.name: _verdict(test) for test in found.tests}, indent="  "))
     opt.write_json({**dataclasses.asdict(found), "healthy": found.healthy}, json_path)
     if not found.healthy:
-        failed = [f"self-test: {test.name}: {_told(test)}" for test in found.tests if not test.passed]
+        failed = [f"self-test: {test.name}: {_verdict(test)}" for test in found.tests if not test.passed]
         fail("\n".join([*found.problems, *failed]))
 
 
-def _told(test: spadwarp.SelfTest) -> str:
+def _verdict(test: spadwarp.doctor.SelfTest) -> str:
     verdict = "ok" if test.passed else "FAILED"
     if not test.standard_error:
         return f"{test.value:g} ({verdict})"

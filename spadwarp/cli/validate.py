@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
 
@@ -46,27 +45,26 @@ def validate(
       spadwarp validate
       spadwarp validate slab cube60 --photons 1e7 --seed 1 --json report.json --plots plots/
     """
-    from spadwarp.validate import CASES, plot_results
-    from spadwarp.validate import write_json as write_report
+    from spadwarp.validate import CASES, draw_results, run, write_json
 
     if list_cases:
-        say(opt.rows({case.name: case.about for case in CASES.values()}))
+        say(opt.rows({case.name: case.summary for case in CASES.values()}))
         return
     for place in (plots, None if json_path is None else json_path.parent):
         if place is not None:
             opt.check_writable(place)
-    results = spadwarp.validate.validate(
+    results = run(
         cases or None,
         photons=photons,
         seed=seed or 0,
         device=device,
         tabulated=tabulated,
-        progress=None if quiet else lambda case: complain(f"{case.name}: {case.about}"),
+        progress=None if quiet else lambda case: complain(f"{case.name}: {case.summary}"),
     )
     failed = [result for result in results if not result.passed]
     if json_path is not None:
-        write_report(results, json_path, photons=photons, seed=seed or 0)
-    drawn = [] if plots is None else plot_results(results, plots)
+        write_json(results, json_path, photons=photons, seed=seed or 0)
+    drawn = [] if plots is None else draw_results(results, plots)
     if not quiet:
         opt.show_table(_table(results))
         say(f"{len(results) - len(failed)} of {len(results)} agree" + (f"; plots in {plots}" if drawn else ""))

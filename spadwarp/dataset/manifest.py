@@ -17,6 +17,7 @@ from spadwarp.dataset.shards import checksum, write_scene_index
 from spadwarp.device import core_count
 from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.text import json_text
 
 __all__ = ["check_shards", "finish", "read_manifest", "record_path", "verify_dataset", "write_json"]
 
@@ -161,4 +162,4 @@ def _write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes a JSON file, whole or not at all."""
-    _write_text(path, json.dumps(value, indent=1) + "\n")
+    _write_text(path, json_text(value, indent=1))

@@ -17,7 +17,7 @@ from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames import Frames, crlb, detect
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
-from spadwarp.transport.simulation import simulate
+from spadwarp.transport import simulate
 
 __all__ = ["render_transport"]
 

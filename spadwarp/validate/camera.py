@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.mesh import load_target
+from spadwarp.scene import Target
 from spadwarp.scene.pose import rotation_angles
-from spadwarp.validate import references as known
-from spadwarp.validate.runs import Case, Run, point_source, scene
-from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means
+from spadwarp.validate import references
+from spadwarp.validate.case import Case, Run, point_source, scene
+from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, quantities
 
 __all__ = ["CASES", "scattered_once"]
 
@@ -31,31 +33,27 @@ def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
 
 
 def _single_scatter(run: Run) -> list[Quantity]:
-    tables = scattered_once(_WATER)
+    tables, places = scattered_once(_WATER), references.SINGLE_SCATTER
     sums = [
-        [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in known.SINGLE_SCATTER.values()]
+        [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in places.values()]
         for result in run.results(tables)
     ]
-    estimates = batch_means(np.reshape(sums, (len(sums), -1)))
-    names = [(where, k, v) for where, (_, _, bins) in known.SINGLE_SCATTER.items() for k, v in enumerate(bins)]
-    return [
-        Quantity(f"path {k + 2}–{k + 3} m, {where}", estimate, reference)
-        for (where, k, reference), estimate in zip(names, estimates, strict=True)
-    ]
+    names = [f"path {k + 2}–{k + 3} m, {place}" for place, (_, _, bins) in places.items() for k in range(len(bins))]
+    expected = [fraction for _, _, bins in places.values() for fraction in bins]
+    return quantities(names, batch_means(np.reshape(sums, (len(sums), -1))), expected)
 
 
 def _lambertian(run: Run) -> list[Quantity]:
     laser = {"position": [0.1, -0.05, 0.0], "profile": "uniform_cone", "half_angle_deg": 10.0}
     plane = {"builtin": "plane", "size": [20.0, 20.0], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     tables = scene(_WATER, laser, camera=_CAMERA, path_edges=(0.0, 12.0, 12), targets=[plane], max_collisions=1)
+    places = references.LAMBERTIAN
     sums = [
-        [result.component("ballistic")[rows, columns].sum() for rows, columns, _ in known.LAMBERTIAN.values()]
+        [result.component("ballistic")[rows, columns].sum() for rows, columns, _ in places.values()]
         for result in run.results(tables)
     ]
-    return [
-        Quantity(f"reflected once, {where}", estimate, reference)
-        for (where, (_, _, reference)), estimate in zip(known.LAMBERTIAN.items(), batch_means(sums), strict=True)
-    ]
+    names = [f"reflected once, {place}" for place in places]
+    return quantities(names, batch_means(sums), [fraction for _, _, fraction in places.values()])
 
 
 def _ledger(run: Run) -> list[Quantity]:
@@ -73,7 +71,7 @@ def _ledger(run: Run) -> list[Quantity]:
     }
     # The older word for "lu2024": the text of these tables seeds the photons.
     water = {"extinction": 0.6, "albedo": "paper", "anisotropy": 0.924}
-    quantities = []
+    measured = []
     for estimator in ("analog", "next_event", "guided"):
         for termination, cutoff in (("cutoff", 0.05), ("roulette", 0.3)):
             rules: dict[str, Any] = {"estimator": estimator, "termination": termination, "weight_cutoff": cutoff}
@@ -82,42 +80,40 @@ def _ledger(run: Run) -> list[Quantity]:
                 emitted = result.photons / result.ledger_unit
                 entries = {name: value for name, value in result.ledger.items() if name != "emitted"}
                 missing += abs(round(emitted) - sum(entries.values()))
-                gains.append([entries.get(name, 0) / emitted for name in ("roulette", "importance_sampling_residual")])
+                gains.append(
+                    [entries.get(entry, 0) / emitted for entry in ("roulette", "importance_sampling_residual")]
+                )
             name = f"{estimator}, {termination}"
-            quantities.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
-            for entry, gain, possible in zip(
-                ("roulette", "importance_sampling_residual"),
-                batch_means(gains),
-                (termination == "roulette", estimator == "guided"),
-                strict=True,
-            ):
-                if possible:
-                    quantities.append(Quantity(f"mean {entry} entry per photon, {name}", gain, 0.0))
-    return quantities
+            measured.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
+            roulette, residual = batch_means(gains)
+            if termination == "roulette":
+                measured.append(Quantity(f"mean roulette entry per photon, {name}", roulette, 0.0))
+            if estimator == "guided":
+                measured.append(Quantity(f"mean importance_sampling_residual entry per photon, {name}", residual, 0.0))
+    return measured
 
 
 def _reciprocity(run: Run) -> list[Quantity]:
     """Laser and camera change places: cones of equal half-angle, a box in the beams, many scatterings."""
     half_angle, pixels = 6.0, 64
-    diameter = 1e-3
     camera = {
         "width": pixels,
         "height": pixels,
         "horizontal_fov_deg": 2 * half_angle,
-        "aperture_diameter": diameter,
+        "aperture_diameter": 1e-3,
     }
     position, direction = np.array([-0.8, 0.3, -0.4]), np.array([0.22, -0.05, 1.0])
     direction /= np.linalg.norm(direction)
     centre = np.array([0.25, 0.1, 3.2])
-    turn = _turn_onto_z(direction)
+    turn = _rotation_onto_z(direction)
     weights = _disc_weights(math.radians(half_angle), pixels)
 
-    def measured(at: NDArray, along: NDArray, placement: NDArray, turned: NDArray) -> list[Estimate]:
+    def measured(at: NDArray, along: NDArray, placement: NDArray, rotation: NDArray) -> list[Estimate]:
         laser = {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle}
         block = {
             "builtin": "box",
             "size": [0.7, 0.5, 0.6],
-            "rotation_deg": rotation_angles(turned),
+            "rotation_deg": rotation_angles(rotation),
             "translation": placement.tolist(),
         }
         tables = scene(
@@ -131,19 +127,19 @@ def _reciprocity(run: Run) -> list[Quantity]:
         )
         return batch_means([np.einsum("ijt,ij->t", r.histogram, weights) for r in run.results(tables)])
 
-    # In the other's frame, x' = turn·(x − position), this laser looks along +z from the origin and serves as the
-    # camera.
+    # Swapped: in the frame x' = turn·(x − position) the laser's place and axis are those of a camera.
     forward = measured(position, direction, centre, np.eye(3))
     backward = measured(turn @ -position, turn @ np.array([0.0, 0.0, 1.0]), turn @ (centre - position), turn)
+    names = [f"path {k}–{k + 2} m, laser and camera swapped" for k in range(5, 13, 2)]
     return [
-        Quantity(f"path {5 + 2 * k}–{7 + 2 * k} m, laser and camera swapped", one, other.value, other.standard_error)
-        for k, (one, other) in enumerate(zip(forward, backward, strict=True))
+        Quantity(name, estimate, swapped.value, swapped.standard_error)
+        for name, estimate, swapped in zip(names, forward, backward, strict=True)
     ]
 
 
 def _mean_path(run: Run) -> list[Quantity]:
-    """White walls make cosine-law light of any light shut in by them: its mean path from wall to wall is 4V/S."""
-    quantities = []
+    """Light between white walls becomes isotropic: its mean path from wall to wall is 4V/S (Blanco & Fournier 2003)."""
+    measured = []
     bodies = {
         "box 1 × 2 × 3 m": {"builtin": "box", "size": [1.0, 2.0, 3.0]},
         "sphere of 2 m": {"builtin": "sphere", "size": [2.0]},
@@ -153,8 +149,8 @@ def _mean_path(run: Run) -> list[Quantity]:
         "c 1 1/m, g 0.924": {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924},
         "c 2 1/m, g −0.5": {"extinction": 2.0, "albedo": 1.0, "anisotropy": -0.5},
     }
-    # The light has to forget where it started: with c 2 1/m and g −0.5 the slowest even mode of the box decays as
-    # exp(−0.49 path), which left 1.5e-4 of the mean path after 15 m.
+    # The light has to become isotropic first: with c 2 1/m and g −0.5 the slowest even mode of the box decays as
+    # exp(−0.49 path), which left an error of 1.5e-4 of the mean path after 15 m.
     early, late = 30.0, 50.0
     for body, target in bodies.items():
         targets = [{**target, "reflectance": 1.0}]
@@ -171,15 +167,12 @@ def _mean_path(run: Run) -> list[Quantity]:
             walls = events.value - medium["extinction"] * (late - early)
             path = (late - early) / walls
             estimate = Estimate(path, path / walls * events.standard_error)
-            quantities.append(Quantity(f"mean path [m], {body}, {water}", estimate, expected))
-    return quantities
+            measured.append(Quantity(f"mean path [m], {body}, {water}", estimate, expected))
+    return measured
 
 
 def _four_volumes_per_area(target: dict[str, Any]) -> float:
     """4V/S [m] of a closed convex target about the origin."""
-    from spadwarp.mesh import load_target
-    from spadwarp.scene import Target
-
     mesh = load_target(Target(**target))
     corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -187,7 +180,7 @@ def _four_volumes_per_area(target: dict[str, Any]) -> float:
     return 4.0 * volume / (np.linalg.norm(cross, axis=1).sum() / 2.0)
 
 
-def _turn_onto_z(direction: NDArray) -> NDArray:
+def _rotation_onto_z(direction: NDArray) -> NDArray:
     """A rotation matrix that takes a unit vector to +z."""
     right = np.cross([0.0, 1.0, 0.0], direction)
     right /= np.linalg.norm(right)
@@ -195,7 +188,8 @@ def _turn_onto_z(direction: NDArray) -> NDArray:
 
 
 def _disc_weights(half_angle: float, pixels: int, inner: int = 16) -> NDArray[np.float64]:
-    """What makes a square camera see like a laser's uniform cone: 1/cosψ inside it, 0 outside, `[pixels, pixels]`."""
+    """Weights with which a square camera has the field of a laser's uniform cone: 1/cosψ inside it, 0 outside;
+    `[pixels, pixels]`."""
     fine = pixels * inner
     tangent = ((np.arange(fine) + 0.5) / fine * 2.0 - 1.0) * math.tan(half_angle)
     squared = tangent[:, None] ** 2 + tangent**2

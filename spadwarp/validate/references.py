@@ -1,7 +1,7 @@
-"""Numbers that the cases are held to, each with its source.
+"""The reference values of the cases, each with its source.
 
-Published rows stand with more digits than were published where the float64 references of the test suite
-(`tests/reference/`) give them; the tests hold those references to the published digits and these numbers to the
+Some published values have more digits here than were published: those of the float64 references of the test suite
+(`tests/reference/`). The tests compare these references with the published digits, and the values here with the
 references.
 """
 

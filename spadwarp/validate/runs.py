@@ -1,131 +1,133 @@
-"""What a case needs of the simulator: scenes from few words, photon records in blocks, independent runs."""
+"""Running the reference cases, judging their quantities together, and reporting them."""
 
 from __future__ import annotations
 
-import hashlib
-import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+from spadwarp.errors import ConfigError
+from spadwarp.io.atomic import atomic_path
+from spadwarp.io.text import json_text
+from spadwarp.validate import camera, phase, water
+from spadwarp.validate.case import Case, Run
+from spadwarp.validate.statistics import holm, two_sided_p
+from spadwarp.viz import draw_validation
 
-from spadwarp.scene import Scene, phase_function
-from spadwarp.units import time_from_path
-from spadwarp.validate.statistics import Quantity
+__all__ = ["CASES", "FAMILY_LEVEL", "CaseResult", "draw_results", "run", "write_json"]
 
-__all__ = ["PENCIL", "Case", "Run", "point_source", "scene"]
+CASES: dict[str, Case] = {case.name: case for case in (*water.CASES, *phase.CASES, *camera.CASES)}
+"""The reference cases by name."""
 
-BLOCK = 1 << 20  # photons whose records are held at a time
-BATCHES = 32  # independent runs behind a standard error of a histogram
-
-# A point source of pencil light along +z, and the camera and the gate of scenes that have no use for them.
-PENCIL = {"profile": "collimated", "beam_radius": 0.0}
-_BLIND = {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01}
-
-# The exact transport: no rule of thumb, no limit.
-_EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 - 1}
+FAMILY_LEVEL = 1e-3
+"""Probability that a run of a correct simulator fails, however many quantities it has."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """How the cases are run: photons for each scene, seed, device (None: the default one).
-
-    With a folder for `tables` every Henyey–Greenstein function goes through a file of angles and values, but for those
-    of layers, which cannot have a table each.
-    """
-
-    photons: int
-    seed: int
-    device: str | None = None
-    tables: Path | None = None
-
-    def records(self, tables: Mapping[str, Any], *, key: str | None = None) -> Iterator[Any]:
-        """`PhotonRecords` of blocks of photons; random numbers of its own for each scene, or for each `key`."""
-        from spadwarp.transport.records import trace
-
-        traced = self._scene(tables)
-        for block, start in enumerate(range(0, self.photons, BLOCK)):
-            count = min(BLOCK, self.photons - start)
-            yield trace(traced, photons=count, seed=self._seed(key or repr(tables), block), device=self.device)
-
-    def results(self, tables: Mapping[str, Any]) -> Iterator[Any]:
-        """`Result`s of `BATCHES` independent runs; each scene has random numbers of its own."""
-        from spadwarp.transport.simulation import simulate
-
-        simulated = self._scene(tables)
-        photons = max(1, self.photons // BATCHES)
-        for batch in range(BATCHES):
-            yield simulate(simulated, photons=photons, seed=self._seed(repr(tables), batch), device=self.device)
-
-    def _scene(self, tables: Mapping[str, Any]) -> Scene:
-        medium = tables["medium"]
-        if self.tables is None or "phase_function" in medium or "layers" in medium:
-            return Scene.from_dict(tables)
-        path = self.tables / f"g{medium.get('anisotropy', 0.924)}.csv"
-        if not path.exists():
-            # Dense at both ends, wherever the peak lies; 1e-5 between the points.
-            near = np.concatenate([[0.0], np.geomspace(1e-3, 90.0, 2000)])
-            angles = np.concatenate([near, 180.0 - near[-2::-1]])
-            law = phase_function(Scene.from_dict(tables).medium)
-            np.savetxt(path, np.column_stack([angles, law.density(np.radians(angles))]), fmt="%.9g", delimiter=",")
-        changed = {**medium, "phase_function": "tabulated", "phase_table": str(path)}
-        return Scene.from_dict({**tables, "medium": changed})
-
-    def _seed(self, key: str, block: int) -> int:
-        digest = hashlib.blake2b(f"{self.seed} {block} {key}".encode(), digest_size=8).digest()
-        return int.from_bytes(digest, "little")
-
-
-@dataclass(frozen=True)
-class Case:
-    """One reference case.
+class CaseResult:
+    """One measured quantity of a case.
 
     Attributes:
-        name: Its key.
-        about: What is checked, and where the reference comes from.
-        measure: Runs it.
+        name: Of the case.
+        quantity: What was measured, with its unit.
+        value: The simulator's value.
+        reference: The known value.
+        standard_error: Of the difference; 0 where both must be equal.
+        z: The difference in standard deviations of a normal distribution.
+        p: Two-sided probability of such a z, corrected for the number of quantities in the run (Holm 1979).
+        passed: Whether p exceeds `FAMILY_LEVEL`.
     """
 
     name: str
-    about: str
-    measure: Callable[[Run], list[Quantity]]
+    quantity: str
+    value: float
+    reference: float
+    standard_error: float
+    z: float
+    p: float
+    passed: bool
 
 
-def scene(
-    medium: Mapping[str, Any],
-    laser: Mapping[str, Any],
+def run(
+    cases: Iterable[str] | None = None,
     *,
-    camera: Mapping[str, Any] = _BLIND,
-    path_edges: tuple[float, float, int] = (0.0, 1e7, 1),
-    targets: list[dict[str, Any]] | None = None,
-    domain: Mapping[str, Any] | None = None,
-    **transport: Any,
-) -> dict[str, Any]:
-    """Tables of a scene with index 1 and exact transport; `path_edges` is (start [m], stop [m], bins) of the gate."""
-    start, stop, bins = path_edges
-    medium = {"group_index": 1.0, "phase_index": 1.0, **medium}
-    first, width = (time_from_path(path, medium["group_index"]) for path in (start, (stop - start) / bins))
-    gate = {"start_ns": first * 1e9, "bin_width_ps": width * 1e12, "bins": bins}
-    tables: dict[str, Any] = {
-        "medium": medium,
-        "laser": dict(laser),
-        "camera": dict(camera),
-        "gate": gate,
-        "domain": dict(domain or {}),
-        "transport": {**_EXACT, **transport},
+    photons: int = 1_000_000,
+    seed: int = 0,
+    device: str | None = None,
+    tabulated: bool = False,
+    progress: Callable[[Case], None] | None = None,
+) -> list[CaseResult]:
+    """Runs reference cases and compares them with their references.
+
+    Args:
+        cases: Names out of `CASES`; all by default.
+        photons: For each scene of a case, at least 1000. A million take a few seconds per case on a GPU; more photons
+            find smaller errors.
+        seed: Of the random numbers, in [0, 2^40].
+        device: As for `spadwarp.simulate`.
+        tabulated: Whether every Henyey–Greenstein phase function is first written to a table and read from it.
+        progress: Called with each case before it is run.
+
+    Returns:
+        One result for each quantity, in the order of the cases.
+
+    Raises:
+        ConfigError: An unknown case, or photons or seed out of range.
+    """
+    names = list(CASES) if cases is None else list(cases)
+    for name in names:
+        if name not in CASES:
+            raise ConfigError(f"cases: {name!r} is not one of {', '.join(CASES)}")
+    for field, value, low, high in (("photons", photons, 1000, 10**12), ("seed", seed, 0, 2**40)):
+        if not low <= value <= high:
+            raise ConfigError(f"{field} = {value} is outside [{low}, {high}]")
+    measured = []
+    with tempfile.TemporaryDirectory() as folder:
+        setup = Run(photons=photons, seed=seed, device=device, tables=Path(folder) if tabulated else None)
+        for name in names:
+            if progress is not None:
+                progress(CASES[name])
+            measured += [(name, quantity) for quantity in CASES[name].measure(setup)]
+    return [
+        CaseResult(
+            name=name,
+            quantity=quantity.name,
+            value=quantity.estimate.value,
+            reference=quantity.reference,
+            standard_error=quantity.standard_error,
+            z=quantity.z,
+            p=p,
+            passed=p > FAMILY_LEVEL,
+        )
+        for (name, quantity), p in zip(measured, holm(two_sided_p(quantity.z) for _, quantity in measured), strict=True)
+    ]
+
+
+def write_json(results: Sequence[CaseResult], path: str | Path, *, photons: int, seed: int) -> None:
+    """Writes the results with their cases' summaries; an infinite z is written as null. Raises `FileError`."""
+    report = {
+        "photons": photons,
+        "seed": str(seed),
+        "family_level": FAMILY_LEVEL,
+        "passed": all(result.passed for result in results),
+        "cases": {result.name: CASES[result.name].summary for result in results},
+        "results": [asdict(result) for result in results],
     }
-    if targets:
-        tables["targets"] = targets
-    return tables
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_text(report, indent=1))
 
 
-def point_source(*position: float) -> dict[str, Any]:
-    """An isotropic point source at x, y, z [m]."""
-    return {"position": list(position), "profile": "uniform_cone", "half_angle_deg": 180.0}
+def draw_results(results: Sequence[CaseResult], folder: str | Path) -> list[Path]:
+    """One PNG for each case: values over references with their errors, and the z of each quantity; returns the paths.
 
-
-def slab_domain(thickness: float) -> dict[str, Any]:
-    """Water between z = 0 and `thickness` [m], which may be infinite."""
-    return {"shape": "slab", "lower": [-math.inf, -math.inf, 0.0], "upper": [math.inf, math.inf, thickness]}
+    Raises `FileError`.
+    """
+    return [
+        draw_validation(
+            [asdict(result) for result in results if result.name == name],
+            Path(folder) / f"{name}.png",
+            title=f"{name}: {CASES[name].summary}",
+        )
+        for name in dict.fromkeys(result.name for result in results)
+    ]

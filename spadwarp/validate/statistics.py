@@ -1,4 +1,4 @@
-"""From scores to z, and from many z to one verdict."""
+"""From scores to z values, and from many z values to one verdict."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Estimate", "Quantity", "ScoreMeans", "batch_means", "holm", "two_sided_p"]
+__all__ = ["Estimate", "Quantity", "ScoreMeans", "batch_means", "holm", "quantities", "two_sided_p"]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured number with its standard error; `degrees` of freedom behind the error (inf: as good as known)."""
+    """A measured number with its standard error, and the degrees of freedom of that error (inf: exactly known)."""
 
     value: float
     standard_error: float
@@ -23,12 +23,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One measured number of a case beside what it should be.
+    """One measured number of a case beside its reference.
 
     Attributes:
         name: What was measured, with its unit.
-        estimate: The engine's value.
-        reference: What it should be.
+        estimate: The simulator's value.
+        reference: The known value.
         reference_error: Standard error of the reference, 0 where it is known.
         rounding: Half a unit of the last published digit: the reference lies within it, and z counts from its edge.
     """
@@ -52,6 +52,16 @@ class Quantity:
         if self.standard_error == 0.0:
             return math.copysign(math.inf, difference) if difference else 0.0
         return _normal_from_t(difference / self.standard_error, self.estimate.degrees)
+
+
+def quantities(
+    names: Iterable[str], estimates: Iterable[Estimate], references: Iterable[float], *, rounding: float = 0.0
+) -> list[Quantity]:
+    """One quantity for each name, estimate and reference, which are equally many."""
+    return [
+        Quantity(name, estimate, reference, rounding=rounding)
+        for name, estimate, reference in zip(names, estimates, references, strict=True)
+    ]
 
 
 @dataclass

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.units import path_from_time
-from spadwarp.validate import references as known
-from spadwarp.validate.runs import PENCIL, Case, Run, point_source, scene, slab_domain
-from spadwarp.validate.statistics import Quantity, ScoreMeans
+from spadwarp.validate import references
+from spadwarp.validate.case import PENCIL, Case, Run, point_source, scene, slab_domain
+from spadwarp.validate.statistics import Quantity, quantities
 
 __all__ = ["CASES"]
 
-# Photons of little weight would wander in a half-space for long; roulette ends them without a bias.
+# In a half-space photons of little weight scatter for long; roulette ends them without a bias.
 _ROULETTE: dict[str, Any] = {"termination": "roulette", "weight_cutoff": 0.05}
+_FORWARD = {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924}
 
 
 def _leaving(records: Any, reason: str) -> NDArray[np.float64]:
@@ -32,29 +32,36 @@ def _in_bins(weight: NDArray, value: NDArray, edges: tuple[float, ...]) -> list[
     return [weight * (bins == i) for i in range(len(edges) - 1)]
 
 
-def _measure(run: Run, tables: dict[str, Any], scores: Callable[[Any], list[NDArray]]) -> list:
-    means = ScoreMeans()
-    for records in run.records(tables):
-        means.add(np.stack(scores(records), axis=1))
-    return means.estimates()
+def _bin_names(label: str, edges: tuple[float, ...]) -> list[str]:
+    return [label.format(f"{low:g}–{high:g}") for low, high in itertools.pairwise(edges)]
+
+
+def _both_faces(records: Any) -> list[NDArray]:
+    return [_leaving(records, "exit_z_low"), _leaving(records, "exit_z_high")]
+
+
+def _cosine(records: Any) -> list[NDArray]:
+    return [records.direction[:, 2]]
+
+
+def _medium(slab: references.Slab) -> dict[str, Any]:
+    return {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
 
 
 def _slabs(run: Run) -> list[Quantity]:
-    quantities = []
-    for slab in known.SLABS:
-        medium = {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
-        tables = scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **(_ROULETTE if slab.albedo < 1 else {}))
-        estimates = _measure(run, tables, lambda r: [_leaving(r, "exit_z_low"), _leaving(r, "exit_z_high")])
-        names = [("R", slab.reflected), ("T", slab.transmitted)]
-        for (name, reference), estimate in zip(names, estimates, strict=True):
-            if not math.isinf(slab.optical_depth) or name == "R":
-                quantities.append(Quantity(f"{name}, {slab.text}", estimate, reference))
-    return quantities
+    measured = []
+    for slab in references.SLABS:
+        end = _ROULETTE if slab.albedo < 1 else {}
+        tables = scene(_medium(slab), PENCIL, domain=slab_domain(slab.optical_depth), **end)
+        names, expected = (f"R, {slab.text}", f"T, {slab.text}"), (slab.reflected, slab.transmitted)
+        both = quantities(names, run.means(tables, _both_faces), expected)
+        measured += both[:1] if math.isinf(slab.optical_depth) else both
+    return measured
 
 
 def _stacks(run: Run) -> list[Quantity]:
-    quantities = []
-    for stack in known.STACKS:
+    measured = []
+    for stack in references.STACKS:
         waters: list[dict[str, float]] = []
         depth = 0.0
         for anisotropy, albedo, extinction, thickness in stack.layers:
@@ -62,128 +69,104 @@ def _stacks(run: Run) -> list[Quantity]:
             depth += thickness
         first = {name: value for name, value in waters[0].items() if name != "start"}
         tables = scene({**first, "layers": waters[1:]}, PENCIL, domain=slab_domain(depth), **_ROULETTE)
-        estimates = _measure(run, tables, lambda r: [_leaving(r, "exit_z_low"), _leaving(r, "exit_z_high")])
-        for name, estimate, reference in zip("RT", estimates, (stack.reflected, stack.transmitted), strict=True):
-            quantities.append(Quantity(f"{name}, layers of {stack.text}", estimate, reference))
-    return quantities
+        names = (f"R, layers of {stack.text}", f"T, layers of {stack.text}")
+        measured += quantities(names, run.means(tables, _both_faces), (stack.reflected, stack.transmitted))
+    return measured
 
 
 def _exit_cosines(run: Run) -> list[Quantity]:
-    quantities = []
-    edges = known.EXIT_COSINE_EDGES
-    for slab, face, fractions in known.EXIT_COSINES:
-        medium = {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
-        tables = scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **_ROULETTE)
+    measured = []
+    edges = references.EXIT_COSINE_EDGES
+    for slab, face, fractions in references.EXIT_COSINES:
+        tables = scene(_medium(slab), PENCIL, domain=slab_domain(slab.optical_depth), **_ROULETTE)
 
         def scores(records: Any, face: str = face) -> list[NDArray]:
             diffuse = _leaving(records, face) * (records.collisions > 0)
             return _in_bins(diffuse, np.abs(records.direction[:, 2]), edges)
 
         side = {"exit_z_low": "R", "exit_z_high": "T"}[face]
-        quantities += [
-            Quantity(f"{side}, exit cosine {low:g}–{high:g}, {slab.text}", estimate, fraction)
-            for (low, high), estimate, fraction in zip(
-                itertools.pairwise(edges), _measure(run, tables, scores), fractions, strict=True
-            )
-        ]
-    return quantities
+        names = _bin_names(f"{side}, exit cosine {{}}, {slab.text}", edges)
+        measured += quantities(names, run.means(tables, scores), fractions)
+    return measured
 
 
 def _time_resolved(run: Run) -> list[Quantity]:
-    pulse = known.TIME_RESOLVED
+    pulse = references.TIME_RESOLVED
     medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
     tables = scene(medium, PENCIL, domain=slab_domain(math.inf), max_path=pulse.edges[-1] + 1.0)
-
-    def scores(records: Any) -> list[NDArray]:
-        return _in_bins(_leaving(records, "exit_z_low"), records.path, pulse.edges)
-
-    return [
-        Quantity(f"R, path {low:g}–{high:g} m", estimate, fraction)
-        for (low, high), estimate, fraction in zip(
-            itertools.pairwise(pulse.edges), _measure(run, tables, scores), pulse.fractions, strict=True
-        )
-    ]
+    estimates = run.means(tables, lambda r: _in_bins(_leaving(r, "exit_z_low"), r.path, pulse.edges))
+    return quantities(_bin_names("R, path {} m", pulse.edges), estimates, pulse.fractions)
 
 
 def _moments(run: Run) -> list[Quantity]:
-    def where(records: Any) -> list[NDArray]:
+    def place(records: Any) -> list[NDArray]:
         x = records.position.astype(np.float64)
         return [x[:, 2], (x**2).sum(axis=1)]
 
-    path, count = 5.0, 5
-    isotropic = scene({"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.0}, PENCIL, max_path=path)
-    z, r2 = _measure(run, isotropic, where)
-    quantities = [
-        Quantity("⟨z⟩ [m], g 0, path 5", z, known.AFTER_PATH[0]),
-        Quantity("⟨r²⟩ [m²], g 0, path 5", r2, known.AFTER_PATH[1]),
-    ]
-    water = {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924}
-    z, r2 = _measure(run, scene(water, PENCIL, max_collisions=count), where)
+    isotropic = scene({"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.0}, PENCIL, max_path=5.0)
+    collided = scene(_FORWARD, PENCIL, max_collisions=5)
     # A record keeps the direction of its last flight: the sixth has scattered five times.
-    (cosine,) = _measure(run, scene(water, PENCIL, max_collisions=count + 1), lambda r: [r.direction[:, 2]])
+    flown = scene(_FORWARD, PENCIL, max_collisions=6)
+    after_path = ("⟨z⟩ [m], g 0, path 5", "⟨r²⟩ [m²], g 0, path 5")
+    after_collisions = [f"{name}, g 0.924, 5 collisions" for name in ("⟨z⟩ [m]", "⟨r²⟩ [m²]", "⟨cosθ⟩")]
     return [
-        *quantities,
-        Quantity("⟨z⟩ [m], g 0.924, 5 collisions", z, known.AFTER_COLLISIONS[0]),
-        Quantity("⟨r²⟩ [m²], g 0.924, 5 collisions", r2, known.AFTER_COLLISIONS[1]),
-        Quantity("⟨cosθ⟩, g 0.924, 5 collisions", cosine, known.AFTER_COLLISIONS[2]),
+        *quantities(after_path, run.means(isotropic, place), references.AFTER_PATH),
+        *quantities(
+            after_collisions,
+            [*run.means(collided, place), *run.means(flown, _cosine)],
+            references.AFTER_COLLISIONS,
+        ),
     ]
 
 
 def _near_axis(run: Run) -> list[Quantity]:
-    water = {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924}
-    quantities = []
-    for threshold, reference in known.NEAR_AXIS.items():
-        tables = scene(water, PENCIL, max_collisions=6, axis_threshold=threshold)
-        (cosine,) = _measure(run, tables, lambda r: [r.direction[:, 2]])
+    measured = []
+    for threshold, reference in references.NEAR_AXIS.items():
+        tables = scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold)
         rule = "rule off" if threshold == 1.0 else f"threshold {threshold:g}"
-        quantities.append(Quantity(f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}", cosine, reference))
-    return quantities
+        measured += quantities([f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}"], run.means(tables, _cosine), [reference])
+    return measured
 
 
 def _cutoff(run: Run) -> list[Quantity]:
     water = {"extinction": 1.0, "albedo": 0.8, "anisotropy": 0.0}
-    quantities = []
-    for cutoff, reference in known.CUTOFF.items():
+    measured = []
+    for cutoff, reference in references.CUTOFF.items():
         end: dict[str, Any] = {"weight_cutoff": cutoff} if cutoff else _ROULETTE
         tables = scene(water, PENCIL, domain=slab_domain(math.inf), **end)
-        (back,) = _measure(run, tables, lambda r: [_leaving(r, "exit_z_low")])
         rule = f"cut-off {cutoff:g}" if cutoff else "no cut-off"
-        quantities.append(Quantity(f"R, half-space, g 0, ω 0.8, {rule}", back, reference))
-    return quantities
+        reflected = run.means(tables, lambda r: [_leaving(r, "exit_z_low")])
+        measured += quantities([f"R, half-space, g 0, ω 0.8, {rule}"], reflected, [reference])
+    return measured
 
 
 def _fluence(run: Run) -> list[Quantity]:
-    shells = known.FLUENCE
+    shells = references.FLUENCE
     medium = {"scattering": 1.0, "absorption": shells.absorption, "anisotropy": 0.0}
     tables = scene(medium, point_source(0.0, 0.0, 0.0), max_path=shells.path)
 
     def scores(records: Any) -> list[NDArray]:
         radius = np.linalg.norm(records.position.astype(np.float64), axis=1)
-        # the unscattered front lies at the outermost edge but for rounding
+        # Unscattered light lies at the outermost edge, but for rounding.
         return _in_bins(_leaving(records, "max_path"), np.minimum(radius, 0.999 * shells.path), shells.edges)
 
-    return [
-        Quantity(f"light at {low:g}–{high:g} m after a path of {shells.path:g} m", estimate, fraction)
-        for (low, high), estimate, fraction in zip(
-            itertools.pairwise(shells.edges), _measure(run, tables, scores), shells.fractions, strict=True
-        )
-    ]
+    names = _bin_names(f"light at {{}} m after a path of {shells.path:g} m", shells.edges)
+    return quantities(names, run.means(tables, scores), shells.fractions)
 
 
 def _cube60(run: Run) -> list[Quantity]:
     medium = {"absorption": 5.0, "scattering": 1000.0, "anisotropy": 0.01, "group_index": 1.37}
     cube = {"shape": "box", "lower": [0.0] * 3, "upper": [0.06] * 3}
     sources = {
-        "pencil at (29, 29, 0) mm": {**PENCIL, "position": [0.029, 0.029, 0.0]},
-        "isotropic at (29, 29, 29) mm": point_source(0.029, 0.029, 0.029),
+        "absorbed, pencil at (29, 29, 0) mm": {**PENCIL, "position": [0.029, 0.029, 0.0]},
+        "absorbed, isotropic at (29, 29, 29) mm": point_source(0.029, 0.029, 0.029),
     }
     gate = path_from_time(5e-9, medium["group_index"])
-    quantities = []
-    for (name, source), reference in zip(sources.items(), known.CUBE60, strict=True):
+    absorbed = []
+    for source in sources.values():
         tables = scene(medium, source, domain=cube, max_path=gate)
-        (absorbed,) = _measure(run, tables, lambda r: [1.0 - r.weight.astype(np.float64)])
-        quantities.append(Quantity(f"absorbed, {name}", absorbed, reference, rounding=known.CUBE60_ROUNDING))
-    return quantities
+        absorbed += run.means(tables, lambda r: [1.0 - r.weight.astype(np.float64)])
+    return quantities(sources, absorbed, references.CUBE60, rounding=references.CUBE60_ROUNDING)
 
 
 CASES = (

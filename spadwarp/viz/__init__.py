@@ -5,6 +5,7 @@ from spadwarp.viz.contact_sheet import draw_dataset
 from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.targets import describe_targets, draw_targets
 from spadwarp.viz.transient_video import video
+from spadwarp.viz.validation import draw_validation
 from spadwarp.viz.viewer import view
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "draw_dataset",
     "draw_recording",
     "draw_targets",
+    "draw_validation",
     "plot_budget",
     "plot_sweep",
     "video",

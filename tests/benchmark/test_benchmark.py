@@ -11,7 +11,8 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, run
-from spadwarp.benchmark.cases import CASES, GROUPS, load_report, ratios, report
+from spadwarp.benchmark import CASES, GROUPS, load_report, ratios, report
+from spadwarp.benchmark.runs import measure_transport
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
@@ -193,9 +194,9 @@ def test_scaling_spans_what_it_is_meant_to_show():
 
 
 def test_runs_are_repeated_until_enough():
-    case = replace(CASES["water"], error=False, enough=1e-9)
+    case = replace(CASES["water"], error=False, time_limit=1e-9)
     device = spadwarp.device.pick_device("cpu")
-    result = spadwarp.benchmark.cases._transport(case, device, 1000, 5)
+    result = measure_transport(case, device, 1000, 5)
     assert len(result.seconds) == 1
     assert result.error_per_root_second is None
 

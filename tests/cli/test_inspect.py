@@ -22,7 +22,7 @@ def test_validation_says_what_failed(tmp_path, monkeypatch):
     assert (tmp_path / "plots" / "ledger.png").is_file()
 
     wrong = [spadwarp.validate.CaseResult("ledger", "its sum", 1.0, 2.0, 0.1, -10.0, 1e-20, False)]
-    monkeypatch.setattr("spadwarp.validate.validate", lambda *_, **__: wrong)
+    monkeypatch.setattr("spadwarp.validate.run", lambda *_, **__: wrong)
     failed = run("validate", "ledger", code=1)
     assert "0 of 1 agree" in failed.stdout and "its sum: z = -10.00" in failed.stderr
     monkeypatch.undo()

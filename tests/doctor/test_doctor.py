@@ -1,4 +1,4 @@
-"""`spadwarp doctor`: it measures what is known, and says what is wrong."""
+"""`spadwarp doctor`: the self-test against known values, and messages about what is wrong."""
 
 import re
 
@@ -7,32 +7,32 @@ import warp as wp
 
 import spadwarp
 from helpers.cli import DEVICE, run, tables
-from spadwarp.doctor import diagnosis as health
+from spadwarp.doctor import diagnosis, self_test
 
 
 def test_self_test_measures_what_is_known(tmp_path):
-    told = run("doctor", *DEVICE, "--json", tmp_path / "report.json").stdout
+    printed = run("doctor", *DEVICE, "--json", tmp_path / "report.json").stdout
     report = tables(tmp_path / "report.json")
     assert report["healthy"] and not report["problems"]
     for test in report["tests"]:
         assert abs(test["value"] - test["reference"]) <= 4.5 * test["standard_error"] < 0.02
-        assert test["name"] in told
+        assert test["name"] in printed
     assert report["facts"]["Packages"]["warp-lang"] == wp.__version__
     assert {"cpu"} <= set(report["facts"]["Devices"])
     assert bool(report["gpu"]) == (not wp.is_cuda_available())
 
 
 def test_a_wrong_simulator_is_found_out(monkeypatch):
-    monkeypatch.setattr(health, "_TRANSMITTED", 0.67)
+    monkeypatch.setattr(self_test, "_TRANSMITTED", 0.67)
     outcome = run("doctor", *DEVICE, "--quiet", code=1)
-    assert "self-test: let through by the slab" in outcome.stderr and "FAILED" in outcome.stderr
+    assert "self-test: transmitted by the slab" in outcome.stderr and "FAILED" in outcome.stderr
     assert outcome.stdout == ""
 
 
 def test_a_cache_that_cannot_be_written_is_a_problem(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file" / "cache"))
-    found = spadwarp.doctor.diagnosis.doctor(device="cpu", self_test=False)
+    found = spadwarp.doctor.diagnose(device="cpu", self_test=False)
     assert not found.healthy and "set WARP_CACHE_PATH" in found.problems[0]
 
 
@@ -42,8 +42,8 @@ def test_a_cache_that_cannot_be_written_is_a_problem(monkeypatch, tmp_path):
 )
 def test_what_is_missing_for_a_gpu(version, words, monkeypatch):
     monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
-    monkeypatch.setattr(health, "_cuda_of_driver", lambda: version)
-    monkeypatch.setattr(health.Path, "exists", lambda self: False)
+    monkeypatch.setattr(diagnosis, "_driver_cuda", lambda: version)
+    monkeypatch.setattr(diagnosis.Path, "exists", lambda self: False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    [reason] = health._missing_for_a_gpu()
+    [reason] = diagnosis._gpu_reasons()
     assert re.search(words, reason)

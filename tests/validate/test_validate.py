@@ -12,7 +12,7 @@ from reference.adding_doubling import cumulative_reflectance, exit_cosine_fracti
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
 from spadwarp.errors import ConfigError
-from spadwarp.validate import CASES, plot_results, references, validate, write_json
+from spadwarp.validate import CASES, draw_results, references, run, write_json
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
 
 pytestmark = pytest.mark.physics
@@ -157,9 +157,7 @@ def test_fournier_forand_references():
 @pytest.fixture(scope="module")
 def results():
     """A short run of all cases but the two that trace most."""
-    return validate(
-        [name for name in CASES if name not in ("ledger", "mean-path")], photons=10_000, seed=3, device="cpu"
-    )
+    return run([name for name in CASES if name not in ("ledger", "mean-path")], photons=10_000, seed=3, device="cpu")
 
 
 @pytest.mark.slow
@@ -177,11 +175,11 @@ def test_deviations_are_standard_normal(results):
 
 def test_a_table_of_henyey_greenstein_passes_as_well():
     cases = ["slab", "near-axis", "single-scatter", "layers"]
-    assert all(r.passed for r in validate(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
+    assert all(r.passed for r in run(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
 
 
 def test_ledger_and_closed_walls():
-    assert all(r.passed for r in validate(["ledger", "mean-path"], photons=1000, seed=4, device="cpu"))
+    assert all(r.passed for r in run(["ledger", "mean-path"], photons=1000, seed=4, device="cpu"))
 
 
 def test_wrong_physics_fails(monkeypatch):
@@ -189,12 +187,12 @@ def test_wrong_physics_fails(monkeypatch):
     row = references.SLABS[0]
     wrong = (row._replace(transmitted=row.transmitted * 1.05), *references.SLABS[1:3])
     monkeypatch.setattr(references, "SLABS", wrong)
-    verdicts = {r.quantity: r.passed for r in validate(["slab"], photons=20_000, seed=5, device="cpu")}
+    verdicts = {r.quantity: r.passed for r in run(["slab"], photons=20_000, seed=5, device="cpu")}
     assert [name for name, passed in verdicts.items() if not passed] == [f"T, {row.text}"]
 
 
 def test_one_seed_gives_one_result():
-    one, again, other = (validate(["moments"], photons=1000, seed=seed, device="cpu") for seed in (6, 6, 7))
+    one, again, other = (run(["moments"], photons=1000, seed=seed, device="cpu") for seed in (6, 6, 7))
     assert one == again
     assert all(a.value != b.value for a, b in zip(one, other, strict=True))
 
@@ -204,7 +202,7 @@ def test_reports(results, tmp_path):
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert report["passed"] is True and len(report["results"]) == len(results)
     some = list(itertools.islice((r for r in results if r.name in ("slab", "moments")), 20))
-    for path in plot_results(some, tmp_path / "plots"):
+    for path in draw_results(some, tmp_path / "plots"):
         assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
@@ -218,4 +216,4 @@ def test_reports(results, tmp_path):
 )
 def test_errors_name_the_argument(arguments, text):
     with pytest.raises(ConfigError, match=text.replace("[", r"\[")):
-        validate(**arguments)
+        run(**arguments)

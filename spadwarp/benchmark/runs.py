@@ -1,0 +1,303 @@
+"""Running the benchmark cases.
+
+Kernels are loaded, and one run is discarded, before the clock starts; a launch ends when the device has finished it,
+and later copies to the host are not counted.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from spadwarp.analytic import simulate_analytic
+from spadwarp.benchmark.cases import CASES, GROUPS, Case
+from spadwarp.benchmark.results import BenchResult
+from spadwarp.device import core_count, pick_device
+from spadwarp.errors import ConfigError
+from spadwarp.frames import detect
+from spadwarp.mesh import build_mesh
+from spadwarp.scene import Detector, Laser, Scene
+from spadwarp.transport import simulate, trace, truth_maps
+from spadwarp.transport.model import build_model, transport_spec
+
+if TYPE_CHECKING:
+    import warp as wp
+
+    from spadwarp_kernels import Data, Model
+
+__all__ = ["CPU_PHOTONS_PER_CORE", "CUDA_PHOTONS", "TransportRun", "run"]
+
+# Photons of one timed run.
+CUDA_PHOTONS = 1 << 26
+CPU_PHOTONS_PER_CORE = 1 << 18
+
+_LAUNCH = 1 << 26  # the most photons of one launch
+_CHECK_PHOTONS = 1 << 20  # whose terminal states are kept for the check of a mean
+_SIGMAS = 4.0  # beyond which a check fails: one correct run in 16 000
+
+
+def run(
+    cases: Iterable[str] | None = None,
+    *,
+    device: str | None = None,
+    photons: int | None = None,
+    repeats: int = 3,
+    progress: Callable[[Case], None] | None = None,
+    found: Callable[[BenchResult], None] | None = None,
+) -> list[BenchResult]:
+    """Measures cases one after the other.
+
+    Args:
+        cases: Names out of `CASES`, or "scaling" for the growth of cost with size; by default all of `CASES`.
+        device: As for `spadwarp.simulate`.
+        photons: Of one timed run of a transport case, > 0; by default 2^26 on a GPU and 2^18 a core on a CPU.
+            "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
+        repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are not repeated
+            once two seconds have been timed.
+        progress: Called with each case before it is run.
+        found: Called with each result.
+
+    Raises:
+        ConfigError: An unknown case, or a number out of range.
+        DeviceError: No such device, or one that is too small for a case.
+    """
+    names = list(CASES) if cases is None else list(cases)
+    for name in names:
+        if name not in CASES and name not in GROUPS:
+            raise ConfigError(f"cases: {name!r} is not one of {', '.join([*CASES, *GROUPS])}")
+    for option, value, high in (("photons", photons, 10**12), ("repeats", repeats, 1000)):
+        if value is not None and not 1 <= value <= high:
+            raise ConfigError(f"{option} = {value} is outside [1, {high}]")
+    wp_device = pick_device(device)
+    chosen = [case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])]
+    results = []
+    for case in chosen:
+        if progress is not None:
+            progress(case)
+        results.append(_KINDS[case.kind](case, wp_device, photons, repeats))
+        if found is not None:
+            found(results[-1])
+    return results
+
+
+class TransportRun:
+    """A transport case on a device, set up and compiled.
+
+    Attributes:
+        setup, compile: Seconds that this took, see `BenchResult`.
+        faces: Triangles of the target.
+        tally_bytes: Of the histograms; None without a camera.
+    """
+
+    def __init__(self, case: Case, device: wp.Device) -> None:
+        import spadwarp_kernels as sk
+
+        scene = Scene.from_dict(case.scene)
+        began = time.perf_counter()
+        mesh = build_mesh(scene)
+        without_camera = case.estimator == "none"
+        self._model: Model = build_model(scene, device, mesh, camera=not without_camera)
+        self._data: Data = sk.make_data(self._model)
+        self._spec = transport_spec(scene, mesh, **({} if case.estimator is None else {"estimator": case.estimator}))
+        _wait(device)
+        ready = time.perf_counter()
+        sk.load_transport_kernel(self._spec, device)
+        self.setup, self.compile = ready - began, time.perf_counter() - ready
+        self.faces = 0 if mesh is None else mesh.face_count
+        self.tally_bytes = None if without_camera else 8 * self._model.tally_size
+
+    def run(self, photons: int, *, first: int = 0) -> tuple[dict[str, int], dict[str, int], float]:
+        """Ledger and counters of the photons with ids from `first` on, on a CPU with a thread for each core, and the
+        seconds until the device had finished."""
+        import spadwarp_kernels as sk
+
+        def launch(start: int, stop: int) -> None:
+            for at in range(start, stop, _LAUNCH):
+                sk.launch_transport(
+                    self._spec, self._model, self._data, seed=0, first_id=at, photon_count=min(_LAUNCH, stop - at)
+                )
+
+        device = self._model.device
+        workers = 1 if device.is_cuda else min(core_count(), photons)
+        edges = [first + photons * i // workers for i in range(workers + 1)]
+        self._data.ledger.zero_()
+        _wait(device)
+        began = time.perf_counter()
+        if workers == 1:
+            launch(first, first + photons)
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(launch, edges[:-1], edges[1:]))
+        _wait(device)
+        seconds = time.perf_counter() - began
+        return (*sk.read_ledger(self._data), seconds)
+
+
+def measure_transport(case: Case, device: wp.Device, photons: int | None, repeats: int) -> BenchResult:
+    usual = CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count()
+    photons = case.photons or photons or usual
+    memory = _Memory(device)
+    traced = TransportRun(case, device)
+    traced.run(min(photons, 1 << 20))
+    seconds: list[float] = []
+    counts: list[dict[str, int]] = []
+    while len(seconds) < repeats and sum(seconds) < case.time_limit:
+        _, counters, took = traced.run(photons, first=len(seconds) * photons)
+        seconds.append(took)
+        counts.append(counters)
+    fastest = min(range(len(seconds)), key=seconds.__getitem__)
+    counted = counts[fastest]
+    work = {
+        "photons": photons,
+        "collisions": counted["water_collisions"] + counted["surface_events"],
+        "queries": counted["surface_queries"] + counted["shadow_queries"],
+    }
+    rates = {unit: number / seconds[fastest] for unit, number in work.items()}
+    used = memory.peak()
+    setup, compiled, faces, tally_bytes = traced.setup, traced.compile, traced.faces, traced.tally_bytes
+    del traced  # and its histograms, before the next run makes its own
+    scene = Scene.from_dict(case.scene)
+    error = case.error and case.estimator != "none"
+    return BenchResult(
+        case=case.name,
+        device=device.alias,
+        threads=None if device.is_cuda else core_count(),
+        faces=faces,
+        size={"photons": photons},
+        setup=setup,
+        compile=compiled,
+        seconds=tuple(seconds),
+        rates=rates,
+        memory=used,
+        tally_bytes=tally_bytes,
+        error_per_root_second=_error(scene, device, min(photons, usual), rates["photons"]) if error else None,
+        check=None if case.absorbed is None else _absorbed(scene, device, photons, *case.absorbed),
+    )
+
+
+def _wait(device: wp.Device) -> None:
+    import warp as wp
+
+    wp.synchronize_device(device)
+
+
+def _error(scene: Scene, device: wp.Device, photons: int, photons_per_second: float) -> float:
+    """Relative error after one second at that rate; from a separate run, since batches take time."""
+    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
+    return result.relative_error * math.sqrt(result.photons / photons_per_second)
+
+
+def _absorbed(scene: Scene, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:
+    weights = trace(scene, photons=max(2, min(photons, _CHECK_PHOTONS)), device=device.alias).weight
+    lost = 1.0 - weights.astype(np.float64)
+    value, error = float(lost.mean()), float(lost.std(ddof=1) / math.sqrt(lost.size))
+    return {
+        "name": "absorbed fraction",
+        "value": value,
+        "standard_error": error,
+        "reference": reference,
+        "passed": abs(value - reference) <= rounding + _SIGMAS * error,
+    }
+
+
+class _Memory:
+    """Memory that a case uses on a GPU, above what was used before it."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device if device.is_cuda and device.is_mempool_supported else None
+        self._before, self._high = self._read()
+
+    def _read(self) -> tuple[int, int]:
+        import warp as wp
+
+        if self._device is None:
+            return 0, 0
+        return wp.get_mempool_used_mem_current(self._device), wp.get_mempool_used_mem_high(self._device)
+
+    def peak(self) -> int | None:
+        """[bytes]. Warp cannot reset its maximum: where an earlier case reached it, the memory that is used now."""
+        now, high = self._read()
+        if self._device is None:
+            return None
+        return (high if high > self._high else now) - self._before
+
+
+def _analytic(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
+    frames = 512 if device.is_cuda else 32
+    scene, memory, clock = Scene.from_dict(case.scene), _Memory(device), _Clock(device)
+    truth = truth_maps(scene, device=device.alias)
+    clock.lap()
+
+    def simulate_frames(count: int, seed: int) -> None:
+        simulate_analytic(scene, truth=truth, frames=count, seed=seed, device=device.alias)
+
+    simulate_frames(1, 0)
+    clock.lap()
+    for seed in range(repeats):
+        simulate_frames(frames, seed)
+        clock.lap()
+    return _stage(case, clock, memory, rates={"frames": frames})
+
+
+def _detect(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
+    import warp as wp
+
+    # A flat background, and a return whose time and strength vary over the image.
+    height, width, bins = (192, 256, 1024) if device.is_cuda else (24, 32, 1024)
+    pulses, memory, clock = 1_000_000, _Memory(device), _Clock(device)
+    row, column, k = np.ogrid[:height, :width, :bins]
+    centre = 300.0 + 400.0 * row / height
+    light = 1e-5 + 0.01 * (1 + column) / width * np.exp(-0.5 * ((k - centre) / 2.0) ** 2)
+    source: Any = wp.array(light.astype(np.float32), dtype=wp.float32, device=device)
+    detector, laser = Detector(wrap=False), Laser()
+    clock.lap()
+    for seed in range(repeats + 1):
+        detect(
+            source,
+            seed=seed,
+            pulses=pulses,
+            detector=detector,
+            laser=laser,
+            gate_start=0.0,
+            bin_width=100e-12,
+            device=device,
+        )
+        clock.lap()
+    return _stage(case, clock, memory, rates={"bins": height * width * bins, "frames": 1}, pulses=pulses)
+
+
+class _Clock:
+    """Seconds between laps, each of which waits for the device."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device, self.seconds, self._last = device, list[float](), time.perf_counter()
+
+    def lap(self) -> None:
+        _wait(self.device)
+        now = time.perf_counter()
+        self.seconds.append(now - self._last)
+        self._last = now
+
+
+def _stage(case: Case, clock: _Clock, memory: _Memory, *, rates: Mapping[str, int], **size: int) -> BenchResult:
+    """The result of laps for setup, compilation and each timed run, which does the work of `rates`."""
+    setup, compiled, *seconds = clock.seconds
+    return BenchResult(
+        case=case.name,
+        device=clock.device.alias,
+        threads=None if clock.device.is_cuda else 1,
+        size={**rates, **size},
+        setup=setup,
+        compile=compiled,
+        seconds=tuple(seconds),
+        rates={unit: number / min(seconds) for unit, number in rates.items()},
+        memory=memory.peak(),
+    )
+
+
+_KINDS = {"transport": measure_transport, "analytic": _analytic, "detect": _detect}
