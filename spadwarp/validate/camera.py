@@ -25,6 +25,8 @@ _CAMERA = {
     "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
 }
 
+_SIGNED = ("roulette", "importance_sampling_residual")  # entries of the ledger whose mean is 0
+
 
 def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
     """The scene of `references.SINGLE_SCATTER` in any water."""
@@ -87,9 +89,9 @@ def _ledger(run: Run) -> list[Quantity]:
             measured.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
             roulette, residual = batch_means(gains)
             if termination == "roulette":
-                measured.append(Quantity(f"mean roulette entry per photon, {name}", roulette, 0.0))
+                measured.append(Quantity(f"mean {_SIGNED[0]} entry per photon, {name}", roulette, 0.0))
             if estimator == "guided":
-                measured.append(Quantity(f"mean importance_sampling_residual entry per photon, {name}", residual, 0.0))
+                measured.append(Quantity(f"mean {_SIGNED[1]} entry per photon, {name}", residual, 0.0))
     return measured
 
 
