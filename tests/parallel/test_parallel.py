@@ -120,13 +120,13 @@ def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, unc
     same(run, whole[uncertainty])
     assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == kills
     assert kills + 1 <= len(run.provenance["workers"]) <= kills + 2 and run.provenance["device"] == "2 Ray workers"
-    # What was written down on the way is consistent, whatever was lost, and can be gone on from.
+    # The checkpoint is consistent, whatever was lost, and can be resumed.
     kept = spadwarp.load_result(tmp_path / "checkpoint.h5")
     assert kept.partial and 0 < kept.photons < PHOTONS and kept.ledger_report()["exact"]
     same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
 
 
-def test_a_run_can_be_gone_on_with_over_ray(cluster, whole):
+def test_a_run_can_be_resumed_over_ray(cluster, whole):
     parts = [spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, shard=(n, 5)) for n in (5, 1)]
     gaps = spadwarp.merge(parts)
     same(spadwarp.simulate(scene(), engine=Ray(workers=1), resume=gaps), whole[True])
@@ -158,7 +158,7 @@ def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
     assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()
 
 
-def test_what_ray_cannot_do_is_said(cluster):
+def test_what_ray_cannot_do_is_refused(cluster):
     with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
         spadwarp.simulate(scene(), **RUN, device="cuda:1", engine=Ray())
     with pytest.raises(spadwarp.DeviceError, match="no GPU"):

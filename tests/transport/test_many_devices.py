@@ -176,7 +176,7 @@ def test_a_device_without_memory_is_named(monkeypatch):
 
 
 def test_a_full_disk_costs_no_photons(whole, tmp_path):
-    """The checkpoint meets a limit on the size of files: the one before it stays, the run goes on to its end."""
+    """The checkpoint meets a limit on the size of files: the one before it stays, the run continues to its end."""
     resource = pytest.importorskip("resource")
     place = tmp_path / "checkpoint.h5"
     spadwarp.simulate(scene(), **{**RUN, "photons": 1000}, device="cpu").save(place)

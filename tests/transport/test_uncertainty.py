@@ -1,5 +1,7 @@
 """Errors of every bin, the stopping rule, resuming and merging."""
 
+import signal
+
 import numpy as np
 import pytest
 import warp as wp
@@ -73,7 +75,6 @@ def test_a_resumed_run_equals_one_long_run(uncertainty, tmp_path):
 
 def _first_batches(one, whole, count):
     """The run interrupted after so many batches or a few more."""
-    import signal
 
     def interrupt(stage, done, total):
         if stage == "trace" and done >= count * whole.batch_size and not fired:
@@ -120,7 +121,7 @@ def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     run = spadwarp.simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)
     assert run.relative_error <= 0.05 and not run.partial
     assert run.photons < 2**22
-    # Stopping is checked at 8, 16, 32, ... batches, whatever the pass size.
+    # Stopping is checked at 8, 16, 32, ... batches, whatever the launch size.
     batches = run.photons // run.batch_size
     assert batches >= 8 and batches & (batches - 1) == 0
     never = spadwarp.simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)

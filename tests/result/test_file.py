@@ -1,0 +1,218 @@
+"""Files of a result: HDF5 loses nothing and refuses what is not whole; truth maps and depth as EXR."""
+
+import dataclasses
+import json
+import os
+
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+
+from helpers.synthetic_result import make_result, make_scene
+from spadwarp.errors import FileError
+from spadwarp.io.exr import read_exr
+from spadwarp.result import (
+    Result,
+    load_result,
+    load_truth_maps,
+    save_depth_exr,
+    save_result,
+    save_truth_maps,
+)
+
+TRUTH = ("depth", "range", "normal", "reflectance")
+
+
+@pytest.fixture(scope="module")
+def result():
+    return make_result(make_scene())
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(Result):
+        if field.name not in ("tallies", "truth"):
+            assert getattr(a, field.name) == getattr(b, field.name), field.name
+    np.testing.assert_array_equal(a.tallies, b.tallies, strict=True)
+    for name in TRUTH:
+        one, other = getattr(a.truth, name), getattr(b.truth, name)
+        assert one.tobytes() == other.tobytes()  # NaNs included
+        assert one.dtype == other.dtype
+
+
+def test_hdf5_loses_nothing(result, tmp_path):
+    path = result.save(tmp_path / "result.h5")
+    again = load_result(path)
+    assert_same(result, again)
+    np.testing.assert_array_equal(again.histogram, result.histogram)
+    again.save(tmp_path / "again.h5")
+    assert_same(result, load_result(tmp_path / "again.h5"))
+
+
+def test_hdf5_keeps_the_largest_numbers(result, tmp_path):
+    tallies = result.tallies.copy()
+    tallies[0, 0, 0, :2] = 2**63 - 1, -(2**63)
+    start = 2**64 - 1 - result.photons
+    extreme = dataclasses.replace(
+        result,
+        tallies=tallies,
+        seed=2**64 - 1,
+        photon_ranges=((start, start + result.photons),),
+        ledger={"absorbed_water": 10**30, "roulette": -(10**30)},
+        counters={"water_collisions": 2**80},
+        provenance={"text": "µ, 水", "nested": {"list": [1, 2.5, None, True]}},
+        partial=True,
+    )
+    assert_same(extreme, load_result(extreme.save(tmp_path / "extreme.h5")))
+
+
+def test_hdf5_remembers_the_scene_file(tmp_path):
+    scene = make_scene()
+    scene = type(scene).from_dict(scene.to_dict(), source=tmp_path / "scene.toml")
+    again = load_result(make_result(scene).save(tmp_path / "result.h5")).scene
+    assert again == scene
+    assert again.source == scene.source
+
+
+def test_hdf5_can_be_read_alone(result, tmp_path):
+    # With nothing but h5py, the file and its own explanation.
+    with h5py.File(result.save(tmp_path / "result.h5")) as file:
+        attributes = dict(file.attrs)
+        fraction = file["tallies"][...].sum(axis=0) * (attributes["unit"] / attributes["photons"])
+        time = attributes["gate_start"] + attributes["bin_width"] * np.arange(file["tallies"].shape[-1] + 1)
+        path = time * 299792458 / attributes["group_index"]
+        detections = fraction * attributes["laser_photons_per_pulse"] * attributes["detector_pde"]
+        assert file["tallies"].compression == "gzip"
+        assert isinstance(attributes["seed"], str)
+    np.testing.assert_array_equal(fraction, result.histogram)
+    np.testing.assert_allclose(path, result.path_edges, rtol=1e-14)
+    np.testing.assert_allclose(detections, result.detections, rtol=1e-14)
+
+
+def test_hdf5_is_the_same_bytes_each_time(result, tmp_path):
+    one, two = result.save(tmp_path / "1.h5"), result.save(tmp_path / "2.h5")
+    assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize("level", [0, 10])
+def test_compression_levels_are_those_of_gzip(result, tmp_path, level):
+    with pytest.raises(ValueError, match=rf"compression = {level} is outside \[1, 9\]"):
+        save_result(result, tmp_path / "result.h5", compression=level)
+
+
+def test_names_of_older_files_are_known(result, tmp_path):
+    moments = np.arange(2 * result.histogram.size, dtype=np.uint64).reshape(2, *result.histogram.shape)
+    ledger = {**result.ledger, "importance_sampling_residual": 0}
+    batches = dataclasses.replace(result, second_moment=moments, batch_size=result.photons, ledger=ledger)
+    path = batches.save(tmp_path / "result.h5")
+    with h5py.File(path, "r+") as file:
+        file.move("second_moment", "squares")
+        del file["ledger"]
+        file["ledger"] = json.dumps({**result.ledger, "directed": 0})
+    again = load_result(path)
+    np.testing.assert_array_equal(again.second_moment, moments)
+    assert again.ledger == ledger
+
+
+# Files that are not whole
+
+
+def test_failed_writes_leave_the_old_file_and_no_other(result, tmp_path, monkeypatch):
+    path = result.save(tmp_path / "result.h5")
+    before = path.read_bytes()
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        dataclasses.replace(result, seed=8).save(path)
+    assert [one.name for one in tmp_path.iterdir()] == ["result.h5"]
+    assert path.read_bytes() == before
+
+
+def test_missing_foreign_and_newer_files_are_told_apart(result, tmp_path):
+    def error_of(path):
+        with pytest.raises(FileError) as caught:
+            load_result(path)
+        text = str(caught.value)
+        assert text.startswith(f"{path}: ")
+        return text
+
+    assert "no such file" in error_of(tmp_path / "none.h5")
+    assert "is not a file" in error_of(tmp_path)
+    (tmp_path / "text.h5").write_text("not HDF5")
+    assert "not an HDF5 file" in error_of(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["data"] = np.arange(3)
+    assert "not a spadwarp result" in error_of(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "foreign.h5", "r+") as file:
+        file.attrs["format"] = "spadwarp frames"
+    assert "its format is 'spadwarp frames'" in error_of(tmp_path / "foreign.h5")
+    newer = result.save(tmp_path / "newer.h5")
+    with h5py.File(newer, "r+") as file:
+        file.attrs["format_version"] = 99
+    assert "format version 99 is newer" in error_of(newer)
+
+
+@pytest.mark.parametrize("name", ["tallies", "config", "ledger", "truth/normal", "photon_ranges"])
+def test_results_with_parts_missing_are_refused(result, tmp_path, name):
+    path = result.save(tmp_path / "result.h5")
+    with h5py.File(path, "r+") as file:
+        del file[name]
+    with pytest.raises(FileError, match=r"result\.h5: not a whole spadwarp result: .*" + name.split("/")[-1]):
+        load_result(path)
+
+
+@pytest.mark.parametrize("name", ["unit", "photons", "seed", "format_version"])
+def test_results_with_attributes_missing_are_refused(result, tmp_path, name):
+    path = result.save(tmp_path / "result.h5")
+    with h5py.File(path, "r+") as file:
+        del file.attrs[name]
+    with pytest.raises(FileError, match=r"result\.h5: not a whole spadwarp result: .*" + name):
+        load_result(path)
+
+
+def test_truncated_files_are_refused(result, tmp_path):
+    path = result.save(tmp_path / "result.h5")
+    content = path.read_bytes()
+    for length in (0, 8, 100, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(FileError, match=r"result\.h5: "):
+            load_result(path)
+
+
+def test_flipped_bits_in_the_tallies_are_noticed(result, tmp_path):
+    path = result.save(tmp_path / "result.h5")
+    with h5py.File(path) as file:
+        chunk = file["tallies"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset + chunk.size // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(FileError, match="damaged"):
+        load_result(path)
+
+
+# EXR
+
+
+def test_truth_survives_exr(result, tmp_path):
+    path = save_truth_maps(result, tmp_path / "truth.exr")
+    again = load_truth_maps(path)
+    for name in ("depth", "range", "normal", "reflectance"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(result.truth, name), strict=True)
+    # The names that other programs look for, in 32-bit floats.
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        assert set(file.channels()) == {"Z", "range", "N.X", "N.Y", "N.Z", "R", "G", "B"}
+        assert {channel.pixels.dtype for channel in file.channels().values()} == {np.dtype(np.float32)}
+        assert file.header()["Z"] == "planar depth [m]"
+        assert file.header()["seed"] == "7"
+
+
+def test_depth_survives_exr(result, tmp_path):
+    depth = result.truth.depth.astype(np.float64) + 0.01
+    channels, metadata = read_exr(save_depth_exr(result, depth, tmp_path / "depth.exr"))
+    np.testing.assert_array_equal(channels["Z"], depth.astype(np.float32), strict=True)
+    assert metadata["content"] == "measured depth"
+    with pytest.raises(FileError, match=r"not truth maps: no channel range, N\.X"):
+        load_truth_maps(tmp_path / "depth.exr")
