@@ -2,6 +2,7 @@
 a machine is slow."""
 
 import os
+import sys
 
 # Tests run side by side; threads of BLAS and OpenMP that wait for small matrices would take the cores from each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -38,3 +39,14 @@ def whole():
         uncertainty: spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=uncertainty)
         for uncertainty in (False, True)
     }
+
+
+@pytest.fixture(scope="session")
+def cluster():
+    """Two cores of Ray for all tests of this process."""
+    ray = pytest.importorskip("ray")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
+        yield
+        ray.shutdown()

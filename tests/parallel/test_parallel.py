@@ -5,7 +5,6 @@ import os
 import random
 import re
 import signal
-import sys
 
 import numpy as np
 import pytest
@@ -26,17 +25,6 @@ def options(request):
     if request.param == "ray":
         request.getfixturevalue("cluster")
     return ENGINES[request.param]
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    """Two cores of Ray for all tests of this file."""
-    ray = pytest.importorskip("ray")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
-        yield
-        ray.shutdown()
 
 
 def test_every_job_is_done_once_and_workers_keep_their_state(options):
