@@ -26,6 +26,7 @@ def measured(path, **laser):
     return {"profile": "measured", "profile_image": str(path), "half_angle_deg": 10.0, **laser}
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.5, -0.6, 0.4), (0.0, -1.0, 0.0)])
 def test_photons_leave_as_the_profile_was_measured(direction, device, tmp_path):
     """On a plane across the axis: χ² of the photons in each pixel, and evenly within the pixels."""

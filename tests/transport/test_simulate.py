@@ -65,6 +65,7 @@ def test_the_ledger_closes_exactly(estimator, **values):
     assert all(value >= 0 for value in entries.values())
 
 
+@pytest.mark.physics
 def test_signed_entries_of_the_ledger_have_expectation_zero(device):
     """Guided directions and roulette move weight between photons and create none, on the mean over 32 seeds."""
     one = scene(transport={"estimator": "guided", "termination": "roulette", "weight_cutoff": 0.2})
@@ -75,6 +76,7 @@ def test_signed_entries_of_the_ledger_have_expectation_zero(device):
         assert abs(values.mean()) < 4.5 * values.std(ddof=1) / np.sqrt(len(values))
 
 
+@pytest.mark.physics
 def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
     """With an absurd cut-off the rule of the paper loses light that scattered more than once; roulette loses none."""
     values = {}
@@ -92,6 +94,7 @@ def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
     assert mean["exact"] - mean["cutoff"] > 10 * np.hypot(error["cutoff"], error["exact"])
 
 
+@pytest.mark.physics
 def test_a_closed_target_keeps_its_light(device):
     """A laser inside a closed box of reflectance 0.9: no weight leaves the domain around it."""
     one = scene(

@@ -82,6 +82,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("name", SHAPES)
 def test_random_rays_do_not_leak(name, device):
     shape, extent = SHAPES[name]
