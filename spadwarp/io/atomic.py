@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and the one file that is meant in a folder."""
+"""Files that appear whole or not at all, and the file of a given name in a folder."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 from spadwarp.errors import FileError, SpadwarpError
 
 
-def file_within(place: str | Path, names: Sequence[str]) -> Path:
+def file_within(path: str | Path, names: Sequence[str]) -> Path:
     """A file itself, or the only one of `names` in a directory. Raises `FileError` where there are none or several."""
-    path = Path(place)
-    if not path.is_dir():
-        return path
-    found = [path / name for name in names if (path / name).is_file()]
+    folder = Path(path)
+    if not folder.is_dir():
+        return folder
+    found = [folder / name for name in names if (folder / name).is_file()]
     if len(found) != 1:
-        what = " and ".join(one.name for one in found) if found else f"no {' and no '.join(names)}"
-        raise FileError(f"{path}: holds {what}; name the file")
+        held = " and ".join(path.name for path in found) if found else f"no {' and no '.join(names)}"
+        raise FileError(f"{path}: holds {held}; name the file")
     return found[0]
 
 

@@ -110,12 +110,11 @@ def hdf5_format(path: str | Path) -> str | None:
     """
     import h5py
 
-    place = Path(path)
-    if not place.is_file():
-        raise FileError(f"{path}: {'is not a file' if place.exists() else 'no such file'}")
+    if not Path(path).is_file():
+        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
     try:
-        with h5py.File(place, "r") as file:
+        with h5py.File(path, "r") as file:
             return file.attrs.get("format")
     except OSError as error:
-        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(place) else "not an HDF5 file"
+        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(path) else "not an HDF5 file"
         raise FileError(f"{path}: {problem}") from error

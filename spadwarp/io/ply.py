@@ -30,8 +30,8 @@ def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.
     view = np.asarray(directions, np.float64)
     if along.ndim != 2 or view.shape != (*along.shape, 3):
         raise ArgumentError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
-    there = np.isfinite(along)
-    return (along[there][:, None] * view[there]).astype(np.float32), there
+    returned = np.isfinite(along)
+    return (along[returned][:, None] * view[returned]).astype(np.float32), returned
 
 
 def write_ply(

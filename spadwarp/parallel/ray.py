@@ -24,7 +24,7 @@ Note = Callable[[str], None]
 
 __all__ = ["Event", "RayWorker", "RayWorkers", "run_on_ray"]
 
-# A job whose worker was lost runs again this often: after that it is likely what kills them.
+# How often a job whose worker was lost runs again; a job that loses more is likely what kills them.
 _RETRIES = 3
 
 # Seconds without any worker after which a remark says so.
@@ -140,7 +140,7 @@ class RayWorkers:
             self._ray._private.worker.print_to_stdstream = self._print
 
     def _actors(self) -> tuple[dict[str, Any], int]:
-        """Options of an actor, and how many there shall be."""
+        """Options of an actor, and the number of workers."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         gpus = int(sum(node.get("GPU", 0) for node in nodes))
         self.cuda = gpus > 0 if self._device is None else self._device != "cpu"
@@ -284,8 +284,8 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     try:
         ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-        place = f"at {address}" if address else "on this machine"
-        raise DeviceError(f"Ray cannot be reached {place}: {_first_line(error)}") from error
+        cluster = f"at {address}" if address else "on this machine"
+        raise DeviceError(f"Ray cannot be reached {cluster}: {_first_line(error)}") from error
     finally:
         # Ray's own would end the program at SIGTERM.
         for number, handler in handlers.items() if main else ():

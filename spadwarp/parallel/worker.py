@@ -63,7 +63,7 @@ def interruptible() -> Iterator[threading.Event]:
 
     def handle(number: int, frame: object) -> None:
         nonlocal first
-        # Some programs send one interrupt twice, to a process and to its group: a second one counts a second later.
+        # Some programs send one interrupt twice, to a process and to its group: a second one counts after 1 s.
         if interrupted.is_set() and time.monotonic() > first + 1.0:
             raise KeyboardInterrupt
         if not interrupted.is_set():

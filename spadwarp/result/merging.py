@@ -118,10 +118,10 @@ def check_capacity(total: NDArray[np.float64]) -> None:
         )
 
 
-def check_targets(a: Truth, b: Truth, what: str) -> None:
+def check_targets(a: Truth, b: Truth, action: str) -> None:
     """Raises `ConfigError` where two truth maps are not of the same targets."""
     if not np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True):
-        raise ConfigError(f"{what}: the targets of the results differ, by their truth maps: was a mesh file changed?")
+        raise ConfigError(f"{action}: the targets of the results differ, by their truth maps: was a mesh file changed?")
 
 
 def physics_of(scene: Scene) -> Scene:

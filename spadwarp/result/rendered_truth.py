@@ -38,7 +38,7 @@ class ExrPreset:
     axes: tuple[tuple[float, float, float], ...]
 
 
-_HALF_MAX = 65504.0  # the largest float16: what "infinitely far" becomes there
+_HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16
 
 EXR_PRESETS: dict[str, ExrPreset] = {
     # Unreal: x forward, y right, z up, left-handed; scene depth is planar, in centimetres.

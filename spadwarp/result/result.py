@@ -66,7 +66,7 @@ class Result:
         truth: Depth, range, normal and reflectance at pixel centres.
         timing: Seconds of each stage.
         provenance: Versions, device and date.
-        partial: Whether the run was interrupted; `photons` then counts what was done.
+        partial: Whether the run was interrupted; `photons` then counts those that were done.
         photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
         requested: The ids [start, stop) that were asked for; an interrupted run has only a part of them.
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.

@@ -21,7 +21,7 @@ from spadwarp.scene import Scene
 __all__ = ["CHECKPOINT", "RunFiles", "bytes_needed", "newest_result", "remove_checkpoint", "write_run"]
 
 CHECKPOINT = "checkpoint.h5"
-"""Name of the partial result that is there while a run is not finished."""
+"""Name of the partial result of an unfinished run."""
 
 _NAMES = {"result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr"}
 _PICTURES = {f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")}
@@ -90,15 +90,15 @@ def _save(result: Result, path: Path) -> Path:
         raise FileError(f"{error}\n{refuge}: the result is here instead") from error
 
 
-def newest_result(place: str | Path) -> Path:
-    """A file itself; of a directory its result or its checkpoint, whichever is newer, or where there is none itself."""
-    folder = Path(place)
-    found = [path for name in ("result.h5", CHECKPOINT) if (path := folder / name).is_file()]
-    return max(found, key=lambda path: path.stat().st_mtime_ns, default=folder)
+def newest_result(path: str | Path) -> Path:
+    """Of a directory its result or its checkpoint, whichever is newer; any other path as it is."""
+    folder = Path(path)
+    found = [file for name in ("result.h5", CHECKPOINT) if (file := folder / name).is_file()]
+    return max(found, key=lambda file: file.stat().st_mtime_ns, default=folder)
 
 
 def remove_checkpoint(out: str | Path) -> None:
-    """Removes the checkpoint of a directory, and what a killed run has left of one."""
+    """Removes the checkpoint of a directory, and the parts of one that a killed run has left."""
     folder = Path(out)
     for path in (folder / CHECKPOINT, *folder.glob(f".{CHECKPOINT}.*.tmp")):
         path.unlink(missing_ok=True)

@@ -156,7 +156,7 @@ def _added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
 
 @contextmanager
 def device_errors(device: wp.Device) -> Iterator[None]:
-    """Makes a `DeviceError` that names the device of what Warp raises."""
+    """Turns an error of Warp into a `DeviceError` that names the device."""
     try:
         yield
     except RuntimeError as error:

@@ -18,9 +18,9 @@ _BLOCK_SECONDS = 5.0
 class Event(NamedTuple):
     """What a worker did.
 
-    "progress": some photons more of its block (value: how many). "traced": its block, or what was done of it when it
-    was stopped (value: ids, seconds). "collected": its tallies are in `Workers.tallies`. "lost": its block and its
-    tallies are gone, and another worker takes its place.
+    "progress": more photons of its block are done (value: their number). "traced": its block is done, or was stopped
+    (value: ids done, seconds). "collected": its tallies are in `Workers.tallies`. "lost": its block and its tallies are
+    gone, and another worker replaces it.
     """
 
     kind: Literal["progress", "traced", "collected", "lost"]
@@ -55,7 +55,7 @@ class Workers(Protocol):
         """Ends blocks early."""
 
     def wait(self) -> list[Event]:
-        """What has happened, after a fraction of a second at most. Raises what a worker raised."""
+        """Events, after a fraction of a second at most. Raises the error of a worker."""
 
     def truth(self) -> Truth:
         """Truth maps by one of the workers."""

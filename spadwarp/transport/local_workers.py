@@ -44,7 +44,7 @@ class LocalWorkers:
     ) -> None:
         kind = "cuda" if devices[0].is_cuda else "cpu"
         if any(device.is_cuda != devices[0].is_cuda for device in devices):
-            raise ConfigError("device: CPU and GPU round differently; their photons cannot make one run")
+            raise ConfigError("device: CPU and GPU round differently; their photons cannot be added up")
         if tallies is not None and len(devices) > 1:
             raise ConfigError(f"tallies go with one device, not with {len(devices)}")
         size = LAUNCH_SIZE[kind] if plan.launch_size is None else plan.launch_size
@@ -123,7 +123,7 @@ class LocalWorkers:
         return trace_truth(self._scene, self.workers[0].model)
 
     def tallies(self) -> Tallies:
-        """Those of all devices; with one CPU they are its own memory."""
+        """Those of all devices; with a single CPU in its own memory."""
         total = self.workers[0].tallies()
         if len(self.workers) > 1:
             total = Tallies.of(total) if not self._devices[0].is_cuda else total

@@ -1,4 +1,4 @@
-"""From a scene to what the kernels take: parameter structs, the mesh's BVH, the compile-time choices."""
+"""A scene as the kernels take it: parameter structs, the mesh's BVH, the compile-time choices."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def build_model(
 
     Raises:
         ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
-            the phase function's table is not one.
+            the phase function's table is not a density.
         FileError: That table or the beam's profile cannot be read.
         DeviceError: The device has too little memory.
     """

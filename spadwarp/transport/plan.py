@@ -1,4 +1,4 @@
-"""Which photons a run traces, and what all who trace them must agree on."""
+"""The plan of a run: scene, seed, photon ids, batches."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def _truth(worker: Worker) -> Truth:
 
 
 def _trace(block: Range, worker: Worker) -> tuple[Ranges, float]:
-    """Traces a block, or what of it is done when the run is stopped; returns the ids and the seconds it took."""
+    """Traces a block; returns the ids done, fewer if it was stopped, and the seconds it took."""
     began = time.perf_counter()
     done = worker.state["local"].workers[0].trace(block, stopped=worker.stopped)
     return done, time.perf_counter() - began

@@ -28,8 +28,9 @@ FORMAT_VERSION = 1
 
 _ARRAYS = ("id", "position", "direction", "weight", "path", "collisions", "reason")
 _READ_ME = (
-    "One row a photon, as its history ended: position [m] and direction in the camera frame (+x right, +y down, "
-    "+z forward), weight, geometric path [m], collisions (surfaces included), reason (index into reasons)."
+    "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
+    "frame, +x right, +y down, +z forward), weight, geometric path [m], collisions (surfaces included), reason (index "
+    "into reasons)."
 )
 
 
@@ -41,7 +42,7 @@ class PhotonRecords:
         id: uint64 `[N]`.
         position: float32 `[N, 3]`, where it ended [m].
         direction: float32 `[N, 3]`, unit vector of its last flight.
-        weight: float32 `[N]`, what was left of it.
+        weight: float32 `[N]`, remaining weight.
         path: float32 `[N]`, geometric path [m].
         collisions: int32 `[N]`, events, surfaces included.
         reason: int32 `[N]`, index into `reasons`.

@@ -27,7 +27,7 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered
     evenly in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that
     the beam spans; for a laser away from the lens also where its beam, narrow near its exit, crosses the view. Times 16
-    for what scatters more than once.
+    for multiple scattering.
     """
     camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
     speed = medium.pulse_speed
