@@ -61,7 +61,7 @@ def _value(value):
         return repr(value)
     if value is None:
         return "None"
-    if type(value) is tuple:
+    if type(value) in (tuple, dict):
         return f"({', '.join(map(_value, value))})"
     return getattr(value, "name", type(value).__name__)
 

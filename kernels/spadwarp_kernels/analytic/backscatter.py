@@ -38,7 +38,7 @@ def single_scatter_per_metre(
 ) -> wp.float64:
     """Single-scatter detections per pulse and metre of range at distance r along `view` [1/m].
 
-    For a laser in the lens, a narrow cone and the axis it is C_back(t) of the paper's geometry times dt/dr.
+    For a laser in the lens, a narrow cone and the axis it is C_back(t) of the geometry of Lu et al. 2024 times dt/dr.
     """
     if lidar.lu2024 == 1:
         scale = lidar.photons * lidar.pde * lidar.scattering * phase[phase.shape[0] - 1]
@@ -68,7 +68,7 @@ def single_scatter_rate(
 
 
 @wp.func
-def lit_interval(lidar: Lidar, view: wp.vec3d) -> wp.vec2d:
+def illuminated_interval(lidar: Lidar, view: wp.vec3d) -> wp.vec2d:
     """The part [near, far] of a line of sight inside the laser's uniform cone; far < near if there is none."""
     far = wp.float64(1.0e30)
     if lidar.profile != 0 or lidar.spread >= ONE or lidar.lu2024 == 1:
@@ -110,9 +110,9 @@ def _single_scatter_table(
 ):
     """Edges in path, cumulative distribution and total of single-scatter backscatter. Launch grid: pixels."""
     i = first + wp.tid()
-    lit = lit_interval(lidar, view[i])
-    near = wp.max(wp.max(lit[0], lidar.nearest), range_of_path(lidar, view[i], lidar.start * lidar.speed))
-    far = wp.min(lit[1], range_of_path(lidar, view[i], lidar.stop * lidar.speed))
+    illuminated = illuminated_interval(lidar, view[i])
+    near = wp.max(wp.max(illuminated[0], lidar.nearest), range_of_path(lidar, view[i], lidar.start * lidar.speed))
+    far = wp.min(illuminated[1], range_of_path(lidar, view[i], lidar.stop * lidar.speed))
     if distance[i] > ZERO:
         far = wp.min(far, distance[i])
     far = wp.max(far, near)

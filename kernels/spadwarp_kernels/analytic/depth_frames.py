@@ -1,4 +1,4 @@
-"""Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon in its place."""
+"""Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead."""
 
 from collections.abc import Sequence
 
@@ -53,11 +53,12 @@ def path_at_share(paths: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=f
 
 
 @wp.func
-def _depth_of_path(sampler: Sampler, view: wp.vec3, path: float) -> float:
-    baseline2 = wp.length_sq(sampler.laser)
+def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
+    """Planar depth at which light has gone `path` from laser to target to lens [m]; 0 if there is none."""
+    baseline2 = wp.length_sq(laser)
     if path * path <= baseline2:
         return 0.0
-    return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, sampler.laser)))
+    return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
 
 
 @wp.kernel
@@ -96,8 +97,8 @@ def _frames(
                 shift = radius * wp.sin(angle)
                 word = block[3]
             value = depth[pixel] + shift
-            stray = u01(word) < p
-            if stray:
+            reports_background = u01(word) < p
+            if reports_background:
                 extra = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
                 kind = u01(extra[0])
                 draw = u01(extra[1])
@@ -107,9 +108,9 @@ def _frames(
                 path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
                 if kind >= flat_share[pixel]:
                     path = path_at_share(paths, cumulative, pixel, draw)
-                value = _depth_of_path(sampler, view[pixel], path)
+                value = depth_of_path(sampler.laser, view[pixel], path)
             frames[frame, pixel] = value
-            labels[frame, pixel] = stray
+            labels[frame, pixel] = reports_background
 
 
 def sample_frames(

@@ -10,8 +10,9 @@ import warp as wp
 
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
+from spadwarp_kernels.random.quantiles import count_quantile
 
-from .depth_frames import path_at_share
+from .depth_frames import depth_of_path, path_at_share
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -42,40 +43,6 @@ class FrameCoding:
     depth_step: float
     pulses: float
     intensity_step: float
-
-
-@wp.func
-def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
-    """Planar depth at which light has gone `path` from laser to target to lens [m]; 0 if there is none."""
-    baseline2 = wp.length_sq(laser)
-    if path * path <= baseline2:
-        return 0.0
-    return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
-
-
-@wp.func
-def count_quantile(z: float, pulses: float, alpha: float) -> float:
-    """The count of Binomial(pulses, 1 − exp(−alpha)) at the normal quantile z.
-
-    Below a mean of 8 by inversion; above it by the Cornish–Fisher expansion to the skewness, whose error in the
-    distribution function is below 0.2 % there.
-    """
-    p = 1.0 - wp.exp(-alpha)
-    if alpha < 1.0e-3:
-        p = alpha * (1.0 - 0.5 * alpha)
-    mean = pulses * p
-    if mean >= 8.0:
-        spread = wp.sqrt(mean * (1.0 - p))
-        x = mean + spread * z + (1.0 - 2.0 * p) * (z * z - 1.0) / 6.0
-        return wp.clamp(wp.floor(x + 0.5), 0.0, pulses)
-    rest = 0.5 * wp.erfc(-z * 0.7071067811865476)
-    probability = wp.exp(-pulses * alpha)
-    count = float(0.0)
-    while rest > probability and count < pulses and count < 64.0:
-        rest = rest - probability
-        count = count + 1.0
-        probability = probability * p / (1.0 - p) * (pulses + 1.0 - count) / count
-    return count
 
 
 @wp.kernel
@@ -121,7 +88,7 @@ def _frames(
                 bits |= 128 >> k
                 draw = u01(block[3])
                 path = coding.nearest + draw * (coding.farthest - coding.nearest)
-                # Of those that are stray, kind / chance is uniform again.
+                # Of the pixels that report background, kind / chance is uniform again.
                 if kind >= flat_share[pixel] * chance:
                     path = path_at_share(paths, cumulative, pixel, draw)
                 value = depth_of_path(coding.laser, view[pixel], path)

@@ -86,7 +86,7 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
 def _small_spot_signal(
     lidar: Lidar, x: wp.vec3d, view: wp.vec3d, normal: wp.vec3d, reflectance: wp.float64
 ) -> wp.float64:
-    """Signal where the beam lights part of the pixel: its rays are followed to the surface's tangent plane at x."""
+    """Signal where the beam illuminates part of the pixel: its rays go to the surface's tangent plane at x."""
     total = wp.float64(0.0)
     half = HALF * lidar.pixel_tangent
     for i in range(16):
@@ -130,14 +130,14 @@ def radiometric_signal(
         return _small_spot_signal(lidar, x, view, normal, reflectance)
     fluence = beam_fluence(lidar, x)
     if lidar.profile != 1:
-        # A pixel on the rim of the beam is lit in part.
-        lit = wp.int32(0)
+        # A pixel on the rim of the beam is partly illuminated.
+        corners_inside = wp.int32(0)
         for corner in range(4):
             du = (wp.float64(corner % 2) - HALF) * lidar.pixel_tangent * x[2]
             dv = (wp.float64(corner / 2) - HALF) * lidar.pixel_tangent * x[2]
             if beam_fluence(lidar, x + wp.vec3d(du, dv, ZERO)) > ZERO:
-                lit += 1
-        if lit > 0 and lit < 4:
+                corners_inside += 1
+        if corners_inside > 0 and corners_inside < 4:
             fluence = ZERO
             for i in range(64):
                 du = ((wp.float64(i % 8) + HALF) / wp.float64(8.0) - HALF) * lidar.pixel_tangent * x[2]

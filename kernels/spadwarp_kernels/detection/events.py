@@ -258,7 +258,7 @@ def event_counts(
     run(0, none, none, wp.zeros(1, dtype=int, device=device))
     if not tags:
         return counts, None
-    # The same draws again, now that each row's place in the stream is known.
+    # The same draws again, now that the position of each row in the stream is known.
     per_row = number.numpy().astype(np.int64)
     start = np.concatenate([[0], np.cumsum(per_row)])
     pulse = wp.empty(max(int(start[-1]), 1), dtype=wp.int64, device=device)

@@ -52,7 +52,7 @@ class Estimator(NamedTuple):
         request_flight: ``(s) -> Request``, the score of a flight whose planned interval is not empty.
         request_event: ``(s, camera) -> Request``, the score of the event that the photon has come to.
         score: ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored``; needed with either request.
-        direct: ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``, in place of
+        direct: ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``, instead of
             the phase function and the surface's law; `reflected` is the draw of a rough specular surface.
     """
 

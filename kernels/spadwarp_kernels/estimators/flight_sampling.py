@@ -67,7 +67,7 @@ def _chord_slope(d: float, along: float, r: float) -> float:
 def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Function:
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``."""
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
-    # What the guide takes: of a place on the flight, the place that has it, its derivative along the flight.
+    # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
     turn_of, along_of, slope = (
         (_chord_of_turn, _along_chord, _chord_slope) if guide.chord else (_angle_of_turn, _along_angle, _angle_slope)
     )
@@ -80,7 +80,7 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
 
         Half the points are drawn from exp(-c s), half in the angle theta(s) = atan2(D, t_c - s), D = |x cross u|, by
         which the light must turn to reach the lens: from the guide, which follows the phase function; on flights that
-        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small for places far off.
+        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small far from the lens.
         """
         sample = FlightSample()
         s0 = interval[0]

@@ -127,12 +127,12 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
             v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
-        inward = toward_axis(s.view, s.x)
+        to_axis = toward_axis(s.view, s.x)
         to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
         to_view_chance = float(0.0)
-        if wp.dot(inward, inward) > 0.0 and not in_view(camera, s.view, s.target, s.x):
+        if wp.dot(to_axis, to_axis) > 0.0 and not in_view(camera, s.view, s.target, s.x):
             to_view_chance = guiding.return_probability
-            inward = wp.normalize(inward)
+            to_axis = wp.normalize(to_axis)
         choice = u01(s.flight.block[3])
         here = water_at(medium, layers, s.x)
         axis = snapped
@@ -144,7 +144,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             axis = v
             t = lobe_sample(u01_fine(s.flight.block[1]), medium, guiding)
         elif choice < to_lens_chance + to_view_chance:
-            axis = inward
+            axis = to_axis
             t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), guiding.return_anisotropy)
         new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
         if wp.static(specular):
@@ -159,7 +159,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), medium, guiding)
         if to_view_chance > 0.0:
             mixture += to_view_chance * henyey_greenstein_pdf(
-                one_minus_cosine(inward, new.u), guiding.return_anisotropy
+                one_minus_cosine(to_axis, new.u), guiding.return_anisotropy
             )
         new.factor = density / wp.max(mixture, 1.0e-30)
         return new

@@ -102,7 +102,7 @@ def _pack_kernel(
         nodes[3] = _with_bits(wp.vec3(_NOWHERE), NO_NODE)
     if kind == 0:
         # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
-        place = wp.where(node == root, 0, before[node] + 1)
+        pair = wp.where(node == root, 0, before[node] + 1)
         for k in range(2):
             child = bits_of(_tree_node(mesh, node, k == 1)[3])
             low = _tree_node(mesh, child, False)
@@ -111,8 +111,8 @@ def _pack_kernel(
             if _tree_kind(mesh, child) == 1:
                 entry = -2 - bits_of(low[3])
                 _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
-            nodes[4 * place + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
-            nodes[4 * place + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
+            nodes[4 * pair + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
+            nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
 
 
 def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:

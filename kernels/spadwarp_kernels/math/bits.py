@@ -1,4 +1,4 @@
-"""Integers in the place of floats, bit by bit."""
+"""The bits of floats as integers, and back."""
 
 import warp as wp
 

@@ -5,7 +5,7 @@ import warp as wp
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // The hardware's sine and cosine, good to 4e-7 on (-pi, pi): far less than a float32 direction can tell.
+    // The hardware's sine and cosine, good to 4e-7 on (-pi, pi): far below the resolution of a float32 direction.
     float s, c;
     __sincosf(6.2831853f * (xi - 0.5f), &s, &c);
     return wp::vec2(c, s);
@@ -46,7 +46,7 @@ def orthonormal_basis(n: wp.vec3):
 def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     """The unit vector at angle theta from u, t = 1 - cos(theta), at azimuth 2 pi xi.
 
-    Exact on an orthonormal basis; equal in distribution to the paper's eq 15, without its division by zero along the
+    Exact on an orthonormal basis; equal in distribution to eq 15 of Lu et al. 2024, which divides by zero along the
     axis.
     """
     sin_theta = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
@@ -59,12 +59,10 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
 
 @wp.func
 def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
-    """The near-axis rule (eq 16): u itself, or the z axis with u's sign where |u_z| >= axis_threshold; 1 switches it
-    off.
+    """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= axis_threshold, else u.
 
     A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase
-    function;
-    the flight keeps u. Up to 1.15 degrees of tilt are dropped at the paper's 0.9998.
+    function; the flight keeps u. A threshold of 0.9998 drops up to 1.15 degrees of tilt, 1 switches the rule off.
     """
     if axis_threshold < 1.0 and wp.abs(u[2]) >= axis_threshold:
         return wp.vec3(0.0, 0.0, wp.sign(u[2]))

@@ -11,7 +11,7 @@ class Medium:
 
     Attributes:
         extinction: c = a + b [1/m], >= 0; 0 is vacuum.
-        albedo: Single-scattering albedo b/c in [0, 1]; with the paper's model, the upper end of the uniform draw.
+        albedo: Single-scattering albedo b/c in [0, 1]; with random_albedo, the upper end of the uniform draw.
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
         axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
             switches it off.

@@ -1,4 +1,4 @@
-"""Phase functions of the water, and what `guided` draws from in their place."""
+"""Phase functions of the water, and what `guided` draws from instead."""
 
 from .densities import (
     fournier_forand_density,
@@ -14,11 +14,13 @@ from .henyey_greenstein import (
     sample_henyey_greenstein,
 )
 from .phase_function import Guiding, PhaseFunction, PhaseGuide
+from .registry import PHASE_FUNCTIONS
 from .tabulated import TABULATED, make_phase_tables
 
 __all__ = [
     "HENYEY_GREENSTEIN",
     "HENYEY_GREENSTEIN_GUIDE",
+    "PHASE_FUNCTIONS",
     "TABULATED",
     "Guiding",
     "PhaseFunction",

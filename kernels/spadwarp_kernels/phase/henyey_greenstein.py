@@ -1,8 +1,7 @@
-"""Phase functions of the water, as densities per steradian over the scattering angle.
+"""The phase function of Henyey and Greenstein.
 
-Everything is written in t = 1 - cos(theta), not in cos(theta): the float32 grid is finest at 0, where the forward peak
-of
-natural water lies, while cos(theta) loses every angle below 3e-4 rad.
+Phase functions are written in t = 1 - cos(theta), not in cos(theta): the float32 grid is finest at 0, where the forward
+peak of natural water lies, while cos(theta) loses every angle below 3e-4 rad.
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""What a phase function is to the transport kernels, and what the estimator `guided` draws from in its place."""
+"""What a phase function is to the transport kernels, and what the estimator `guided` draws from instead."""
 
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ class Guiding:
 
 
 class PhaseGuide(NamedTuple):
-    """What `guided` draws from in place of a phase function p that it cannot invert; all are Warp functions.
+    """What `guided` draws from instead of a phase function p that it cannot invert; all are Warp functions.
 
     The angle theta in (0, pi) by which light on a flight turns to reach the lens has the density q(theta), per radian
     and of any scale: best is p(theta). Directions towards the lens have the density of a lobe [1/sr]: best is the
@@ -39,8 +39,8 @@ class PhaseGuide(NamedTuple):
         density: ``(theta: float, medium: Medium) -> float``, q itself.
         lobe_pdf: ``(t: float, medium: Medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens.
         lobe_sample: ``(xi: float, medium: Medium, guiding: Guiding) -> float``, returns t.
-        chord: The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) in place of theta, which spares
-            trigonometry: Henyey-Greenstein is (a^2 + c^2)^(-3/2) without approximation, a^2 = (1 - g)^2/g.
+        chord: The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) instead of theta, which needs
+            no trigonometry: Henyey-Greenstein is (a^2 + c^2)^(-3/2) without approximation, a^2 = (1 - g)^2/g.
     """
 
     complement: wp.Function
@@ -55,7 +55,7 @@ class PhaseFunction(NamedTuple):
     """A phase function as the transport kernels take it.
 
     Attributes:
-        name: Told apart by name in the kernel cache and in files.
+        name: Identifies it in the kernel cache and in files.
         pdf: Warp function ``(t: float, medium: Medium) -> float``, density [1/sr].
         sample: Warp function ``(xi: float, medium: Medium) -> float``, returns t = 1 - cos(theta).
         guide: How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's

@@ -38,13 +38,13 @@ _FLAT = 2.0**-32  # t up to which a table takes the density for constant
 
 @wp.func
 def _one_minus_cosine(z: float) -> float:
-    """t at the folded place z of t/2."""
+    """t at the folded coordinate z of t/2."""
     return wp.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)
 
 
 @wp.func
 def _turn(theta: float) -> float:
-    """The folded place of 1 - theta/pi; a forward theta keeps its precision."""
+    """The folded coordinate of 1 - theta/pi; a forward theta keeps its precision."""
     return wp.where(theta < 0.5 * _PI, wp.min(-theta * _INV_PI, -1.0e-12), wp.max(1.0 - theta * _INV_PI, 0.0))
 
 
@@ -100,18 +100,18 @@ def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceL
     """
     scattering = tabulate(lambda z: density(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
 
-    def turned(z: Floats) -> Floats:
+    def over_angle(z: Floats) -> Floats:
         t = 2.0 * np.sin(0.5 * np.pi * np.where(z < 0.0, -z, 1.0 - z)) ** 2
         return density(np.maximum(t, _FLAT))  # where the density over t stays finite, its integral over theta does
 
-    turning = tabulate(turned)
+    turning = tabulate(over_angle)
     below = np.append(turning[:, 0], 1.0), np.append(lower_ends(), 1.0)
 
     def lobe(z: Floats) -> Floats:
         """What a flight at an angle theta to the lens brings, up to factors that vary little: integral of p from theta
         on over its distance from the lens, ~ sin(theta)."""
         angle = 2.0 * np.arcsin(np.sqrt(np.abs(z)))  # from the nearer end
-        place = np.where(z < 0.0, angle, np.pi - angle) / np.pi
-        return np.interp(place, below[1], below[0]) / np.sin(angle)
+        position = np.where(z < 0.0, angle, np.pi - angle) / np.pi
+        return np.interp(position, below[1], below[0]) / np.sin(angle)
 
     return make_density_tables(scattering, turning, tabulate(lobe), device=device)

@@ -20,7 +20,7 @@ class TransportSpec(NamedTuple):
         mesh: Trace rays against a mesh.
         brute_force: On CUDA, try every face rather than walk the tree; for meshes of up to BRUTE_FORCE_FACES faces.
         bounded: Honour the domain and the lateral limit.
-        roulette: Russian roulette in place of the weight cut-off.
+        roulette: Russian roulette instead of the weight cut-off.
         records: Write the terminal state of each photon.
         layered: The water is that of the layers, not that of the medium.
         pattern: The reflectance varies within faces: corners and textures.

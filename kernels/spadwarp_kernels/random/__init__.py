@@ -24,11 +24,13 @@ from .philox import (
     u01_low,
     u01_open,
 )
+from .quantiles import count_quantile
 
 __all__ = [
     "DensityTables",
     "RoundKeys",
     "binomial",
+    "count_quantile",
     "fold",
     "folded_quadrature",
     "make_density_tables",

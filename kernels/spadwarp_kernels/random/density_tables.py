@@ -1,11 +1,11 @@
 """Tabulated probability densities on [0, 1] that resolve both ends.
 
-The grid has sixteen cells an octave towards 0 and towards 1, down to 2^-33 from either end: the bits of a float tell
-its cell, without a search and without a logarithm. A place x is given folded, z = x up to 1/2 and z = x - 1 beyond,
+The grid has sixteen cells an octave towards 0 and towards 1, down to 2^-33 from either end: the bits of a float give
+its cell, without a search and without a logarithm. A coordinate x is given folded, z = x up to 1/2 and z = x - 1 above,
 which keeps its distance from the nearer end exact.
 
-Within a cell the density is linear, with the probability and the mean place of the function that was tabulated. It is
-the density of what `table_sample` draws, not an approximation to it.
+Within a cell the density is linear, with the probability and the mean coordinate of the function that was tabulated. It
+is the density of what `table_sample` draws, not an approximation to it.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ _FIRST_BITS = wp.constant((127 - _OCTAVES - 1) << 23)  # of the float32 2^-33
 _SHIFT = wp.constant(23 - 4)  # the bits of a float32 below a sixteenth of its octave
 _LAST = wp.constant(_HALF - 1)
 _LAST_CELL = wp.constant(2 * _HALF - 1)
-_NEAREST = wp.constant(1.0e-12)  # a folded place of the upper half stays at least this far below 0: its sign tells
+_NEAREST = wp.constant(1.0e-12)  # least distance of a folded coordinate of the upper half from 0, so that it has a sign
 
 
 @wp.struct
@@ -73,7 +73,7 @@ def _part(z: float, k: int) -> float:
 
 @wp.func
 def table_density(tables: DensityTables, row: int, z: float) -> float:
-    """Density over x at the folded place z."""
+    """Density over x at the folded coordinate z."""
     k = _cell_at(z)
     cell = tables.cells[row, k]
     return cell[2] + (cell[3] - cell[2]) * _part(z, k)
@@ -81,7 +81,7 @@ def table_density(tables: DensityTables, row: int, z: float) -> float:
 
 @wp.func
 def table_cumulative(tables: DensityTables, row: int, z: float) -> float:
-    """Probability below the folded place z."""
+    """Probability below the folded coordinate z."""
     k = _cell_at(z)
     cell = tables.cells[row, k]
     f = _part(z, k)
@@ -91,7 +91,7 @@ def table_cumulative(tables: DensityTables, row: int, z: float) -> float:
 
 @wp.func
 def table_sample(tables: DensityTables, row: int, xi: float) -> float:
-    """The folded place below which the probability is xi, in [0, 1)."""
+    """The folded coordinate below which the probability is xi, in [0, 1)."""
     k = tables.guide[row, _cell_at(fold(xi))]
     cell = tables.cells[row, k]
     while xi >= cell[1] and k < _LAST_CELL:
@@ -111,7 +111,7 @@ def table_sample(tables: DensityTables, row: int, xi: float) -> float:
 
 
 def folded_quadrature() -> tuple[Floats, Floats]:
-    """Folded places and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second.
+    """Folded coordinates and weights for an integral over [0, 1], `[2, cells of a half, 16]`, the upper half second.
 
     A function may rise towards either end as y^-0.95.
     """
@@ -125,7 +125,7 @@ def folded_quadrature() -> tuple[Floats, Floats]:
 
 
 def tabulate(density: Callable[[Floats], Floats]) -> Floats:
-    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded places.
+    """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates.
 
     Up to 2^-33 from an end the density is replaced by its mean there. Raises `ValueError` if it is negative, not finite
     or zero everywhere.

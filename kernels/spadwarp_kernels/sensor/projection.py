@@ -13,7 +13,7 @@ from .visibility import may_be_hidden, may_be_hidden_in
 
 
 class Lens(NamedTuple):
-    """A way of imaging, told apart by name in the kernel cache.
+    """A way of imaging; its name identifies it in the kernel cache.
 
     Attributes:
         name: "pinhole" or "calibrated".

@@ -31,12 +31,12 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, near_depth: wp.array2d(d
     last_column = int(_TEXELS - 1)
     last_row = int(_TEXELS - 1)
     if depth > camera.aperture_radius:
-        # A ray to the rim of the lens strays from the line to its centre by less than this, as a tangent.
-        stray = camera.aperture_radius / depth
-        left = wp.min(p[0] / p[2], wp.min(q[0] / q[2], r[0] / r[2])) - stray
-        right = wp.max(p[0] / p[2], wp.max(q[0] / q[2], r[0] / r[2])) + stray
-        top = wp.min(p[1] / p[2], wp.min(q[1] / q[2], r[1] / r[2])) - stray
-        bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + stray
+        # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent.
+        spread = camera.aperture_radius / depth
+        left = wp.min(p[0] / p[2], wp.min(q[0] / q[2], r[0] / r[2])) - spread
+        right = wp.max(p[0] / p[2], wp.max(q[0] / q[2], r[0] / r[2])) + spread
+        top = wp.min(p[1] / p[2], wp.min(q[1] / q[2], r[1] / r[2])) - spread
+        bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + spread
         # One texel more on each side makes up for rounding.
         edge = float(_TEXELS)
         first_column = int(wp.clamp(_texel(left, view[0], view[2]) - 1.0, 0.0, edge))

@@ -37,7 +37,7 @@ class Surfaces:
         nodes, faces, order: The mesh's tree, see `bvh`.
         reflectance: Of each face, in [0, 1].
         near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
-        corner_reflectance: At the three corners of each face, in place of `reflectance`; empty unless it varies.
+        corner_reflectance: At the three corners of each face, instead of `reflectance`; empty unless it varies.
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
@@ -77,7 +77,7 @@ def make_surfaces(
         mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew; the arrays may stay.
         reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
         corner_reflectance: Lambertian reflectance at the corners of each face, vec3 [faces], interpolated between them;
-            takes the place of `reflectance`.
+            replaces `reflectance`.
         textures: From `make_textures`; multiplies the corners', which default to `reflectance`.
         specular: Reflectance of the facets of a rough specular lobe, in [0, 1]: one number or an array as above.
         roughness: GGX width parameter of the lobe, in [0.01, 1]: one number or an array as above.

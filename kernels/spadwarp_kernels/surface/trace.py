@@ -17,7 +17,7 @@ class SurfaceHit:
         distance: [m].
         normal: Unit vector on the ray's side.
         face: Its index; -1 for a miss.
-        slot: Its place in the order of the mesh's tree, where that was walked; -1 for a miss.
+        slot: Its index in the order of the mesh's tree, where that was walked; -1 for a miss.
     """
 
     distance: float

@@ -249,19 +249,19 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.surface_events += s.surface_count
                         s.stage = START
                     wanting = s.stage == START
-                    place = count_lanes_before(wanting)
+                    entry = count_lanes_before(wanting)
                     if wp.static(cuda):
                         # All lanes emit a photon each, which those that have ended take one by one.
                         if s.taken >= 32:
                             s.first = take_photons(cursor)
                             s.taken = 0
                             exchange(True, lane, emit(laser, scan, seed, first_id + wp.uint64(s.first + lane)))
-                        place += s.taken
+                        entry += s.taken
                         s.taken += count_lanes(wanting)
                     elif wanting:
                         s.first += 1
-                    if wanting and place < 32:
-                        s.photon = s.first + place
+                    if wanting and entry < 32:
+                        s.photon = s.first + entry
                         s.stage = wp.where(s.photon < photon_count, FLIGHT, DONE)
                         if s.stage == FLIGHT:
                             id = first_id + wp.uint64(s.photon)
@@ -269,7 +269,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.target = int(id % wp.uint64(scan.count))
                                 s.view = scan.view[s.target]
                             if wp.static(cuda):
-                                fresh = exchange(False, place, wp.spatial_vector())
+                                fresh = exchange(False, entry, wp.spatial_vector())
                             else:
                                 fresh = emit(laser, scan, seed, id)
                             s.x = wp.spatial_top(fresh)
