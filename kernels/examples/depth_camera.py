@@ -139,16 +139,14 @@ class SpadCamera:
             count_law="per_pulse",
             acquisitions=self.pulses,
         )
-        true, sigma, background_chance, flat = (wp.empty(count, dtype=float, device=self.device) for _ in range(4))
+        true, sigma, chance, flat = (wp.empty(count, dtype=float, device=self.device) for _ in range(4))
         inputs = [self.lidar, self.view, distance, backscatter, fisher, sigma_time, outlier]
-        wp.launch(
-            _statistics, dim=count, inputs=inputs, outputs=[true, sigma, background_chance, flat], device=self.device
-        )
+        wp.launch(_statistics, dim=count, inputs=inputs, outputs=[true, sigma, chance, flat], device=self.device)
         noisy, _ = sk.sample_frames(
             self.view32,
             true,
             sigma,
-            background_chance,
+            chance,
             flat,
             paths,
             cumulative,
@@ -197,14 +195,14 @@ def _statistics(
     # Out:
     depth: wp.array(dtype=float),
     sigma: wp.array(dtype=float),
-    background_chance: wp.array(dtype=float),
+    chance: wp.array(dtype=float),
     flat: wp.array(dtype=float),
 ):
     """True depth, its standard deviation, and how often a pixel reports background instead. Launch: pixels."""
     i = wp.tid()
     depth[i] = wp.NAN
     sigma[i] = 0.0
-    background_chance[i] = 0.0
+    chance[i] = 0.0
     flat[i] = 0.0
     if fisher[i] > wp.float64(0.0):
         # path = |r u - laser| + r, so that a time of flight changes with range by (1 + cosine) / speed.
@@ -215,7 +213,7 @@ def _statistics(
         # No bound is worse than a guess anywhere in the gate.
         guess = per_time * (lidar.stop - lidar.start) / wp.float64(3.4641016)
         sigma[i] = float(wp.min(sigma_time[i] * per_time, guess))
-        background_chance[i] = float(outlier[i])
+        chance[i] = float(outlier[i])
         flat[i] = float(dark / (dark + backscatter[i]))
 
 
