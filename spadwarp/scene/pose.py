@@ -6,6 +6,7 @@ are the columns of R sees the world's point X at Rᵀ(X − position); R = Rx·R
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +33,9 @@ def rotation_angles(matrix: ArrayLike) -> Vector:
     """`rotation_deg` [°] of a rotation matrix: `rotation_matrix` undone, with 0 for the last angle where ry is ±90°."""
     from scipy.spatial.transform import Rotation
 
-    return _vector(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True, suppress_warnings=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of ry = ±90°, where only the sum of the other two angles is defined
+        return _vector(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True))
 
 
 def to_camera(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
