@@ -4,39 +4,17 @@ import pytest
 
 from helpers.cli import run
 from helpers.scenes import scene as make_scene
+from spadwarp.scene import Scene
 
-SCENE = """
-[medium]
-extinction = 0.3
-albedo = 0.8
-group_index = "seawater"
-
-[laser]
-position = [-0.05, 0.0, 0.0]
-
-[camera]
-width = 8
-height = 6
-horizontal_fov_deg = 20.0
-aperture_diameter = 0.02
-
-[gate]
-start_ns = 16.0
-bin_width_ps = 200.0
-bins = 30
-
-[[targets]]
-builtin = "plane"
-size = [1.5, 1.5]
-translation = [0.0, 0.0, 2.0]
-
-[transport]
-photons = 20_000
-seed = 3
-
-[output]
-png = false
-"""
+SCENE = {
+    "medium": {"extinction": 0.3, "albedo": 0.8, "group_index": "seawater"},
+    "laser": {"position": [-0.05, 0.0, 0.0]},
+    "camera": {"width": 8, "height": 6, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+    "gate": {"start_ns": 16.0, "bin_width_ps": 200.0, "bins": 30},
+    "targets": [{"builtin": "plane", "size": [1.5, 1.5], "translation": [0.0, 0.0, 2.0]}],
+    "transport": {"photons": 20_000, "seed": 3},
+    "output": {"png": False},
+}
 
 # A laser in the lens, a gate that begins at 2 m of path and a response of some bins.
 SECTIONS = {
@@ -53,7 +31,7 @@ SECTIONS = {
 def scene(tmp_path_factory):
     """A plate in water; runs draw no pictures unless they are asked to."""
     path = tmp_path_factory.mktemp("scene") / "scene.toml"
-    path.write_text(SCENE)
+    path.write_text(Scene.from_dict(SCENE).to_toml())
     return path
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 import warp as wp
 
+Vectors, Floats, Integers = (wp.array(dtype=kind) for kind in (wp.vec3, float, int))  # of a kernel's arguments
+
 
 def on_device(values, device="cpu", dtype=None):
     """An array of float32 or int32; rows of three numbers are `wp.vec3`."""

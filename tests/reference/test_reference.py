@@ -87,13 +87,9 @@ def test_time_resolved_reflectance_agrees_with_the_walk():
 def test_walk_agrees_with_doubling():
     """All that leaves a slab, by face and by exit cosine, within four standard errors."""
     count, edges = 100_000, np.linspace(0, 1, 6)
-    photons = walk(
-        Medium(1.0, 0.9, 0.75),
-        pencil(count),
-        np.random.default_rng(1),
-        lower=(-math.inf,) * 2 + (0,),
-        upper=(math.inf,) * 2 + (2,),
-    )
+    inf = math.inf
+    faces = {"lower": (-inf, -inf, 0), "upper": (inf, inf, 2)}
+    photons = walk(Medium(1.0, 0.9, 0.75), pencil(count), np.random.default_rng(1), **faces)
     back, forth = exit_cosine_fractions(anisotropy=0.75, albedo=0.9, optical_depth=2, edges=edges)
     for face, sign, expected in (("z_low", -1, back), ("z_high", 1, forth)):
         cosine = sign * photons.direction[:, 2]
@@ -136,31 +132,20 @@ def test_moments_reproduce_published_values():
     five = after_path(5, scattering=1, anisotropy=0)
     assert (round(five.z, 6), round(five.r2, 6)) == (0.993262, 8.013476)
     collided = after_collisions(5, extinction=1, anisotropy=0.924)
-    assert (round(collided.z, 6), round(collided.r2, 6), round(collided.cos_theta, 6)) == (
-        4.295598,
-        27.128079,
-        0.673535,
-    )
+    found = (round(collided.z, 6), round(collided.r2, 6), round(collided.cos_theta, 6))
+    assert found == (4.295598, 27.128079, 0.673535)
 
 
 def test_moments_agree_with_the_walk():
     count, rng = 100_000, np.random.default_rng(4)
-    ended = walk(Medium(1.0, 1.0, 0.924), pencil(count), rng, max_collisions=5)
-    expected = after_collisions(5, extinction=1.0, anisotropy=0.924)
-    scores = [
-        (ended.position[:, 2], expected.z),
-        ((ended.position**2).sum(1), expected.r2),
-        (ended.direction[:, 2], expected.cos_theta),
-    ]
-    ended = walk(Medium(1.0, 1.0, 0.5), pencil(count), rng, max_path=5.0)
-    expected = after_path(5.0, scattering=1.0, anisotropy=0.5)
-    scores += [
-        (ended.position[:, 2], expected.z),
-        ((ended.position**2).sum(1), expected.r2),
-        (ended.direction[:, 2], expected.cos_theta),
-    ]
-    for score, value in scores:
-        assert abs(score.mean() - value) < 4 * score.std() / math.sqrt(count)
+    for g, limit, expected in (
+        (0.924, {"max_collisions": 5}, after_collisions(5, extinction=1.0, anisotropy=0.924)),
+        (0.5, {"max_path": 5.0}, after_path(5.0, scattering=1.0, anisotropy=0.5)),
+    ):
+        ended = walk(Medium(1.0, 1.0, g), pencil(count), rng, **limit)
+        scores = (ended.position[:, 2], (ended.position**2).sum(1), ended.direction[:, 2])
+        for score, value in zip(scores, (expected.z, expected.r2, expected.cos_theta), strict=True):
+            assert abs(score.mean() - value) < 4 * score.std() / math.sqrt(count)
 
 
 def test_near_axis_rule_narrows_the_beam():

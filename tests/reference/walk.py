@@ -141,14 +141,9 @@ def scatter(u: NDArray, g: float, rng: np.random.Generator, axis_threshold: floa
     if axis_threshold < 1:
         vertical |= np.abs(z) >= axis_threshold
     safe = np.where(vertical, 1.0, root)
-    rotated = np.stack(
-        [
-            (a * u[:, 0] * z - b * u[:, 1]) / safe + u[:, 0] * cosine,
-            (a * u[:, 1] * z + b * u[:, 0]) / safe + u[:, 1] * cosine,
-            -a * safe + z * cosine,
-        ],
-        1,
-    )
+    x = (a * u[:, 0] * z - b * u[:, 1]) / safe + u[:, 0] * cosine
+    y = (a * u[:, 1] * z + b * u[:, 0]) / safe + u[:, 1] * cosine
+    rotated = np.stack([x, y, -a * safe + z * cosine], 1)
     sign = np.where(z < 0, -1.0, 1.0)
     rotated = np.where(vertical[:, None], np.stack([a, sign * b, sign * cosine], 1), rotated)
     return rotated / np.linalg.norm(rotated, axis=1, keepdims=True)

@@ -51,15 +51,8 @@ def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, wh
     if device.startswith("cuda"):
         one = spadwarp.simulate(scene(), **RUN, device="cuda:0", uncertainty=uncertainty)
     seen = []
-    cut = spadwarp.simulate(
-        scene(),
-        **RUN,
-        device=device,
-        threads=4,
-        launch_size=3000,
-        uncertainty=uncertainty,
-        progress=lambda *report: seen.append(report),
-    )
+    options = {**RUN, "device": device, "threads": 4, "launch_size": 3000, "uncertainty": uncertainty}
+    cut = spadwarp.simulate(scene(), **options, progress=lambda *report: seen.append(report))
     same(cut, one)
     assert cut.provenance["device"] == device or device == "cuda:all"
     traced = [done for stage, done, _ in seen if stage == "trace"]
@@ -202,13 +195,7 @@ def test_a_full_disk_costs_no_photons(whole, tmp_path):
 def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
     part = whole[True]
     seen = []
-    run = spadwarp.simulate(
-        scene(),
-        photons=64 * part.batch_size,
-        device="cpu",
-        resume=part,
-        relative_error=1e-6,
-        progress=lambda *report: seen.append(report[0]),
-    )
+    options = {"photons": 64 * part.batch_size, "device": "cpu", "resume": part, "relative_error": 1e-6}
+    run = spadwarp.simulate(scene(), **options, progress=lambda *report: seen.append(report[0]))
     assert run.photons == 64 * part.batch_size
     assert [remark.split(" after ")[1] for remark in seen if remark.startswith("error")] == ["64 batches"]

@@ -74,12 +74,8 @@ def test_stack_references(row):
 
 def test_exit_cosine_references():
     for row, face, fractions in references.EXIT_COSINES:
-        both = exit_cosine_fractions(
-            anisotropy=row.anisotropy,
-            albedo=row.albedo,
-            optical_depth=row.optical_depth,
-            edges=references.EXIT_COSINE_EDGES,
-        )
+        case = {"anisotropy": row.anisotropy, "albedo": row.albedo, "optical_depth": row.optical_depth}
+        both = exit_cosine_fractions(**case, edges=references.EXIT_COSINE_EDGES)
         np.testing.assert_allclose(fractions, both[face == "exit_z_high"], atol=6e-9)
 
 

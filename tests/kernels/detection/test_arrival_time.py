@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from helpers.launch import Integers
 from spadwarp_kernels.detection import PHASES, arrival_bins, first_invalid_row
 from spadwarp_kernels.pixels import launch_pixels
 
@@ -142,7 +143,7 @@ def test_invalid_values_are_found():
 
 
 @wp.kernel(enable_backward=False)
-def _count(first_pixel: int, seen: wp.array(dtype=int)):
+def _count(first_pixel: int, seen: Integers):
     pixel = first_pixel + wp.tid()
     seen[pixel] += 1
 

@@ -260,14 +260,9 @@ def test_response_matrix_is_applied_and_noise_added():
     matrix = random_array((5, 8), density=0.4, rng=rng, format="csr")
     source, width, noise = rng.random((7, 8)), rng.random(5), rng.random(7)
     for dtype in (wp.float32, wp.float64):
-        hazard = expected_detections(
-            wp.array(source, dtype=dtype, device="cpu"),
-            row_start=matrix.indptr,
-            source_bin=matrix.indices,
-            weight=matrix.data,
-            width=width,
-            noise_rate=_array(noise),
-        )
+        response = {"row_start": matrix.indptr, "source_bin": matrix.indices, "weight": matrix.data}
+        light = wp.array(source, dtype=dtype, device="cpu")
+        hazard = expected_detections(light, **response, width=width, noise_rate=_array(noise))
         np.testing.assert_allclose(hazard.numpy(), source @ matrix.T + noise[:, None] * width, rtol=1e-5)
 
 

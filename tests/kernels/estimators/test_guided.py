@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import launched
+from helpers.launch import Floats, launched
 from spadwarp_kernels import (
     TABULATED,
     Medium,
@@ -61,15 +61,7 @@ def _flights(guide):
     sample_flight = make_sample_flight(guide)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def flights(
-        x: wp.vec3,
-        u: wp.vec3,
-        interval: wp.vec2,
-        c: float,
-        medium: Medium,
-        s: wp.array(dtype=float),
-        p: wp.array(dtype=float),
-    ):
+    def flights(x: wp.vec3, u: wp.vec3, interval: wp.vec2, c: float, medium: Medium, s: Floats, p: Floats):
         i = wp.tid()
         block = random_block(wp.uint64(2), wp.uint64(i), wp.uint32(0), wp.uint32(2))
         sample = sample_flight(x, u, interval, c, medium, u01(block[0]), u01_fine(block[1]))

@@ -6,7 +6,7 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import launched
+from helpers.launch import Floats, Integers, Vectors, launched
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels import (
     intersect_mesh,
@@ -20,7 +20,7 @@ from spadwarp_kernels import (
 
 
 @wp.kernel(enable_backward=False)
-def _leaks(surfaces: sk.Surfaces, extent: wp.vec3, rays: int, leaks: wp.array(dtype=int)):
+def _leaks(surfaces: sk.Surfaces, extent: wp.vec3, rays: int, leaks: Integers):
     """Random rays from random points of a box that lies inside the mesh."""
     i = wp.tid()
     missed = int(0)
@@ -35,14 +35,14 @@ def _leaks(surfaces: sk.Surfaces, extent: wp.vec3, rays: int, leaks: wp.array(dt
 
 
 @wp.kernel(enable_backward=False)
-def _aim(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), to: wp.array(dtype=wp.vec3), hit: wp.array(dtype=int)):
+def _aim(surfaces: sk.Surfaces, x: Vectors, to: Vectors, hit: Integers):
     i = wp.tid()
     u = wp.normalize(to[i] - x[i])
     hit[i] = wp.where(intersect_surfaces(surfaces, x[i], u, 1.0e6, False).face >= 0, 1, 0)
 
 
 @wp.kernel(enable_backward=False)
-def _bounce(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), u: wp.array(dtype=wp.vec3), gap: wp.array(dtype=float)):
+def _bounce(surfaces: sk.Surfaces, x: Vectors, u: Vectors, gap: Floats):
     """Distance to the next surface after a bounce back along the normal; the sphere's diameter unless it hits
     itself."""
     i = wp.tid()
@@ -52,7 +52,7 @@ def _bounce(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), u: wp.array(dtype
 
 
 @wp.kernel(enable_backward=False)
-def _boxes(x: wp.array(dtype=wp.vec3), u: wp.array(dtype=wp.vec3), length: float, meets: wp.array(dtype=int)):
+def _boxes(x: Vectors, u: Vectors, length: float, meets: Integers):
     i = wp.tid()
     box = segment_meets_box(x[i], u[i], length, wp.vec3(-1.0, -2.0, -0.5), wp.vec3(1.0, 2.0, 0.5))
     meets[i] = wp.where(box, 1, 0)
@@ -60,12 +60,7 @@ def _boxes(x: wp.array(dtype=wp.vec3), u: wp.array(dtype=wp.vec3), length: float
 
 @wp.kernel(enable_backward=False)
 def _both_walks(
-    surfaces: sk.Surfaces,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    reach: float,
-    face: wp.array(dtype=wp.vec3i),
-    distance: wp.array(dtype=wp.vec3),
+    surfaces: sk.Surfaces, x: Vectors, u: Vectors, reach: float, face: wp.array(dtype=wp.vec3i), distance: Vectors
 ):
     """Nearest hit by Warp's walk and by ours, and any hit by ours."""
     i = wp.tid()

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Floats, Vectors, launched
 from helpers.statistics_of_samples import chi2_p
 from spadwarp_kernels import (
     one_minus_cosine,
@@ -16,7 +16,7 @@ from spadwarp_kernels import (
 
 
 @wp.kernel(enable_backward=False)
-def _bases(n: wp.array(dtype=wp.vec3), b1: wp.array(dtype=wp.vec3), b2: wp.array(dtype=wp.vec3)):
+def _bases(n: Vectors, b1: Vectors, b2: Vectors):
     i = wp.tid()
     first, second = orthonormal_basis(n[i])
     b1[i] = first
@@ -24,15 +24,13 @@ def _bases(n: wp.array(dtype=wp.vec3), b1: wp.array(dtype=wp.vec3), b2: wp.array
 
 
 @wp.kernel(enable_backward=False)
-def _rotate(
-    u: wp.array(dtype=wp.vec3), t: wp.array(dtype=float), xi: wp.array(dtype=float), v: wp.array(dtype=wp.vec3)
-):
+def _rotate(u: Vectors, t: Floats, xi: Floats, v: Vectors):
     i = wp.tid()
     v[i] = rotate_direction(u[i], t[i], xi[i])
 
 
 @wp.kernel(enable_backward=False)
-def _walk(u: wp.array(dtype=wp.vec3), steps: int):
+def _walk(u: Vectors, steps: int):
     i = wp.tid()
     v = u[i]
     for k in range(steps):
@@ -42,13 +40,13 @@ def _walk(u: wp.array(dtype=wp.vec3), steps: int):
 
 
 @wp.kernel(enable_backward=False)
-def _snap(u: wp.array(dtype=wp.vec3), threshold: float, v: wp.array(dtype=wp.vec3)):
+def _snap(u: Vectors, threshold: float, v: Vectors):
     i = wp.tid()
     v[i] = snap_direction(u[i], threshold)
 
 
 @wp.kernel(enable_backward=False)
-def _difference(u: wp.array(dtype=wp.vec3), v: wp.array(dtype=wp.vec3), t: wp.array(dtype=float)):
+def _difference(u: Vectors, v: Vectors, t: Floats):
     i = wp.tid()
     t[i] = one_minus_cosine(u[i], v[i])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Floats, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import (
     free_path,
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.physics
 
 
 @wp.kernel(enable_backward=False)
-def _free_paths(c: float, l: wp.array(dtype=float)):
+def _free_paths(c: float, l: Floats):
     i = wp.tid()
     l[i] = free_path(u01(random_block(wp.uint64(6), wp.uint64(i), wp.uint32(0), wp.uint32(1))[0]), c)
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import launched
+from helpers.launch import Floats, Integers, Vectors, launched
 
 AXIS = np.array([0.36, -0.48, 0.8])
 START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read
@@ -17,13 +17,13 @@ COUNT = 20_000
 def fly(
     medium: sk.Medium,
     layers: sk.Layers,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    xi: wp.array(dtype=float),
-    distance: wp.array(dtype=float),
-    homogeneous: wp.array(dtype=float),
-    mean: wp.array(dtype=float),
-    index: wp.array(dtype=int),
+    x: Vectors,
+    u: Vectors,
+    xi: Floats,
+    distance: Floats,
+    homogeneous: Floats,
+    mean: Floats,
+    index: Integers,
 ):
     """Free path, that of the medium alone, mean extinction along it, layer at its begin. Launch: rays."""
     i = wp.tid()

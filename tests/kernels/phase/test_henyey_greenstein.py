@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Floats, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import henyey_greenstein_pdf, random_block, sample_henyey_greenstein, u01_fine
 
@@ -14,13 +14,13 @@ ANISOTROPIES = [-0.7, 0.0, 0.01, 0.5, 0.924, 0.99]
 
 
 @wp.kernel(enable_backward=False)
-def _sample(g: float, seed: wp.uint64, t: wp.array(dtype=float)):
+def _sample(g: float, seed: wp.uint64, t: Floats):
     i = wp.tid()
     t[i] = sample_henyey_greenstein(u01_fine(random_block(seed, wp.uint64(i), wp.uint32(0), wp.uint32(1))[1]), g)
 
 
 @wp.kernel(enable_backward=False)
-def _evaluate(g: float, t: wp.array(dtype=float), p: wp.array(dtype=float)):
+def _evaluate(g: float, t: Floats, p: Floats):
     i = wp.tid()
     p[i] = henyey_greenstein_pdf(t[i], g)
 

@@ -9,7 +9,7 @@ from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
 import spadwarp_kernels as sk
-from helpers.launch import launched
+from helpers.launch import Floats, launched
 from helpers.statistics_of_samples import chi2_p
 from reference import fournier_forand
 from spadwarp_kernels import TABULATED, random_block, u01_fine
@@ -35,7 +35,7 @@ DENSITIES = {
 
 
 @wp.kernel(enable_backward=False)
-def _sample(medium: sk.Medium, seed: wp.uint64, t: wp.array(dtype=float)):
+def _sample(medium: sk.Medium, seed: wp.uint64, t: Floats):
     i = wp.tid()
     xi = u01_fine(random_block(seed, wp.uint64(i), wp.uint32(0), wp.uint32(1))[1])
     t[i] = wp.static(TABULATED.sample)(xi, medium)
@@ -43,14 +43,7 @@ def _sample(medium: sk.Medium, seed: wp.uint64, t: wp.array(dtype=float)):
 
 @wp.kernel(enable_backward=False)
 def _evaluate(
-    medium: sk.Medium,
-    t: wp.array(dtype=float),
-    theta: wp.array(dtype=float),
-    p: wp.array(dtype=float),
-    lobe: wp.array(dtype=float),
-    complement: wp.array(dtype=float),
-    q: wp.array(dtype=float),
-    back: wp.array(dtype=float),
+    medium: sk.Medium, t: Floats, theta: Floats, p: Floats, lobe: Floats, complement: Floats, q: Floats, back: Floats
 ):
     i = wp.tid()
     guiding = sk.Guiding()

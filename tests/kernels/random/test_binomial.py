@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import launched, on_device
+from helpers.launch import Integers, launched, on_device
 from spadwarp_kernels.math import expm1, log1p
 from spadwarp_kernels.random import binomial
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.physics
 
 
 @wp.kernel(enable_backward=False)
-def _draw(n: int, hazard: wp.float64, seed: wp.uint64, base: wp.uint64, counts: wp.array(dtype=int)):
+def _draw(n: int, hazard: wp.float64, seed: wp.uint64, base: wp.uint64, counts: Integers):
     i = wp.tid()
     count, _block = binomial(n, hazard, seed, base + wp.uint64(i), wp.uint32(0), wp.uint32(0))
     counts[i] = count

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import launched, on_device
+from helpers.launch import Floats, launched, on_device
 from spadwarp_kernels.random import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
 
 
@@ -14,7 +14,7 @@ def _philox(words: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.vec4ui)):
 
 
 @wp.kernel(enable_backward=False)
-def _uniforms(words: wp.array(dtype=wp.uint32), coarse: wp.array(dtype=float), fine: wp.array(dtype=float)):
+def _uniforms(words: wp.array(dtype=wp.uint32), coarse: Floats, fine: Floats):
     i = wp.tid()
     coarse[i] = u01(words[i])
     fine[i] = u01_fine(words[i])

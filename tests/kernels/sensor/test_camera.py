@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import (
     Camera,
@@ -16,21 +16,14 @@ from spadwarp_kernels.sensor import clip_to_gate, clip_to_planes, field
 
 
 @wp.kernel(enable_backward=False)
-def _lens(camera: Camera, o: wp.array(dtype=wp.vec3)):
+def _lens(camera: Camera, o: Vectors):
     i = wp.tid()
     block = random_block(wp.uint64(8), wp.uint64(i), wp.uint32(0), wp.uint32(4))
     o[i] = lens_point(camera, u01(block[0]), u01(block[1]))
 
 
 @wp.kernel(enable_backward=False)
-def _clips(
-    camera: Camera,
-    gate: Gate,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    path: float,
-    out: wp.array(dtype=wp.vec2),
-):
+def _clips(camera: Camera, gate: Gate, x: Vectors, u: Vectors, path: float, out: wp.array(dtype=wp.vec2)):
     i = wp.tid()
     seen = clip_to_planes(field(camera), x[i], u[i], 9.0)
     out[i] = clip_to_gate(gate, x[i], u[i], path, wp.vec3(0.001, -0.002, 0.0), seen)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import LASER_PROFILES, Laser, emit_photon
 
@@ -14,7 +14,7 @@ AXIS = np.array([0.36, -0.48, 0.8])
 
 
 @wp.kernel(enable_backward=False)
-def _emit(laser: Laser, x: wp.array(dtype=wp.vec3), u: wp.array(dtype=wp.vec3)):
+def _emit(laser: Laser, x: Vectors, u: Vectors):
     i = wp.tid()
     start, direction = emit_photon(laser, wp.uint64(4), wp.uint64(i))
     x[i] = start

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import launched
+from helpers.launch import Floats, Vectors, launched
 from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
 
 pytestmark = pytest.mark.physics
@@ -16,7 +16,7 @@ ASIDE = np.cross(NORMAL, ACROSS)
 
 
 @wp.kernel(enable_backward=False)
-def _draw(u: wp.vec3, n: wp.vec3, alpha: float, v: wp.array(dtype=wp.vec3), leaving: wp.array(dtype=float)):
+def _draw(u: wp.vec3, n: wp.vec3, alpha: float, v: Vectors, leaving: Floats):
     i = wp.tid()
     block = random_block(wp.uint64(11), wp.uint64(i), wp.uint32(1), wp.uint32(1))
     v[i] = sample_ggx(u, n, alpha, float(block[0] >> wp.uint32(8)) / 16777216.0, float(block[1]) / 4294967296.0)
@@ -24,15 +24,7 @@ def _draw(u: wp.vec3, n: wp.vec3, alpha: float, v: wp.array(dtype=wp.vec3), leav
 
 
 @wp.kernel(enable_backward=False)
-def _evaluate(
-    u: wp.array(dtype=wp.vec3),
-    v: wp.array(dtype=wp.vec3),
-    n: wp.vec3,
-    alpha: float,
-    brdf: wp.array(dtype=float),
-    pdf: wp.array(dtype=float),
-    facets: wp.array(dtype=float),
-):
+def _evaluate(u: Vectors, v: Vectors, n: wp.vec3, alpha: float, brdf: Floats, pdf: Floats, facets: Floats):
     i = wp.tid()
     brdf[i] = ggx_brdf(u[i], v[i], n, alpha)
     pdf[i] = ggx_pdf(u[i], v[i], n, alpha)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import launched
+from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import (
     random_block,
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.physics
 
 
 @wp.kernel(enable_backward=False)
-def _lambert(normal: wp.vec3, v: wp.array(dtype=wp.vec3)):
+def _lambert(normal: wp.vec3, v: Vectors):
     i = wp.tid()
     block = random_block(wp.uint64(9), wp.uint64(i), wp.uint32(0), wp.uint32(1))
     v[i] = sample_lambert(normal, u01(block[0]), u01(block[1]))
