@@ -53,7 +53,7 @@ def budget(
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
     if out is not None:
         opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
-    found = spadwarp.budget(scene, numbers(ranges), media or None, reflectance=reflectance, device=device)
+    found = spadwarp.budget(scene, _numbers(ranges), media or None, reflectance=reflectance, device=device)
     written = []
     if out is not None:
         plot_budget(found, out / "budget.png")
@@ -68,7 +68,7 @@ def budget(
     opt.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written}, json_path)
 
 
-def numbers(text: str | None) -> list[float] | None:
+def _numbers(text: str | None) -> list[float] | None:
     from spadwarp.analytic import parse_vary
 
     if text is None:

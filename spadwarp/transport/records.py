@@ -130,7 +130,6 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     Raises:
         FileError: The file cannot be written.
     """
-
     with write_hdf5(path) as file:
         file.attrs.update(
             {

@@ -135,6 +135,7 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
 
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
+    """Empty arrays in place of `make_textures`."""
     textures = Textures()
     textures.face = wp.zeros(0, dtype=int, device=device)
     textures.coordinates = wp.zeros((0, 3), dtype=wp.vec2, device=device)
