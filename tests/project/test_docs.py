@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import run
 from helpers.scenes import scene as make_scene
 from spadwarp.cli import app
 from spadwarp.scene import Target
@@ -108,7 +109,7 @@ def test_tutorial_runs(checkout):
         else:
             for line in code.splitlines():
                 if not line.startswith("pip "):
-                    run(line)
+                    run_smaller(line)
 
 
 def commands(text):
@@ -146,14 +147,13 @@ def test_every_picture_of_the_gallery_has_its_commands():
     assert len(re.findall(r"^!\[[^\]]+\]\([^)]+\)\n\n```sh\n", text, re.MULTILINE)) == text.count("![") > 5
 
 
-def run(line):
+def run_smaller(line):
     """A command, in this process."""
     for pattern, smaller in SMALLER.items():
         line = re.sub(pattern, smaller, line)
     program, *arguments = shlex.split(line)
     assert program == "spadwarp"
-    outcome = CliRunner().invoke(app, arguments)
-    assert outcome.exit_code == 0, f"{line}\n{outcome.output}"
+    run(*arguments)
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "docs" / "reference" / "scene.md"], ids=by_name)

@@ -18,7 +18,7 @@ WATER = {"extinction": 0.3, "albedo": 0.8}
 PETZOLD = Medium(**WATER, phase_function="tabulated", phase_table="petzold-average-particle")
 
 
-def problems(**fields):
+def medium_problems(**fields):
     with pytest.raises(ConfigError) as caught:
         scene(medium=fields)
     return caught.value.problems
@@ -128,17 +128,19 @@ def test_a_missing_table_is_named(tmp_path):
 
 
 def test_fields_belong_to_their_phase_function():
-    assert problems(phase_function="tabulated") == ("medium needs phase_table with phase_function = 'tabulated'",)
-    assert problems(phase_function="two_term_henyey_greenstein", g1=0.9) == (
+    assert medium_problems(phase_function="tabulated") == (
+        "medium needs phase_table with phase_function = 'tabulated'",
+    )
+    assert medium_problems(phase_function="two_term_henyey_greenstein", g1=0.9) == (
         "medium needs g2, alpha with phase_function = 'two_term_henyey_greenstein'",
     )
-    assert problems(phase_table="a.csv") == (
+    assert medium_problems(phase_table="a.csv") == (
         "medium.phase_table = 'a.csv' goes with phase_function = 'tabulated' only",
     )
-    assert problems(phase_function="tabulated", phase_table="petzold")[0].startswith(
+    assert medium_problems(phase_function="tabulated", phase_table="petzold")[0].startswith(
         "medium.phase_table = 'petzold' is not one of 'petzold-average-particle', the path of a .csv file"
     )
-    assert problems(phase_function="fournier_forand", junge_slope=5.5) == (
+    assert medium_problems(phase_function="fournier_forand", junge_slope=5.5) == (
         "medium.junge_slope = 5.5 is outside [3.05, 5)",
     )
 

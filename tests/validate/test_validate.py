@@ -15,8 +15,6 @@ from spadwarp.errors import ConfigError
 from spadwarp.validate import CASES, draw_results, references, run, write_json
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
 
-pytestmark = pytest.mark.physics
-
 # The statistics
 
 
@@ -59,12 +57,14 @@ def test_means_in_blocks_are_those_of_the_whole():
 # The numbers that the cases are held to
 
 
+@pytest.mark.physics
 @pytest.mark.parametrize("row", references.SLABS, ids=lambda row: row.text)
 def test_slab_references(row):
     solved = slab(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
     assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
 
 
+@pytest.mark.physics
 @pytest.mark.slow
 @pytest.mark.parametrize("row", references.STACKS, ids=lambda row: row.text)
 def test_stack_references(row):
@@ -72,6 +72,7 @@ def test_stack_references(row):
     assert (row.reflected, row.transmitted) == pytest.approx(solved, abs=6e-9)
 
 
+@pytest.mark.physics
 def test_exit_cosine_references():
     for row, face, fractions in references.EXIT_COSINES:
         case = {"anisotropy": row.anisotropy, "albedo": row.albedo, "optical_depth": row.optical_depth}
@@ -79,6 +80,7 @@ def test_exit_cosine_references():
         np.testing.assert_allclose(fractions, both[face == "exit_z_high"], atol=6e-9)
 
 
+@pytest.mark.physics
 def test_time_resolved_references():
     pulse = references.TIME_RESOLVED
     medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
@@ -86,6 +88,7 @@ def test_time_resolved_references():
     np.testing.assert_allclose(pulse.fractions, np.diff(until), atol=2e-8)
 
 
+@pytest.mark.physics
 def test_moment_references():
     fixed = after_path(5.0, scattering=1.0, anisotropy=0.0)
     collided = after_collisions(5, extinction=1.0, anisotropy=0.924)
@@ -93,6 +96,7 @@ def test_moment_references():
     assert pytest.approx((collided.z, collided.r2, collided.cos_theta), abs=6e-7) == references.AFTER_COLLISIONS
 
 
+@pytest.mark.physics
 @pytest.mark.slow
 def test_references_of_the_rules_that_bias():
     for threshold, cosine in references.NEAR_AXIS.items():
@@ -105,6 +109,7 @@ def test_references_of_the_rules_that_bias():
         assert everything - lost == pytest.approx(reflected, abs=2e-7)
 
 
+@pytest.mark.physics
 def test_fluence_references():
     shells = references.FLUENCE
     inside = isotropic_radial_cdf(shells.edges[1:-1], path=shells.path, scattering=1.0)
@@ -112,6 +117,7 @@ def test_fluence_references():
     np.testing.assert_allclose(shells.fractions, fractions, atol=2e-7)
 
 
+@pytest.mark.physics
 def test_single_scatter_references():
     lidar = Lidar()
     for name, (rows, columns, fractions) in references.SINGLE_SCATTER.items():
@@ -123,6 +129,7 @@ def test_single_scatter_references():
         np.testing.assert_allclose(fractions, expected, rtol=5e-5, atol=1e-20)
 
 
+@pytest.mark.physics
 def test_lambertian_references():
     lidar = Lidar(laser_position=(0.1, -0.05, 0.0), half_angle=math.radians(10.0))
     image = lambertian_plane(lidar, depth=5.0, reflectance=0.5)
@@ -130,6 +137,7 @@ def test_lambertian_references():
         assert fraction == pytest.approx(image[rows, columns].sum(), rel=1e-7)
 
 
+@pytest.mark.physics
 @pytest.mark.slow
 def test_fournier_forand_references():
     """The mean of 1 − cosθ is the integral of what lies above it."""
@@ -156,6 +164,7 @@ def results():
     return run([name for name in CASES if name not in ("ledger", "mean-path")], photons=10_000, seed=3, device="cpu")
 
 
+@pytest.mark.physics
 @pytest.mark.slow
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
@@ -163,17 +172,20 @@ def test_engine_agrees_with_every_reference(results):
     assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path"}
 
 
+@pytest.mark.physics
 def test_deviations_are_standard_normal(results):
     """Too small an error would make them wide, too large a one narrow."""
     z = np.array([r.z for r in results if r.standard_error > 0])
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
 
 
+@pytest.mark.physics
 def test_a_table_of_henyey_greenstein_passes_as_well():
     cases = ["slab", "near-axis", "single-scatter", "layers"]
     assert all(r.passed for r in run(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
 
 
+@pytest.mark.physics
 def test_ledger_and_closed_walls():
     assert all(r.passed for r in run(["ledger", "mean-path"], photons=1000, seed=4, device="cpu"))
 
@@ -193,6 +205,7 @@ def test_one_seed_gives_one_result():
     assert all(a.value != b.value for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.physics
 def test_reports(results, tmp_path):
     write_json(results, tmp_path / "report.json", photons=10_000, seed=3)
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
