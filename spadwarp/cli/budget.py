@@ -48,7 +48,7 @@ def budget(
     Example:
       spadwarp budget configs/scenes/harbour_5m.toml --range 1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
     """
-    from spadwarp.viz import plot_budget
+    from spadwarp.viz import draw_budget
 
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
     if out is not None:
@@ -56,7 +56,7 @@ def budget(
     found = spadwarp.budget(scene, _numbers(ranges), media or None, reflectance=reflectance, device=device)
     written = []
     if out is not None:
-        plot_budget(found, out / "budget.png")
+        draw_budget(found, out / "budget.png")
         written = [
             out / "budget.png",
             spadwarp.io.write_csv([dataclasses.asdict(row) for row in found], out / "budget.csv"),

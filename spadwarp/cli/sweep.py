@@ -52,12 +52,12 @@ def sweep(
     Example:
       spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
     """
-    from spadwarp.viz import plot_sweep
+    from spadwarp.viz import draw_sweep
 
     scene: Scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
     opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
     curves = spadwarp.sweep(scene, vary=vary, of=of.value, device=device)
-    plot_sweep(curves, out / "sweep.png")
+    draw_sweep(curves, out / "sweep.png")
     values, some = list(curves.values), list[Any](curves.rows)
     found = [dataclasses.asdict(row) for row in some]
     table = [{curves.field: value, **row} for value, row in zip(values, found, strict=True)]

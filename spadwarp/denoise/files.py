@@ -23,7 +23,7 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time
-from spadwarp.viz.evaluation import draw_denoised
+from spadwarp.viz import draw_denoised
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 

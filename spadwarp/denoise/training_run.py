@@ -15,7 +15,7 @@ from spadwarp.denoise.inference import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError
 from spadwarp.io.hdf5 import read_hdf5
-from spadwarp.viz.learning_curves import draw_learning_curves
+from spadwarp.viz import draw_learning_curves
 
 if TYPE_CHECKING:
     from spadwarp.denoise.synthetic_noise import CleanScenes

@@ -26,7 +26,7 @@ def write_depth(
         ArgumentError: A point cloud was asked for and the field of view is not known.
         FileError: A file cannot be written.
     """
-    from spadwarp.viz.frames import draw_depth
+    from spadwarp.viz import draw_depth
 
     if ply is not None and reduction.directions is None:
         raise ArgumentError("a point cloud needs the horizontal field of view")

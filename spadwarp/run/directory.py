@@ -71,9 +71,9 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
     if output.exr:
         written += [save_depth_exr(result, depth, folder / "depth.exr"), save_truth_maps(result, folder / "truth.exr")]
     if formats := [ending for ending in ("png", "pdf") if getattr(output, ending)]:
-        from spadwarp.viz.result import write_previews
+        from spadwarp.viz import draw_result
 
-        written += write_previews(result, folder, depth=depth, method=output.depth_method, formats=formats)
+        written += draw_result(result, folder, depth=depth, method=output.depth_method, formats=formats)
     remove_checkpoint(folder)
     for name in (_NAMES | _PICTURES) - set(keep) - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)

@@ -1,8 +1,11 @@
 """Pictures, pages and videos: arrays in, images out."""
 
-from spadwarp.viz.budget import plot_budget, plot_sweep
+from spadwarp.viz.budget import draw_budget, draw_sweep
 from spadwarp.viz.contact_sheet import draw_dataset
+from spadwarp.viz.depth import draw_denoised, draw_depth
 from spadwarp.viz.frames import draw_analytic, draw_recording
+from spadwarp.viz.learning_curves import draw_learning_curves
+from spadwarp.viz.result import draw_result
 from spadwarp.viz.targets import describe_targets, draw_targets
 from spadwarp.viz.transient_video import video
 from spadwarp.viz.validation import draw_validation
@@ -11,12 +14,16 @@ from spadwarp.viz.viewer import view
 __all__ = [
     "describe_targets",
     "draw_analytic",
+    "draw_budget",
     "draw_dataset",
+    "draw_denoised",
+    "draw_depth",
+    "draw_learning_curves",
     "draw_recording",
+    "draw_result",
+    "draw_sweep",
     "draw_targets",
     "draw_validation",
-    "plot_budget",
-    "plot_sweep",
     "video",
     "view",
 ]

@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow
 from spadwarp.analytic.sweeps import Sweep
-from spadwarp.io.atomic import atomic_path
 from spadwarp.scene import Scene
+from spadwarp.viz.style import SERIES, new_figure, plain_axis, save
 
-__all__ = ["plot_budget", "plot_sweep"]
+__all__ = ["draw_budget", "draw_sweep"]
 
-# Okabe and Ito's colours, which differ with every common colour-blindness.
-_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#F0E442")
 # Label, factor, and the widest range of values to show.
 _PANELS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "signal": ("signal [detections per pulse]", 1.0, (1e-10, 1e3)),
@@ -38,7 +39,7 @@ _LABELS: dict[str, tuple[str, float]] = {
 }
 
 
-def plot_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> Any:
+def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> Figure:
     """Four panels over range, a line for each water: signal, depth error, signal to backscatter, pulses for 1 cm.
 
     Where more than 1 % of the fits would be outliers, the bound is dashed: it is not reached. Returns the matplotlib
@@ -52,7 +53,7 @@ def plot_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> An
         for axis, (field, (_, scale, shown)) in zip(axes, _PANELS.items(), strict=True):
             y = np.array([getattr(row, field) for row in own]) * scale
             y[~(np.isfinite(y) & (y > 0.01 * shown[0]) & (y < 100 * shown[1]))] = np.nan
-            colour = _COLOURS[number % len(_COLOURS)]
+            colour = SERIES[number % len(SERIES)]
             label = f"{name} ({own[0].extinction:.3g}/m)"
             if field == "sigma_depth":
                 sure = np.array([row.outlier_probability <= OUTLIERS for row in own])
@@ -68,10 +69,12 @@ def plot_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> An
     axes[1].axhline(TOLERANCE * 1e3, color="0.5", linewidth=0.8, linestyle=":")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)), frameon=False, fontsize=9)
-    return _finish(figure, path)
+    if path is not None:
+        save(figure, path)
+    return figure
 
 
-def plot_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None) -> Any:
+def draw_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None) -> Figure:
     """One panel for each column over the values of the swept field; returns the matplotlib figure, writes it to `path`.
 
     `columns`: attributes of the rows; default: what matters most.
@@ -86,11 +89,11 @@ def plot_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequen
         y = curves.column(name) * scale
         positive = y[np.isfinite(y) & (y > 0)]
         axis.plot(
-            x, np.where(np.isfinite(y), y, np.nan), "o-", color=_COLOURS[number % 5], markersize=3.5, label="median"
+            x, np.where(np.isfinite(y), y, np.nan), "o-", color=SERIES[number % 5], markersize=3.5, label="median"
         )
         if name == "sigma_depth" and not budgets:
             p90 = curves.column("sigma_depth_p90") * scale
-            axis.plot(x, p90, "--", color=_COLOURS[number % 5], linewidth=1.0, label="90 % of the pixels below")
+            axis.plot(x, p90, "--", color=SERIES[number % 5], linewidth=1.0, label="90 % of the pixels below")
             axis.legend(frameon=False, fontsize=9)
         axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=label)
         if name in ("outlier_probability", "estimate_fraction"):
@@ -99,7 +102,9 @@ def plot_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequen
             axis.set_yscale("log")
         if numeric and x.min() > 0 and x.max() > 30 * x.min():
             axis.set_xscale("log")
-    return _finish(figure, path)
+    if path is not None:
+        save(figure, path)
+    return figure
 
 
 def _unit(field: str) -> str:
@@ -111,24 +116,19 @@ def _unit(field: str) -> str:
     return found.group(0) if found else ""
 
 
-def _grid(panels: int) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure
-
+def _grid(panels: int) -> tuple[Figure, list[Axes]]:
     columns = 2 if panels in (2, 4) else min(panels, 3)
     lines = math.ceil(panels / columns)
-    figure = Figure(figsize=(4.6 * columns, 3.3 * lines + 0.4), layout="constrained")
+    figure = new_figure(4.6 * columns, 3.3 * lines + 0.4)
     axes = list(np.ravel(figure.subplots(lines, columns)))
     for axis in axes[panels:]:
         axis.remove()
     for axis in axes[:panels]:
-        axis.grid(True, which="major", color="0.9", linewidth=0.8)
-        axis.spines[["top", "right"]].set_visible(False)
+        plain_axis(axis)
     return figure, axes[:panels]
 
 
-def _plain_range_ticks(axis: Any, ranges: Sequence[float]) -> None:
-    from matplotlib.ticker import FixedLocator, NullLocator
-
+def _plain_range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
     low, high = min(ranges), max(ranges)
     ticks = sorted(set(ranges))
     if len(ticks) > 6:
@@ -138,11 +138,3 @@ def _plain_range_ticks(axis: Any, ranges: Sequence[float]) -> None:
         axis.xaxis.set_major_locator(FixedLocator(ticks))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-
-
-def _finish(figure: Any, path: str | Path | None) -> Any:
-    if path is not None:
-        kind = Path(path).suffix.lstrip(".") or "png"
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, dpi=150, format=kind)
-    return figure

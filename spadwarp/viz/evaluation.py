@@ -7,7 +7,6 @@ range of photon counts.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,19 +14,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.io.atomic import atomic_path
+from spadwarp.viz.style import (
+    BLUE,
+    DEPTH_MAP,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    colour_map,
+    new_figure,
+    plain_axis,
+    save,
+)
 
-__all__ = ["COLOURS", "SCORES", "TITLES", "draw_denoised", "draw_photon_sweep", "draw_ranking", "draw_samples"]
-__all__ += ["draw_scores"]
+__all__ = ["COLOURS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_samples", "draw_scores"]
 
 _METHODS = {
     "input": ("noisy input", "0.55"),
-    "median": ("median, best window", "#E69F00"),
-    "gating": ("backscatter gating", "#56B4E9"),
-    "bm3d": ("BM3D", "#CC79A7"),
-    "usdn": ("USDN", "#009E73"),
-    "dncnn": ("DnCNN", "#D55E00"),
-    "pyramid": ("PyramidNet", "#0072B2"),
+    "median": ("median, best window", ORANGE),
+    "gating": ("backscatter gating", SKY),
+    "bm3d": ("BM3D", PURPLE),
+    "usdn": ("USDN", GREEN),
+    "dncnn": ("DnCNN", RED),
+    "pyramid": ("PyramidNet", BLUE),
     "histograms": ("PyramidNet, histograms", "black"),
 }
 
@@ -63,7 +73,7 @@ def draw_scores(
     """Scores against the level, target by target; `note` is written below. Returns the path."""
     fields = ("psnr", "ssim", "entropy", "rmse_mm")
     width = max(3.1 * len(targets) + 1.0, 5.2)
-    figure = _figure(width, 2.3 * len(fields) + 0.9)
+    figure = new_figure(width, 2.3 * len(fields) + 0.9)
     axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
     counted = any("photons" in level for level in levels)
     places = [float(k) for k in range(len(levels))] if counted else [float(level) for level in levels]
@@ -83,14 +93,14 @@ def draw_scores(
                 if points:
                     bold = method == "pyramid"
                     (lines[method],) = axis.plot(*zip(*points, strict=True), **_line(method, bold), zorder=2 + bold)
-            _plain_axis(axis)
+            plain_axis(axis)
         axes[0, column].set_title(target.replace("_", " "), fontsize=11)
         axes[-1, column].set_xticks(places, labels, fontsize=8)
         axes[-1, column].set_xlabel("signal photons per pixel" if counted else "backscatter fraction")
     names = [TITLES[name] for name in lines]
     columns = min(len(names), int(width / 1.7))  # 1.7 inches hold the longest name and its line
     figure.legend(list(lines.values()), names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
-    return _write(figure, path, note)
+    return save(figure, path, note=note, dpi=130)
 
 
 def draw_samples(
@@ -110,7 +120,7 @@ def draw_samples(
     columns = 1 + len(methods)
     height, width = samples[0][0].shape
     ratio = 1.0 if enlarged else height / width
-    figure = _figure(2.05 * columns + 0.7, (2.05 * ratio + 0.34) * len(samples) + 0.5)
+    figure = new_figure(2.05 * columns + 0.7, (2.05 * ratio + 0.34) * len(samples) + 0.5)
     axes = figure.subplots(len(samples), columns, squeeze=False)
     for axis, title in zip(axes[0], ["truth", *(TITLES[name] for name in methods)], strict=True):
         axis.set_title(title, fontsize=9)
@@ -124,15 +134,15 @@ def draw_samples(
                 axis.text(0.5, 0.5, "not run", ha="center", va="center", color="0.5", transform=axis.transAxes)
                 continue
             visible = np.where(np.isfinite(clean) | (name == "input"), image, np.nan)[part]
-            drawn = axis.imshow(visible, cmap=_colours(), vmin=low, vmax=high, interpolation="nearest")
+            drawn = axis.imshow(visible, cmap=colour_map(DEPTH_MAP), vmin=low, vmax=high, interpolation="nearest")
         bar = figure.colorbar(drawn, ax=list(row), fraction=0.02, pad=0.01)
         bar.set_label("depth z [m]", fontsize=8)
         bar.ax.tick_params(labelsize=7)
         bar.outline.set_visible(False)
         text = row[0].text(0.0, -0.04, caption, fontsize=7.5, va="top", transform=row[0].transAxes)
         text.set_in_layout(False)  # may extend below the other images
-    figure.get_layout_engine().set(hspace=0.1)
-    return _write(figure, path, f"grey: no target; {note}")
+    figure.get_layout_engine().set(hspace=0.1)  # type: ignore[call-arg,union-attr]
+    return save(figure, path, note=f"grey: no target; {note}", dpi=130)
 
 
 def draw_ranking(
@@ -141,7 +151,7 @@ def draw_ranking(
     """Mean scores `{method: {field: value}}` as bars, the first method on top. Returns the path."""
     fields = ("psnr", "ssim", "rmse_mm", "edge_mm")
     order = list(means)[::-1]
-    figure = _figure(12.0, 0.42 * len(order) + 1.5)
+    figure = new_figure(12.0, 0.42 * len(order) + 1.5)
     for axis, field in zip(figure.subplots(1, len(fields), sharey=True), fields, strict=True):
         values = [means[method][field] for method in order]
         axis.barh(range(len(order)), values, color=[COLOURS[method] for method in order], height=0.7)
@@ -151,7 +161,7 @@ def draw_ranking(
         axis.set_xlim(0, 1.25 * max(values))
         axis.set_xlabel(SCORES[field][0] + (" (more is better)" if larger_is_better[field] else " (less is better)"))
         axis.spines[["top", "right"]].set_visible(False)
-    return _write(figure, path, note)
+    return save(figure, path, note=note, dpi=130)
 
 
 def draw_photon_sweep(
@@ -168,7 +178,7 @@ def draw_photon_sweep(
     One panel for each signal-to-background ratio (SBR), `[S]`. Returns the path.
     """
     columns = len(sbr)
-    figure = _figure(3.3 * columns + 0.4, 3.9)
+    figure = new_figure(3.3 * columns + 0.4, 3.9)
     axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
     for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=True)):
         for name, values in rmse.items():
@@ -176,66 +186,19 @@ def draw_photon_sweep(
             axis.plot(photons, 1e3 * values[row], label=label, **_line(name, name == "histograms"))
         axis.plot(photons, 1e3 * bound[row], color="black", linestyle=":", label="Cramér–Rao bound of a pixel")
         axis.set(xscale="log", yscale="log", xlabel="signal photons per pixel", title=f"SBR {ratio:g}")
-        _plain_axis(axis, grid="both")
+        plain_axis(axis, grid="both")
     axes[0].set_ylabel("RMSE of depth [mm]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5)
-    return _write(figure, path, note, dpi=150)
-
-
-def draw_denoised(
-    noisy: NDArray[np.float32],
-    denoised: NDArray[np.float32],
-    path: str | Path,
-    *,
-    gate: tuple[float, float],
-    title: str,
-) -> Path:
-    """A frame before and after, depth `[H, W]` [m] each; returns the path."""
-    from spadwarp.viz.result import image_panels, show_image, shown_limits
-
-    figure, images, bars = image_panels(noisy.shape, 2)
-    low, high = shown_limits(denoised if np.isfinite(denoised).any() else noisy, beyond=1.0)
-    low, high = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
-    for image, bar, values, name in zip(images, bars, (noisy, denoised), ("Input", "Denoised"), strict=True):
-        show_image(image, bar, values, title=name, label="depth z [m]", colours="viridis_r", low=low, high=high)
-    figure.suptitle(title, fontsize=9, color="0.25")
-    return _write(figure, path, dpi=150)
+    return save(figure, path, note=note)
 
 
 # Parts
 
 
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
-
-
 def _line(method: str, bold: bool) -> dict[str, Any]:
     line = {"linewidth": 2.2 if bold else 1.2, "linestyle": "--" if method == "input" else "-"}
     return {"color": COLOURS[method], "marker": "o", "markersize": 3.5, **line}
-
-
-def _plain_axis(axis: Any, *, grid: str = "major") -> None:
-    axis.grid(color="0.92", which=grid)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def _write(figure: Any, path: str | Path, note: str = "", *, dpi: int = 130) -> Path:
-    """Writes a PNG with a note below the figure."""
-    if note:
-        figure.supxlabel(textwrap.fill(note, int(14 * figure.get_figwidth())), fontsize=8, color="0.35")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, format="png")
-    return Path(path)
-
-
-def _colours() -> Any:
-    import matplotlib
-
-    return matplotlib.colormaps["viridis_r"].with_extremes(bad="0.85")
 
 
 def _limits(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[float, float]:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import Normalize, to_rgb
 from numpy.typing import NDArray
 
-from spadwarp.io.atomic import atomic_path
 from spadwarp.mesh import SIZED_BUILTINS, builtin_names, load_target
-from spadwarp.scene import Scene
+from spadwarp.scene import Scene, Target
+from spadwarp.transport import truth_maps
+from spadwarp.viz.panels import coloured_depth, depth_bar, strips
+from spadwarp.viz.style import BACKGROUND, save
 
 __all__ = ["DISTANCE", "describe_targets", "draw_targets", "target_scene"]
 
 DISTANCE = 15.0  # [m]
 FIELD_OF_VIEW = 17.0  # [°]
-_SIDE = 3.5  # [m] of those that have no size of their own
-_LIGHT = np.array([-0.35, -0.5, -0.79])  # direction towards a lamp above the camera's left shoulder
+_SIDE = 3.5  # [m] of targets that have no size of their own
+_LIGHT = np.array([-0.35, -0.5, -0.79])  # direction to a lamp on the upper left of the camera
 
 
 def target_scene(name: str, *, pixels: int = 192) -> Scene:
@@ -44,15 +46,9 @@ def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]
     """Name, faces and extent x, y, z [m] of built-in targets; all if `names` is None."""
     described = []
     for name in builtin_names() if names is None else names:
-        mesh = load_target(Scene.from_dict(_bare(name)).targets[0])
-        described.append({"name": name, "faces": len(mesh.faces), "extent": [float(one) for one in mesh.extents]})
+        mesh = load_target(Target(builtin=name))
+        described.append({"name": name, "faces": len(mesh.faces), "extent": [float(side) for side in mesh.extents]})
     return described
-
-
-def _bare(name: str) -> dict[str, Any]:
-    tables = target_scene(name).to_dict()
-    tables["targets"] = [{"builtin": name}]
-    return tables
 
 
 def draw_targets(
@@ -70,38 +66,16 @@ def draw_targets(
         MeshError: An unknown name.
         FileError: The picture cannot be written.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.figure import Figure
-
-    from spadwarp.transport.truth import truth_maps
-
     chosen = list(builtin_names() if names is None else names)
-    columns = min(4, len(chosen))
-    lines = math.ceil(len(chosen) / columns)
-    figure = Figure(figsize=(3.5 * columns, 1.98 * lines + 0.6), layout="constrained", facecolor="white")
-    figure.get_layout_engine().set(w_pad=0.05, h_pad=0.03)  # type: ignore[call-arg,union-attr]
-    axes = np.ravel(figure.subplots(lines, columns, squeeze=False))
-    for axis in axes:
-        axis.axis("off")
-    reach = Normalize(DISTANCE - 1.5, DISTANCE + 1.5)
+    figure, axes = strips(len(chosen), columns=4, size=(3.5, 1.98), spare=0.6, pads=(0.05, 0.03))
+    scale = Normalize(DISTANCE - 1.5, DISTANCE + 1.5)
     for axis, name in zip(axes, chosen, strict=False):
         truth = truth_maps(target_scene(name, pixels=2 * pixels), device=device)
-        shaded = _halved(_shaded(truth.normal))
-        colours = _halved(_coloured(truth.depth, reach))
-        axis.imshow(np.concatenate([shaded, colours], axis=1), interpolation="lanczos")
+        views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
+        axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
         axis.set_title(name, fontsize=11, pad=3)
-    bar = figure.colorbar(
-        ScalarMappable(reach, "viridis_r"), ax=list(axes), orientation="horizontal", fraction=0.012, aspect=70, pad=0.01
-    )
-    bar.set_label("depth z [m]")
-    bar.outline.set_visible(False)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png")
-    return Path(path)
-
-
-_BACKGROUND = np.array([0.93, 0.945, 0.955])
+    depth_bar(figure, axes, scale, "depth z [m]", fontsize=10)
+    return save(figure, path)
 
 
 def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -111,14 +85,7 @@ def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
     facing = np.clip(-n[..., 2], 0.0, 1.0)
     grey = 0.16 + 0.62 * lamp + 0.2 * facing
     image = grey[..., None] * np.array([1.0, 0.97, 0.92])
-    return np.where(np.isfinite(grey)[..., None], image, _BACKGROUND).clip(0.0, 1.0)
-
-
-def _coloured(depth: NDArray[np.float32], reach: Any) -> NDArray[np.float64]:
-    import matplotlib
-
-    image = matplotlib.colormaps["viridis_r"](reach(np.nan_to_num(depth, nan=DISTANCE)))[..., :3]
-    return np.where(np.isfinite(depth)[..., None], image, _BACKGROUND)
+    return np.where(np.isfinite(grey)[..., None], image, to_rgb(BACKGROUND)).clip(0.0, 1.0)
 
 
 def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:

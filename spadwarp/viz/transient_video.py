@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
-from spadwarp.result.file import load_result
-from spadwarp.result.result import Result
+from spadwarp.result import Result
+from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure
+from spadwarp.viz.viewer import load_run
 
 __all__ = ["video"]
 
@@ -34,17 +37,17 @@ def video(
 ) -> Path:
     """Writes what each pixel receives, bin after bin, as an animated GIF or an MP4; returns its path.
 
-    Every picture is a time of flight: light that is scattered back on the way out, then the target, lit from near to
-    far. The colour scale is one for all pictures, its upper end the 99.9th percentile of what is not zero.
+    Every picture is a time of flight: first backscatter, then the target from near to far. All pictures have one colour
+    scale, whose upper end is the 99.9th percentile of the values above zero.
 
     Args:
         source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
         path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install 'spadwarp[video]'`.
         window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
-        pictures: At most; bins are merged so that there are no more.
+        pictures: Largest number of pictures; bins are merged where there are more.
         fps: Pictures per second.
         scale: "log" over four decades, or "linear".
-        frame: Of frames, which one, from 0.
+        frame: Number of the frame, from 0, where the source holds frames.
 
     Raises:
         ArgumentError: An argument out of range, or another ending.
@@ -72,18 +75,11 @@ def video(
 
 def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
-    from spadwarp.frames.file import FramesFile, is_frames_file
-    from spadwarp.viz.viewer import find_run
-
-    if not isinstance(source, Result):
-        place = find_run(source)
-        if is_frames_file(place):
-            file = FramesFile.load(place)
-            edges = 1e9 * (file.gate_start + file.edges)
-            counts = file.counts(frame).astype(np.float64)
-            return counts, edges, "counts per pixel", 1e-9 * file.scene.medium.pulse_speed
-        source = load_result(place)
-    return source.detections, 1e9 * source.bin_edges, "detections per pulse, pixel", 1e-9 * source.pulse_speed
+    run = load_run(source)
+    if isinstance(run, Result):
+        return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
+    counts, edges = run.counts(frame).astype(np.float64), 1e9 * (run.gate_start + run.edges)
+    return counts, edges, "counts per pixel", 1e-9 * run.scene.medium.pulse_speed
 
 
 def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
@@ -96,8 +92,8 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
                 f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns"
             )
         return slice(first, last + 1)
-    lit = np.flatnonzero(cube.any(axis=(0, 1)))
-    return slice(int(lit[0]), int(lit[-1]) + 1) if len(lit) else slice(0, cube.shape[2])
+    filled = np.flatnonzero(cube.any(axis=(0, 1)))
+    return slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, cube.shape[2])
 
 
 def _pictures(
@@ -108,20 +104,16 @@ def _pictures(
     scale: str,
 ) -> Iterator[NDArray[np.uint8]]:
     """RGB pictures, one after the other."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LogNorm, Normalize
-    from matplotlib.figure import Figure
-
     height, width = cube.shape[:2]
-    lit = cube[cube > 0]
-    top = float(np.percentile(lit, 99.9)) if lit.size else 1.0
+    values = cube[cube > 0]
+    top = float(np.percentile(values, 99.9)) if values.size else 1.0
     norm = LogNorm(top * 10.0**-_DECADES, top) if scale == "log" else Normalize(0.0, top)
-    colours = matplotlib.colormaps["inferno"].with_extremes(bad="black", under="black")
-    tall = float(np.clip(5.0 * height / width, 1.5, 9.0))
-    figure = Figure(figsize=(5.4, tall + 1.5), dpi=_DPI, layout="constrained")
+    colours = colour_map(LIGHT_MAP).with_extremes(bad="black", under="black")
+    image_height = float(np.clip(5.0 * height / width, 1.5, 9.0))
+    figure = new_figure(5.4, image_height + 1.5)
+    figure.set_dpi(_DPI)
     canvas = FigureCanvasAgg(figure)
-    axes, bar = figure.subplots(2, 1, height_ratios=[tall, 0.15])
+    axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.15])
     axes.set(xticks=[], yticks=[])
     image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm, interpolation="nearest")
     figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
@@ -132,7 +124,7 @@ def _pictures(
         title.set_text(f"{middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
         canvas.draw()
         if index == 0:
-            figure.set_layout_engine("none")  # measured once, so that nothing moves
+            figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
@@ -143,7 +135,7 @@ def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
     palette = None
     for picture in pictures:
         image = Image.fromarray(picture)
-        # One palette for all, from the colour bar in the first: colours must not flicker.
+        # One palette for all pictures, from the colour bar in the first, so that colours do not flicker.
         palette = image.quantize(255) if palette is None else palette
         frames.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
     frames[0].save(
@@ -162,7 +154,7 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
     first = next(pictures)
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps)]
-    # Players want even sides and colours at half resolution.
+    # Players need even sides and colours at half resolution.
     command += ["-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command += ["-f", "mp4", str(path)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -173,8 +165,8 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
             process.stdin.write(picture.tobytes())
         process.stdin.close()
     except BrokenPipeError:
-        pass  # what ffmpeg says follows
-    said = process.stderr.read().decode(errors="replace").strip()
+        pass  # ffmpeg's message follows
+    message = process.stderr.read().decode(errors="replace").strip()
     process.stderr.close()
     if process.wait() != 0:
-        raise FileError(f"{path}: ffmpeg failed: {said}")
+        raise FileError(f"{path}: ffmpeg failed: {message}")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spadwarp.io.atomic import atomic_path
+from spadwarp.viz.style import BLUE, RED, new_figure, save
 
 __all__ = ["draw_validation"]
 
@@ -18,12 +18,10 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     `rows`: of each `quantity` its `value`, `reference`, `standard_error`, `z` and whether it `passed`. Raises
     `FileError`.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 1.6 + 0.26 * len(rows)), layout="constrained")
+    figure = new_figure(11.0, 1.6 + 0.26 * len(rows))
     ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
     for y, row in enumerate(rows):
-        colour, reference = "C0" if row["passed"] else "C3", row["reference"]
+        colour, reference = BLUE if row["passed"] else RED, row["reference"]
         if reference:
             error = abs(row["standard_error"] / reference)
             ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, fmt="o", ms=4, color=colour)
@@ -36,6 +34,4 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     deviation.axvspan(-2.0, 2.0, color="0.92")
     deviation.set_xlabel("z")
     figure.suptitle(title, fontsize=10)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format="png")
-    return Path(path)
+    return save(figure, path)

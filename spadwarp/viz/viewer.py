@@ -1,4 +1,4 @@
-"""A run as one HTML file that shows itself in any browser, without a network: `view`."""
+"""A run as one HTML file that any browser shows without a network: `view`."""
 
 from __future__ import annotations
 
@@ -6,42 +6,34 @@ import base64
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.frames import FramesFile, InstrumentResponse, detector_response, is_frames_file
 from spadwarp.io.atomic import file_within
-from spadwarp.result.file import load_result
-from spadwarp.result.result import COMPONENTS, Result
+from spadwarp.result import Result, load_result
+from spadwarp.scene import Scene
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.viz import style
 from spadwarp.viz.pages import write_page
+from spadwarp.viz.panels import median_pixel
 
-if TYPE_CHECKING:
-    from spadwarp.frames.file import FramesFile
-    from spadwarp.frames.response import InstrumentResponse
-    from spadwarp.scene import Scene
-
-__all__ = ["HISTOGRAM_BYTES", "view"]
+__all__ = ["HISTOGRAM_BYTES", "load_run", "view"]
 
 HISTOGRAM_BYTES = 5_000_000
-"""What the packed histograms may take [bytes]; with plotly and the images the page stays below 15 MB."""
+"""Largest size of the packed histograms [bytes]; with plotly and the images a page stays below 15 MB."""
 
 _DECADES = 7.0
 # Blocks of pixels and of bins that are added up until the histograms fit, the finest first.
 _STEPS = ((1, 1), (1, 2), (1, 4), (2, 2), (2, 4), (2, 8), (4, 4), (4, 8), (4, 16), (8, 16), (16, 16), (32, 32))
-_COLOURS = {"ballistic": "#0072B2", "forward_scattered": "#E69F00", "backscatter": "#009E73"}
-_LABELS = {
-    "ballistic": "target, ballistic",
-    "forward_scattered": "target, forward-scattered",
-    "backscatter": "water, backscatter",
-}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Layer:
-    """Histograms of one kind: `cube` `[H, W, T]`, times `factor` what is shown."""
+    """Histograms of one kind; the page shows `cube` `[H, W, T]` times `factor`."""
 
     label: str
     colour: str
@@ -52,7 +44,7 @@ class _Layer:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Page:
-    """What a page is made of, from a result or from frames of a camera."""
+    """The content of a page, from a result or from frames of a camera."""
 
     title: str
     caption: str
@@ -89,7 +81,7 @@ def view(
         source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
         path: The file to write.
         method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
-        frame: Of frames, which one, from 0.
+        frame: Number of the frame, from 0, where the source holds frames.
         device: Warp device for the depth frame.
 
     Raises:
@@ -100,7 +92,8 @@ def view(
         from plotly.offline import get_plotlyjs
     except ImportError as error:
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
-    page = _of_result(source, method, device) if isinstance(source, Result) else _of_file(source, method, frame, device)
+    run = load_run(source)
+    page = _of_frames(run, method, frame) if isinstance(run, FramesFile) else _of_result(run, method, device)
     write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
     return Path(path)
 
@@ -108,32 +101,23 @@ def view(
 # Sources
 
 
-def find_run(place: str | Path) -> Path:
-    """The file of a result or of frames, or the one that a directory holds; raises `FileError` where it is not one."""
-    return file_within(place, ("frames.h5", "result.h5"))
-
-
-def _of_file(place: str | Path, method: str | None, frame: int, device: Any) -> _Page:
-    from spadwarp.frames.file import FramesFile, is_frames_file
-
-    path = find_run(place)
-    if is_frames_file(path):
-        return _of_frames(FramesFile.load(path), method, frame)
-    return _of_result(load_result(path), method, device)
+def load_run(source: Result | str | Path) -> Result | FramesFile:
+    """A result or frames, from a file or from the directory that holds one. Raises `FileError`."""
+    if isinstance(source, Result):
+        return source
+    path = file_within(source, ("frames.h5", "result.h5"))
+    return FramesFile.load(path) if is_frames_file(path) else load_result(path)
 
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
-    from spadwarp.frames.response import detector_response
-
     scene = result.scene
     per_pulse = scene.laser.photons_per_pulse * scene.detector.pde
     # In a scan the positions' numbers of photons differ by one at most.
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
-    photons = f"{result.photons:,}".replace(",", " ")
     return _Page(
         title=_name(scene),
-        caption=f"{photons} photons, seed {result.seed}, {scene.transport.estimator}"
+        caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
         + (", interrupted" if result.partial else "")
         + "; expected histograms, before the instrument response",
         scene=scene,
@@ -144,8 +128,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
         layers=[
-            _Layer(label=_LABELS[name], colour=_COLOURS[name], cube=cube, factor=scale)
-            for name, cube in zip(COMPONENTS, result.tallies, strict=True)
+            _Layer(label=label, colour=colour, cube=cube, factor=scale)
+            for (label, colour), cube in zip(style.COMPONENTS.values(), result.tallies, strict=True)
         ],
         edges=result.bin_edges,
         unit="detections per pulse and bin",
@@ -161,11 +145,11 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
         raise FileError(f"{file.path}: without expected counts and depth there is nothing to compare")
     chosen: Any = method or file.best_method
     background = np.broadcast_to(file.background, counts.shape)
-    pulses = f"{file.pulses:,}".replace(",", " ")
+    mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
         title=_name(file.scene),
-        caption=f"frame {frame} of {file.frames}: {pulses} pulses, {file.scene.detector.mode.replace('_', '-')}, seed"
-        f" {file.seed}; expectations before pile-up",
+        caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
+        "expectations before pile-up",
         scene=file.scene,
         depth=file.depth(chosen, frame).astype(np.float64),
         method=chosen,
@@ -175,8 +159,8 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
         intensity_label="counts in the frame",
         layers=[
             _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
-            _Layer(label="expected", colour="#0072B2", cube=file.expected, factor=file.pulses),
-            _Layer(label="of that, background", colour="#009E73", cube=background, factor=file.pulses),
+            _Layer(label="expected", colour=style.BLUE, cube=file.expected, factor=file.pulses),
+            _Layer(label="background part", colour=style.GREEN, cube=background, factor=file.pulses),
         ],
         edges=file.gate_start + file.edges,
         unit="counts per bin",
@@ -188,7 +172,7 @@ def _name(scene: Scene) -> str:
     return "spadwarp" if scene.source is None else Path(scene.source).stem
 
 
-# What the page carries
+# The page's data
 
 
 def _data(page: _Page) -> dict[str, Any]:
@@ -221,25 +205,25 @@ def _data(page: _Page) -> dict[str, Any]:
         "edges": [round(1e9 * float(edge), 6) for edge in edges],
         "unit": page.unit,
         "response": _response(page.response),
-        "first": _first_pixel(page),
+        "first": median_pixel(page.intensity, np.isfinite(page.depth) & np.isfinite(page.truth)),
     }
 
 
 def _histograms(layers: list[_Layer]) -> tuple[list[dict[str, Any]], int, int]:
-    """The layers packed within `HISTOGRAM_BYTES`, pixels in a block's side and bins that were merged."""
+    """The layers, packed within `HISTOGRAM_BYTES`; the side of a block of pixels; bins that were merged."""
     for block, merged in _STEPS:
         rows = max(layers[0].cube.shape[0] // 16, block) // block * block
         trial = sum(len(_pack(_reduced(layer.cube[:rows], block, merged), layer)["codes"]) for layer in layers)
         if trial * layers[0].cube.shape[0] / rows > 1.5 * HISTOGRAM_BYTES:
-            continue  # far from it: the whole need not be packed to know
+            continue  # far too large, as a part of the rows shows
         packed = [_pack(_reduced(layer.cube, block, merged), layer) for layer in layers]
-        if sum(len(one["codes"]) for one in packed) <= HISTOGRAM_BYTES / 3 * 4:
+        if sum(len(layer["codes"]) for layer in packed) <= HISTOGRAM_BYTES / 3 * 4:
             break
     return packed, block, merged
 
 
 def _reduced(cube: NDArray[Any], block: int, merged: int) -> NDArray[Any]:
-    """Sums over blocks of pixels and bins, what is left over at the ends included."""
+    """Sums over blocks of pixels and bins; those at the ends may be smaller."""
     for axis, step in ((2, merged), (1, block), (0, block)):
         if step > 1:
             cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], step), axis=axis)
@@ -247,17 +231,16 @@ def _reduced(cube: NDArray[Any], block: int, merged: int) -> NDArray[Any]:
 
 
 def _pack(values: NDArray[Any], layer: _Layer) -> dict[str, Any]:
-    """Whole numbers below 65536 as they are, others as the logarithm in 254 steps; deflated."""
-    about = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
+    """Counts below 65536 as they are, other values as their logarithm in 254 steps; deflated."""
+    metadata = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
     high = float(values.max())
     if layer.filled and high < 65536:
-        return {**about, "kind": "whole", "codes": _deflated(values.astype("<u2"))}
+        return {**metadata, "kind": "whole", "codes": _deflated(values.astype("<u2"))}
     lowest = high * 10.0**-_DECADES
     codes = np.zeros(values.shape, dtype=np.uint8)
-    there = values > lowest
-    if there.any():
-        codes[there] = 1 + np.round(254.0 / _DECADES * np.log10(values[there] / lowest)).astype(np.uint8)
-    return {**about, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _deflated(codes)}
+    valid = values > lowest
+    codes[valid] = 1 + np.round(254.0 / _DECADES * np.log10(values[valid] / lowest)).astype(np.uint8)
+    return {**metadata, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _deflated(codes)}
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
@@ -269,7 +252,7 @@ def _deflated(values: NDArray[Any]) -> str:
 
 
 def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
-    """The response over the delay [ns], its peak 1; None without width."""
+    """The response over the delay [ns], its peak 1; None for one without width."""
     low, high = response.support
     if not high > low or (response.times is None and response.sigma == response.tail == 0.0):
         return None
@@ -280,13 +263,3 @@ def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
         "delay": [round(1e9 * float(delay), 6) for delay in delays[kept]],
         "value": [round(float(value), 5) for value in density[kept] / density.max()],
     }
-
-
-def _first_pixel(page: _Page) -> list[int]:
-    """The pixel that the page opens on: of those with a depth, the one of median intensity."""
-    known = np.flatnonzero(np.isfinite(page.depth) & np.isfinite(page.truth))
-    if not len(known):
-        known = np.arange(page.depth.size)
-    order = known[np.argsort(page.intensity.ravel()[known], kind="stable")]
-    row, column = divmod(int(order[(len(order) - 1) // 2]), page.depth.shape[1])
-    return [row, column]

@@ -2,7 +2,7 @@
 
 import spadwarp
 from helpers.scenes import scene
-from spadwarp.viz import plot_budget, plot_sweep
+from spadwarp.viz import draw_budget, draw_sweep
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},
@@ -14,7 +14,7 @@ SCENE = scene(
 
 def test_pictures_are_written_whole(tmp_path):
     rows = spadwarp.budget(SCENE, ranges=[1, 3, 9], media=["uwoc-clear", "uwoc-harbour"])
-    figure = plot_budget(rows, tmp_path / "budget.png")
+    figure = draw_budget(rows, tmp_path / "budget.png")
     assert len(figure.axes) == 4
     assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["1", "3", "9"]
     assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == [
@@ -22,7 +22,7 @@ def test_pictures_are_written_whole(tmp_path):
         "uwoc-harbour (2.17/m)",
     ]
     for of in ("budget", "depth-error"):
-        figure = plot_sweep(spadwarp.sweep(SCENE, vary="medium.extinction=0.1:2:3", of=of), tmp_path / f"{of}.pdf")
+        figure = draw_sweep(spadwarp.sweep(SCENE, vary="medium.extinction=0.1:2:3", of=of), tmp_path / f"{of}.pdf")
         assert all(axis.get_xlabel() == "medium.extinction [1/m]" for axis in figure.axes)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["budget.pdf", "budget.png", "depth-error.pdf"]

@@ -14,13 +14,13 @@ from matplotlib.image import imread
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.errors import FileError
 from spadwarp.result.result import Result
-from spadwarp.viz.result import write_previews
+from spadwarp.viz import draw_result
 
 NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
 
 
 def check_pictures(result: Result, directory: Path, **options: object) -> list[np.ndarray]:
-    paths = write_previews(result, directory, **options)  # type: ignore[arg-type]
+    paths = draw_result(result, directory, **options)  # type: ignore[arg-type]
     assert paths == [directory / name for name in NAMES]
     assert sorted(path.name for path in directory.iterdir()) == sorted(NAMES)
     images = [imread(path) for path in paths]
@@ -72,19 +72,19 @@ def test_a_given_depth_frame_is_shown_as_it_is(tmp_path: Path) -> None:
 def test_folders_that_cannot_be_written_are_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(FileError, match=r"depth\.png: cannot be written"):
-        write_previews(make_result(make_scene()), tmp_path / "file", method="peak")
+        draw_result(make_result(make_scene()), tmp_path / "file", method="peak")
 
 
 def test_pictures_need_no_pyplot() -> None:
     # pyplot would choose a window system for the caller.
-    code = "import sys, spadwarp.viz.result; assert 'matplotlib.pyplot' not in sys.modules"
+    code = "import sys, spadwarp.viz; assert 'matplotlib.pyplot' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, env={"PYTHONPATH": ":".join(sys.path)})
 
 
 @pytest.mark.slow
 def test_pictures_for_print_are_vectors_and_the_same_again(tmp_path: Path) -> None:
     result = make_result(make_scene())
-    first, second = (write_previews(result, tmp_path / run, method="peak", formats=["pdf"]) for run in ("a", "b"))
+    first, second = (draw_result(result, tmp_path / run, method="peak", formats=["pdf"]) for run in ("a", "b"))
     assert [path.name for path in first] == [name.replace("png", "pdf") for name in NAMES]
     for one, other in zip(first, second, strict=True):
         content = one.read_bytes()
