@@ -1,4 +1,4 @@
-"""The application that every command hangs on: what is said in case of trouble, and the exit codes.
+"""The application to which all commands belong: messages in case of errors, and the exit codes.
 
 0 done, 1 failed, 2 wrong use (options, or a scene that is not valid), 130 interrupted.
 """
@@ -18,7 +18,7 @@ FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 
 
 class _Commands(TyperGroup):
-    """Errors meant for the user end a command without a traceback; warnings are one line."""
+    """Errors of spadwarp end a command without a traceback; warnings are one line."""
 
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings():
@@ -30,7 +30,7 @@ class _Commands(TyperGroup):
             except MemoryError as error:
                 fail(f"not enough memory: {error}")
             except KeyboardInterrupt:
-                fail("stopped; nothing was written of what was not finished", INTERRUPTED)
+                fail("interrupted; unfinished files were not written", INTERRUPTED)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -38,12 +38,12 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def say(text: str = "") -> None:
-    """One line, or several, of what was asked for."""
+    """Prints the answer of a command to stdout."""
     typer.echo(text)
 
 
 def complain(text: str) -> None:
-    """What is not an answer goes to stderr: progress, warnings, errors."""
+    """Prints progress, warnings and errors to stderr."""
     typer.echo(text, err=True)
 
 

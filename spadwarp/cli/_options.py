@@ -1,4 +1,4 @@
-"""Options that commands share, each meaning the same wherever it appears, and what is done with them."""
+"""Options that commands share, with the same meaning in every command, and how they are read."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ Mesh = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="A mesh (STL, OBJ, PLY, OFF, GLB) in place of the scene's first target, at its place, turned as it is and "
-        "with its reflectance; in metres unless --set 'targets[0].scale=0.001' says otherwise.",
+        help="A mesh (STL, OBJ, PLY, OFF, GLB) that replaces the scene's first target, with the same position, "
+        "rotation and reflectance; in metres, or in millimetres with --set 'targets[0].scale=0.001'.",
     ),
 ]
 Overrides = Annotated[
@@ -46,7 +46,7 @@ Overrides = Annotated[
 ]
 Photons = Annotated[
     int | None,
-    typer.Option(parser=whole_number, metavar="N", help="Photons to emit; 2e9 will do. By default the scene's."),
+    typer.Option(parser=whole_number, metavar="N", help="Photons to emit, such as 2e9. By default the scene's."),
 ]
 Seed = Annotated[
     int | None,
@@ -78,13 +78,13 @@ RayAddress = Annotated[
 Workers = Annotated[
     int | None,
     typer.Option(
-        min=1, metavar="N", help="Workers of Ray; by default one for each GPU, without any one for each machine."
+        min=1, metavar="N", help="Workers of Ray; by default one for each GPU, or one for each machine without a GPU."
     ),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threads; by default one for each core.")]
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)]
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Allow an output directory that is not empty.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and errors.")]
 TorchDevice = Annotated[
     str | None,
     typer.Option("--device", metavar="NAME", help='"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
@@ -93,8 +93,8 @@ RunOrFrames = Annotated[
     Path,
     typer.Argument(metavar="RUN", help="A result or frames, or the directory of one of them.", show_default=False),
 ]
-Frame = Annotated[int, typer.Option(min=0, metavar="N", help="Which frame, of frames.")]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write what is told here as JSON.")]
+Frame = Annotated[int, typer.Option(min=0, metavar="N", help="Number of the frame, if RUN holds frames.")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the output as JSON.")]
 
 
 class Estimator(enum.StrEnum):
@@ -109,7 +109,7 @@ class Estimator(enum.StrEnum):
 def read_scene(
     path: Path, *, mesh: Path | None, overrides: list[str] | None, photons: int | None = None, seed: int | None = None
 ) -> Scene:
-    """The scene as the options make it; `--set` lies over `--mesh`, the options of their own over both."""
+    """The scene with the options applied: first `--mesh`, then `--set`, then the others."""
     scene = spadwarp.load_scene(path)
     if mesh is not None:
         # What sized the old target says nothing about the new one.
@@ -120,7 +120,7 @@ def read_scene(
 
 
 def read_engine(name: str, address: str | None, workers: int | None) -> Ray | None:
-    """What `engine=` takes."""
+    """The value for `engine=`."""
     if name not in ("local", "ray"):
         raise typer.BadParameter(f"{name!r} is not local or ray", param_hint="--engine")
     if name == "ray":
@@ -132,7 +132,7 @@ def read_engine(name: str, address: str | None, workers: int | None) -> Ray | No
 
 
 def one_device(devices: str | None, engine: Ray | None) -> str | None:
-    """Where what a single device does after a run is done."""
+    """The device for the work after a run that needs one device."""
     if devices is None or engine is not None:
         return None
     return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]

@@ -22,7 +22,7 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
         "signal",
         "background",
         "α",
-        "S/B",
+        "signal/backscatter",
         "σ* [ps]",
         "σ* [mm]",
         "outliers",

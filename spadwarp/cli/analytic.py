@@ -36,7 +36,7 @@ def analytic(
     mesh: opt.Mesh = None,
     overrides: opt.Overrides = None,
     depth: Annotated[
-        Path | None, typer.Option(metavar="EXR", help="Depth that a program rendered, in place of the scene's targets.")
+        Path | None, typer.Option(metavar="EXR", help="Rendered depth, which replaces the scene's targets.")
     ] = None,
     depth_channel: Annotated[str | None, typer.Option(metavar="NAME", help="Its channel; the preset's.")] = None,
     depth_scale: Annotated[
@@ -65,10 +65,10 @@ def analytic(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Depth frames by the paper's analytic model.
+    """Depth frames by the analytic model.
 
-    From the scene's targets, or from what a game engine or Blender rendered with the scene's camera. Writes analytic.h5
-    (maps, frames and which of their pixels are stray) and analytic.png.
+    From the scene's targets, or from images that a game engine or Blender rendered with the scene's camera. Writes
+    analytic.h5 (maps, frames, and labels of the pixels that report background) and analytic.png.
 
     \b
     Examples:

@@ -26,13 +26,13 @@ def bench(
     ] = None,
     device: opt.Device = None,
     photons: opt.Photons = None,
-    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest counts.")] = 3,
-    list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and leave.")] = False,
+    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest is reported.")] = 3,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also print the ratio of the rates to those that --json wrote earlier."),
+        typer.Option(metavar="FILE", help="Also print the ratio of the rates to those in FILE, written by --json."),
     ] = None,
 ) -> None:
     """Measure the speed of named cases.

@@ -30,7 +30,7 @@ def budget(
         typer.Option("--medium", metavar="NAME", help="A named water; may be repeated. By default the scene's."),
     ] = None,
     reflectance: Annotated[
-        float | None, typer.Option(metavar="X", help="Of the face; by default that of the scene's first target.")
+        float | None, typer.Option(metavar="X", help="Of the surface; by default that of the first target.")
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Directory for budget.png and budget.csv.")] = None,
     overrides: opt.Overrides = None,
@@ -39,10 +39,11 @@ def budget(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """What comes back from a face on the optical axis.
+    """Photon budget of a surface on the optical axis.
 
-    Signal and background per pulse and pixel, depth error, pulses for 1 cm; over range and water, from the analytic
-    model. Depth errors in brackets are not reached: more than 1 % of the fits would find a false peak.
+    Signal and background per pulse and pixel, depth error, and pulses for a depth error of 1 cm, over range and water,
+    from the analytic model. Depth errors in brackets are not reached: more than 1 % of the fits would find a false
+    peak.
 
     \b
     Example:

@@ -24,7 +24,7 @@ def make(
     recipe_path: Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe (TOML).", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The dataset's folder.", show_default=False)],
     shard: Annotated[
-        str, typer.Option(metavar="K/N", help="Only every N-th shard, from the K-th on; for several machines.")
+        str, typer.Option(metavar="K/N", help="Only every N-th shard, starting with the K-th; for several machines.")
     ] = "1/1",
     overrides: Annotated[
         list[str] | None,
@@ -32,7 +32,8 @@ def make(
     ] = None,
     device: opt.Devices = None,
     processes: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Processes of each GPU at most; fewer for few shards or cores.")
+        int,
+        typer.Option(min=1, metavar="N", help="Largest number of processes per GPU; fewer for few shards or cores."),
     ] = 4,
     engine_name: opt.EngineName = "local",
     ray_address: opt.RayAddress = None,
@@ -40,9 +41,9 @@ def make(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Makes a dataset, or what is missing or broken of it.
+    """Makes a dataset, or its missing and damaged shards.
 
-    The same recipe gives the same files. May be stopped at any moment and called again: whole shards stay.
+    The same recipe gives the same files. An interrupted call can be repeated: complete shards are kept.
 
     \b
     Examples:
@@ -69,11 +70,11 @@ def make(
     if not quiet:
         table = {"made": f"{opt.count(len(found.made))} shards with {opt.count(found.frames)} frames in {out}"}
         if found.kept:
-            table["kept"] = f"{opt.count(len(found.kept))} shards that were there and whole"
+            table["kept"] = f"{opt.count(len(found.kept))} shards that were complete"
         if found.broken:
             table["replaced"] = "; ".join(found.broken)
         if found.missing:
-            table["missing"] = f"{opt.count(len(found.missing))} shards that others are to make"
+            table["missing"] = f"{opt.count(len(found.missing))} shards, left to other machines"
         say(opt.rows(table))
     opt.write_json(summary, json_path)
 
@@ -98,14 +99,14 @@ def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None)
     wrong = spadwarp.dataset.verify_dataset(folder)
     opt.write_json({"folder": folder, "wrong": wrong}, json_path)
     if wrong:
-        fail("\n".join(wrong) + "\n`spadwarp dataset make` makes these anew")
+        fail("\n".join(wrong) + "\n`spadwarp dataset make` makes them again")
     if not quiet:
-        say(f"{folder}: whole")
+        say(f"{folder}: complete")
 
 
 @group.command()
 def info(folder: Folder, json_path: opt.Json = None) -> None:
-    """What a dataset holds.
+    """Contents of a dataset.
 
     \b
     Example:
@@ -140,8 +141,10 @@ class Split(enum.StrEnum):
 def preview(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(metavar="PNG", help="The picture; by default preview.png in DIR.")] = None,
-    split: Annotated[Split, typer.Option(help="Which frames.")] = Split.all,
-    frames: Annotated[int, typer.Option(min=1, metavar="N", help="How many, evenly over the split.")] = 20,
+    split: Annotated[Split, typer.Option(help="Split of the frames.")] = Split.all,
+    frames: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Number of frames, spread evenly over the split.")
+    ] = 20,
 ) -> None:
     """Draws frames of a dataset on one sheet.
 

@@ -29,14 +29,16 @@ def denoise(
     ] = "pyramid",
     gate: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="START STOP", help="Gate in depth [m]. By default the file's, else the depths in it."),
+        typer.Option(
+            metavar="START STOP", help="Gate in depth [m]. By default that of the file, or the range of its depths."
+        ),
     ] = None,
     profile: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help=".npy with the water's backscatter over the gate in equal bins."),
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of spadwarp train. By default the package's.")
+        Path | None, typer.Option(metavar="FILE", help="Weights of spadwarp train. By default the package's.")
     ] = None,
     depth: Annotated[
         bool, typer.Option("--depth", help="Three dimensions in .npy and .mat are frames of depth, not a histogram.")
@@ -45,14 +47,14 @@ def denoise(
     scale: Annotated[float, typer.Option(metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")] = 1.0,
     variable: Annotated[str | None, typer.Option(metavar="NAME", help="Array in a .mat file.")] = None,
     bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of a bin; measured histograms need it, .ptu knows it.")
+        float | None, typer.Option(metavar="PS", help="Width of a bin; for measured histograms other than .ptu.")
     ] = None,
     gate_start_ns: Annotated[
         float | None, typer.Option(metavar="NS", help="Time of flight at the start of bin 0 of measured histograms.")
     ] = None,
     group_index: Annotated[
         float | None,
-        typer.Option(metavar="N", help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; measured ones need it."),
+        typer.Option(metavar="N", help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; for measured histograms."),
     ] = None,
     irf_fwhm_ps: Annotated[
         float | None, typer.Option(metavar="PS", help="Width of the instrument response of measured histograms.")

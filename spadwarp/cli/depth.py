@@ -32,18 +32,19 @@ def depth(
     out: opt.Out,
     method: Annotated[opt.Estimator, typer.Option(help="Estimator of the arrival time.")] = opt.Estimator.centroid,
     bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of a bin; measured histograms need it, .ptu knows it.")
+        float | None, typer.Option(metavar="PS", help="Width of a bin; for measured histograms other than .ptu.")
     ] = None,
     gate_start_ns: Annotated[
         float | None,
-        typer.Option(metavar="NS", help="Time of flight at the start of bin 0. By default what the file knows, or 0."),
+        typer.Option(metavar="NS", help="Time of flight at the start of bin 0. By default that of the file, or 0."),
     ] = None,
     group_index: Annotated[
         float | None,
         typer.Option(metavar="N", help="For the speed of light; 1 in air, 1.3566 in fresh water, 1.3638 in seawater."),
     ] = None,
     horizontal_fov_deg: Annotated[
-        float | None, typer.Option(metavar="DEG", help="View of a measuring camera: planar depth, and --ply, need it.")
+        float | None,
+        typer.Option(metavar="DEG", help="Field of view of a measuring camera, for planar depth and --ply."),
     ] = None,
     irf_fwhm_ps: Annotated[
         float | None, typer.Option(metavar="PS", help="Width of a Gaussian instrument response.")
@@ -55,8 +56,8 @@ def depth(
         str | None,
         typer.Option(
             metavar="COUNTS",
-            help='Background per bin, or "median": each pixel\'s median bin. By default what the file knows; for '
-            "measured ones none, with likelihood the median.",
+            help='Background per bin, or "median": each pixel\'s median bin. By default that of the file; for '
+            "measured histograms none, with likelihood the median.",
         ),
     ] = None,
     variable: Annotated[
@@ -70,8 +71,9 @@ def depth(
 ) -> None:
     """Depth from histograms, simulated or measured.
 
-    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured: [height, width, bin], or frames of
-    them. Without a field of view only the range along the line of sight is known, for a laser in the lens.
+    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured histograms
+    are [height, width, bin], or frames of them. Without a field of view, the output is the range along the line of
+    sight, for a laser in the lens.
 
     \b
     Examples:
@@ -131,7 +133,7 @@ def _with_options(
     if irf is not None and irf_fwhm_ps is not None:
         raise typer.BadParameter("goes without --irf-fwhm-ps", param_hint="--irf")
     if histograms.scene is not None and (clash := [*changes, *(["irf"] if irf or irf_fwhm_ps else [])]):
-        raise typer.BadParameter(f"the file knows its {', '.join(clash).replace('_', ' ')}", param_hint="FILE")
+        raise typer.BadParameter(f"the file has its own {', '.join(clash).replace('_', ' ')}", param_hint="FILE")
     if irf is not None:
         changes["irf"] = changes["response"] = spadwarp.frames.instrument_response(
             pulse_fwhm=0.0, jitter_fwhm=0.0, shape=irf

@@ -27,7 +27,9 @@ def detect(
     out: opt.Out,
     pulses: Annotated[
         int | None,
-        typer.Option(parser=opt.whole_number, metavar="N", help="Pulses of a frame, else detector.pulses_per_frame."),
+        typer.Option(
+            parser=opt.whole_number, metavar="N", help="Pulses per frame; by default detector.pulses_per_frame."
+        ),
     ] = None,
     frames: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Frames to record.")] = 1,
     seed: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Key of the random numbers.")] = 0,
@@ -35,7 +37,9 @@ def detect(
         list[opt.Estimator] | None,
         typer.Option(help="Estimator of depth; may be repeated. By default all four; the last is drawn."),
     ] = None,
-    coates: Annotated[bool, typer.Option("--coates", help="Undo pile-up (Coates) before depth is estimated.")] = False,
+    coates: Annotated[
+        bool, typer.Option("--coates", help="Correct pile-up (Coates) before depth is estimated.")
+    ] = False,
     tags: Annotated[bool, typer.Option("--tags", help="Also keep the time tag of every detection.")] = False,
     window: Annotated[
         tuple[float, int] | None,
@@ -47,7 +51,7 @@ def detect(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Frames of counts that the camera would record of a run.
+    """Frames of counts that the camera would record.
 
     Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
     takes fields of the detector, and pulse_energy, repetition_rate and pulse_fwhm_ps of the laser.
@@ -124,7 +128,7 @@ def _told(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
         "frames": f"{opt.count(summary['frames'])} of {opt.count(summary['pulses'])} pulses, seed {summary['seed']}",
         "detections": f"{summary['detections_per_frame_and_pixel']:.4g} a frame and pixel, "
         f"{summary['detections_per_pulse_and_pixel']:.3g} a pulse and pixel",
-        "bound": "no information on depth in any pixel"
+        "bound": "no depth information in any pixel"
         if median is None
         else f"{1000 * median:.3g} mm of depth in the median pixel (Cramér–Rao, one frame)",
     }

@@ -9,7 +9,7 @@ from spadwarp.cli._app import app, say
 
 @app.command()
 def devices(json_path: opt.Json = None) -> None:
-    """Where photons can be traced: the CPU and the GPUs.
+    """Devices that can trace photons: the CPU and the GPUs.
 
     \b
     Example:
@@ -20,5 +20,5 @@ def devices(json_path: opt.Json = None) -> None:
         memory = f", {opt.in_bytes(device['memory'])}" if device["memory"] else ""
         say(f"{device['name']:<8}  {device['description']}{memory}" + ("  (default)" if device["default"] else ""))
     if len(found) == 1:
-        say("no NVIDIA GPU with driver R580 or newer is seen")
+        say("no NVIDIA GPU with driver R580 or newer was found")
     opt.write_json({"devices": found}, json_path)

@@ -19,12 +19,13 @@ def doctor(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """What is installed and seen, and a self-test.
+    """Check the installation, and run a self-test.
 
-    Versions, devices, driver, kernel cache, and what is missing for a GPU.
+    Shows versions, devices, driver, kernel cache, and what is missing for a GPU.
 
-    The self-test takes a few seconds, the first time as many again to compile its kernels: light straight from a plate
-    against the lidar equation, a slab against published values. Exit code 1 if something is in the way or it fails.
+    The self-test takes a few seconds, and about twice as long when it first compiles its kernels. It compares ballistic
+    light from a plate with the lidar equation, and a slab with published values. Exit code 1 for a problem or a failed
+    test.
 
     \b
     Example:

@@ -25,7 +25,7 @@ def evaluate(
         str,
         typer.Option(
             metavar="NAMES",
-            help='"all", or names with commas: median, gating, bm3d, usdn, dncnn, pyramid, of results histograms too.',
+            help='"all", or a list: median, gating, bm3d, usdn, dncnn, pyramid; for results also histograms.',
         ),
     ] = "all",
     split: Annotated[str, typer.Option(metavar="NAME", help="test, validation, train or all.")] = "test",
@@ -39,28 +39,30 @@ def evaluate(
     crop: Annotated[
         tuple[int, int] | None,
         typer.Option(
-            metavar="WIDTH HEIGHT", help="Only the middle part of each frame [pixels]; 128 96 spares BM3D time."
+            metavar="WIDTH HEIGHT", help="Only the middle part of each frame [pixels]; 128 96 makes BM3D faster."
         ),
     ] = None,
     report: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Also write here: report.html, its pictures, scores.json; of a result photons.png alone.",
+            help="Also write report.html, its pictures and scores.json there; for a result only photons.png.",
         ),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Of spadwarp train, for the network it names. By default the package's."),
+        typer.Option(
+            metavar="FILE", help="Weights of spadwarp train for the network that they name. By default the package's."
+        ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(parser=opt.whole_number, metavar="N", help="Of the counts that are drawn from a result.")
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Seed of the counts drawn from a result.")
     ] = 0,
     device: opt.TorchDevice = None,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Compare denoisers on a dataset, or on frames of few photons.
+    """Compare denoisers on a dataset, or on frames with few photons.
 
     On a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved. On a Monte Carlo result:
     frames of 1 to 100 signal photons a pixel at several signal-to-background ratios, RMSE beside the Cramér-Rao bound.

@@ -40,7 +40,9 @@ def export(
     frames: Annotated[
         str | None, typer.Option(metavar="N or A:B", help="Only frame N, or A to B - 1; by default all.")
     ] = None,
-    split: Annotated[str, typer.Option(metavar="NAME", help="Of a dataset: train, validation, test or all.")] = "all",
+    split: Annotated[
+        str, typer.Option(metavar="NAME", help="Split of a dataset: train, validation, test or all.")
+    ] = "all",
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,

@@ -14,12 +14,12 @@ from spadwarp.cli._app import app, say
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="A result, or the directory it lies in.")],
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A result, or its directory.")],
     json_path: opt.Json = None,
 ) -> None:
-    """What is in a result, and how it was made.
+    """Contents of a result, and how it was made.
 
-    With the energy ledger: where the emitted light went.
+    Includes the energy balance: where the emitted light went.
 
     \b
     Example:
@@ -53,7 +53,7 @@ def _told(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str,
             "pulse",
         },
         "Collected, as fractions of the emitted light": collected,
-        f"Energy ledger, {'exact' if ledger['exact'] else 'off by ' + str(ledger['difference']) + ' units'}": {
+        f"Energy balance, {'exact' if ledger['exact'] else 'off by ' + str(ledger['difference']) + ' units'}": {
             name: f"{100 * part:10.6f} %" for name, part in fractions.items() if part
         }
         | {"sum": f"{100 * sum(fractions.values()):10.6f} %"},

@@ -17,7 +17,7 @@ from spadwarp.cli.simulate import described
 def merge(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN...", help="Results, or the directories they lie in.", show_default=False),
+        typer.Argument(metavar="RUN...", help="Results, or their directories.", show_default=False),
     ],
     out: opt.Out,
     device: opt.Device = None,
@@ -27,7 +27,7 @@ def merge(
 ) -> None:
     """Add runs of one scene and seed that traced different photons.
 
-    The sum is, bit for bit, the run of all the photons at once. Writes what `spadwarp simulate` writes.
+    The sum has the same bits as one run of all photons. Writes the same files as `spadwarp simulate`.
 
     \b
     Example:

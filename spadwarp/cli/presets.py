@@ -22,8 +22,8 @@ def presets(
 ) -> None:
     """Named waters, lasers and detectors with their sources.
 
-    Cameras and gates too. A scene takes one by `preset = "NAME"` in the section of that name.
-    The waters are for about 532 nm; `spadwarp water` has other wavelengths.
+    Cameras and gates too. A scene selects one by `preset = "NAME"` in the section of that name.
+    The waters are for about 532 nm; `spadwarp water` computes other wavelengths.
 
     \b
     Example:

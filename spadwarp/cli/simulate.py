@@ -27,7 +27,7 @@ def simulate(
         typer.Argument(metavar="SCENE", help="Scene file (TOML); none with --resume.", show_default=False),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Directory for what is written.", show_default=False)
+        Path | None, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)
     ] = None,
     mesh: opt.Mesh = None,
     device: opt.Devices = None,
@@ -43,22 +43,22 @@ def simulate(
     ] = False,
     uncertainty: Annotated[
         bool,
-        typer.Option("--uncertainty", help="Keep batches, for the standard error of every bin; twice the memory."),
+        typer.Option("--uncertainty", help="Keep batches for the standard error of every bin; twice the memory."),
     ] = False,
     relative_error: Annotated[
         float | None,
         typer.Option(
             metavar="X",
-            help="Stop when the bins that decide the depth are known this well (0.02: 2 %); --photons is then the most "
-            "that are traced, rounded up to whole batches.",
+            help="Stop at this relative error of the bins that decide the depth (0.02: 2 %); --photons is then the "
+            "largest number of photons, rounded up to whole batches.",
         ),
     ] = None,
     resume: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Resume the finished, interrupted or killed run in DIR until it has --photons in all (by default what "
-            "it was asked for), and write it back there.",
+            help="Resume the finished, interrupted or killed run in DIR until it has --photons in total (by default "
+            "those it was started with), and write the result there.",
         ),
     ] = None,
     checkpoint: Annotated[
@@ -88,9 +88,9 @@ def simulate(
 ) -> None:
     """Trace photons through a scene into histograms.
 
-    Writes to the output directory: result.h5 (everything, for `spadwarp info` and `spadwarp.load_result`), scene.toml
-    (the full scene as it was run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and writes what
-    is done; after a crash --resume continues from the last checkpoint.
+    Writes to the output directory: result.h5 (the complete result, for `spadwarp info` and `spadwarp.load_result`),
+    scene.toml (the complete scene of the run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and
+    writes the photons traced so far; after a crash, --resume continues from the last checkpoint.
 
     \b
     Examples:

@@ -22,7 +22,7 @@ from spadwarp.cli._tables import budget_table, new_table, percent, short
 
 
 class Quantity(enum.StrEnum):
-    """What `spadwarp.sweep` can be of."""
+    """Quantities of `spadwarp.sweep`."""
 
     budget = "budget"
     depth_error = "depth-error"
@@ -33,10 +33,12 @@ def sweep(
     scene_path: opt.ScenePath,
     vary: Annotated[
         str,
-        typer.Option(metavar="FIELD=FROM:TO:N", help="Field and values; :log for a geometric progression; or a,b,c."),
+        typer.Option(metavar="FIELD=FROM:TO:N", help="Field and values; with :log a geometric progression; or a,b,c."),
     ],
     out: opt.Out,
-    of: Annotated[Quantity, typer.Option(help="Budget of the central pixel, or depth error of all.")] = Quantity.budget,
+    of: Annotated[
+        Quantity, typer.Option(help="Budget of the central pixel, or depth error of all pixels.")
+    ] = Quantity.budget,
     mesh: opt.Mesh = None,
     overrides: opt.Overrides = None,
     device: opt.Device = None,
@@ -76,7 +78,9 @@ def sweep(
 
 
 def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:
-    table = new_table(title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "S/B")
+    table = new_table(
+        title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "signal/backscatter"
+    )
     for name, row in zip(names, found, strict=True):
         table.add_row(
             name,

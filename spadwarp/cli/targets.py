@@ -24,9 +24,9 @@ def targets(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """The targets that come along; with --out a sheet with a picture of each.
+    """The built-in targets; with --out a sheet with a picture of each.
 
-    A scene takes one by `builtin = "NAME"` in [[targets]].
+    A scene selects one by `builtin = "NAME"` in [[targets]].
 
     \b
     Example:

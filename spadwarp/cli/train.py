@@ -19,7 +19,7 @@ def train(
     recipe: Annotated[Path, typer.Argument(metavar="RECIPE", help="Training recipe (TOML).", show_default=False)],
     out: opt.Out,
     data: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Dataset in place of the recipe's.", show_default=False)
+        Path | None, typer.Option(metavar="DIR", help="Dataset; by default the recipe's.", show_default=False)
     ] = None,
     steps: Annotated[
         int | None, typer.Option(parser=opt.whole_number, metavar="N", help="Updates. By default the recipe's.")
@@ -33,8 +33,8 @@ def train(
 ) -> None:
     """Train a denoiser on the clean scenes of a dataset.
 
-    Noise is drawn anew for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
-    command resumes a run that was interrupted. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
+    command resumes an interrupted training. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

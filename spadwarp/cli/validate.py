@@ -29,16 +29,16 @@ def validate(
     seed: opt.Seed = None,
     device: opt.Device = None,
     tabulated: Annotated[
-        bool, typer.Option("--tabulated", help="Take Henyey–Greenstein from tables of angle and value.")
+        bool, typer.Option("--tabulated", help="Use Henyey–Greenstein as tables of angle and value.")
     ] = False,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw a picture of each case.")] = None,
-    list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and leave.")] = False,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Hold the simulator to physics whose answer is known without it.
+    """Compare the simulator with known results of physics.
 
-    A correct simulator fails once in a thousand runs. Exit code 1 when a value misses its reference.
+    A correct simulator fails in one run of a thousand. Exit code 1 if a value does not agree with its reference.
 
     \b
     Examples:

@@ -15,19 +15,21 @@ from spadwarp.cli._app import app, say
 @app.command()
 def video(
     run: opt.RunOrFrames,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Ends in .gif, or in .mp4, which needs ffmpeg.")] = Path(
-        "light.gif"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Name of the video, .gif or .mp4; .mp4 needs ffmpeg.")
+    ] = Path("light.gif"),
     window: Annotated[
-        str | None, typer.Option(metavar="FROM,TO", help="Times of flight [ns]; by default all with light in them.")
+        str | None, typer.Option(metavar="FROM,TO", help="Times of flight [ns]; by default those with light.")
     ] = None,
-    pictures: Annotated[int, typer.Option(min=1, metavar="N", help="At most; bins are merged.")] = 120,
+    pictures: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Largest number of pictures; bins are merged.")
+    ] = 120,
     fps: Annotated[float, typer.Option(metavar="N", help="Pictures per second, up to 50.")] = 12.0,
-    linear: Annotated[bool, typer.Option("--linear", help="A linear colour scale, not four decades.")] = False,
+    linear: Annotated[bool, typer.Option("--linear", help="A linear colour scale instead of four decades.")] = False,
     frame: opt.Frame = 0,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Light in flight: what each pixel receives, bin after bin.
+    """A video of light in flight, from time bin to time bin.
 
     \b
     Examples:

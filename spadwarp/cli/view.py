@@ -27,7 +27,7 @@ def view(
     """A run as one HTML file: click a pixel to see its histogram.
 
     Depth as a point cloud coloured by its error; depth, truth, error and intensity as images; the histogram of a pixel
-    with its components and the instrument response. Opens in any browser, without a network.
+    with its components and the instrument response. Opens in any browser, without a network connection.
 
     \b
     Examples:

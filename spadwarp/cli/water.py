@@ -22,7 +22,7 @@ def water(
 ) -> None:
     """Absorption, scattering and indices of water at a wavelength.
 
-    What a scene gets by medium.chlorophyll, temperature and salinity.
+    A scene gets them by medium.chlorophyll, temperature and salinity.
 
     \b
     Example:

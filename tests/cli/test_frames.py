@@ -74,7 +74,7 @@ def test_depth_of_frames_knows_the_response(done, tmp_path):
     with h5py.File(tmp_path / "frames" / "frames.h5") as file:
         assert np.allclose(np.load(tmp_path / "out" / "depth.npy"), file["depth/matched"], rtol=1e-5, equal_nan=True)
     asked = run("depth", done, "--out", tmp_path / "x", "--bin-width-ps", 5, code=2)
-    assert "the file knows its bin width" in asked.stderr
+    assert "the file has its own bin width" in asked.stderr
 
 
 def test_depth_of_measured_histograms(tmp_path):

@@ -65,7 +65,7 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     summary = tmp_path / "summary.json"
     told = run("info", tmp_path / "result.h5", "--json", summary).stdout
     assert run("info", tmp_path).stdout == told  # the directory stands for the result in it
-    assert "20 000, seed 3" in told and "Energy ledger, exact" in told and "100.000000 %" in told
+    assert "20 000, seed 3" in told and "Energy balance, exact" in told and "100.000000 %" in told
     assert tables(summary) == json.loads(json.dumps(result.summary()))
 
 

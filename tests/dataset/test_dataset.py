@@ -352,7 +352,7 @@ def test_commands(tmp_path):
 
     make = ["make", tmp_path / "recipe.toml", "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
     told = dataset(*make, "--shard", "1/2")
-    assert "3 shards with 3 frames" in told and "3 shards that others are to make" in told
+    assert "3 shards with 3 frames" in told and "3 shards, left to other machines" in told
     assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
     assert "3 shards that were there" in dataset(*make, "--json", tmp_path / "told.json")
     assert tables(tmp_path / "told.json")["frames"] == 3
