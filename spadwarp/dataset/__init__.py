@@ -10,18 +10,5 @@ from spadwarp.dataset.read import FIELDS, FrameReader, SpadDataset, iterate_data
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe, load_recipe
 from spadwarp.dataset.sampling import Plan
 
-__all__ = [
-    "FIELDS",
-    "SPLITS",
-    "DatasetReport",
-    "Distribution",
-    "FrameReader",
-    "Plan",
-    "Recipe",
-    "SpadDataset",
-    "iterate_dataset",
-    "load_recipe",
-    "make_dataset",
-    "read_manifest",
-    "verify_dataset",
-]
+__all__ = ["FIELDS", "SPLITS", "DatasetReport", "Distribution", "FrameReader", "Plan", "Recipe", "SpadDataset"]
+__all__ += ["iterate_dataset", "load_recipe", "make_dataset", "read_manifest", "verify_dataset"]

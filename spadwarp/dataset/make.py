@@ -86,31 +86,31 @@ def make_dataset(
         raise ConfigError(f"shard = {part}/{parts}: {part} is outside [1, {parts}]")
     folder = Path(out).absolute()
     _claim(plan, folder)
-    mine = [one for one in plan.shards if one.index % parts == part - 1]
-    state = check_shards(plan, folder, mine)
-    todo = [one for one in mine if state[one.index]]
-    total = sum(one.scenes for one in todo) * plan.frames_per_scene
+    shards = [item for item in plan.shards if item.index % parts == part - 1]
+    state = check_shards(plan, folder, shards)
+    missing = [item for item in shards if state[item.index]]
+    total = sum(item.scenes for item in missing) * plan.frames_per_scene
     _check_space(plan, folder, total)
     report = progress or (lambda *_: None)
     if total:
         report("compile", 0, 0)
     if engine is None:
-        device = _processes(device, processes, len(todo))
+        device = _processes(device, processes, len(missing))
     done = 0
-    jobs = [_Job(plan.recipe, folder, one.index) for one in todo]
+    jobs = [_Job(plan.recipe, folder, item.index) for item in missing]
     with interruptible() as stopped:
         options: dict[str, Any] = {"engine": engine, "device": device, "stopped": stopped}
         for _, frames in run_jobs(_make_shard, jobs, note=lambda text: report(text, 0, 0), **options):
             done += frames
             report("frames", done, total)
-    missing = finish(plan, folder)
+    others = finish(plan, folder)
     if done < total:
         raise KeyboardInterrupt
     return DatasetReport(
         folder=Path(out),
-        made=tuple(one.frames_file for one in todo),
-        kept=tuple(one.frames_file for one in mine if not state[one.index]),
-        missing=missing,
+        made=tuple(item.frames_file for item in missing),
+        kept=tuple(item.frames_file for item in shards if not state[item.index]),
+        missing=others,
         broken=tuple(text for text in state.values() if text not in ("", "missing")),
         frames=total,
     )
@@ -140,7 +140,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
 
 def _processes(device: str | None, processes: int, shards: int) -> str:
     """The devices, each GPU as often as it gets processes."""
-    names = [one.alias for one in pick_devices(device)]
+    names = [chosen.alias for chosen in pick_devices(device)]
     if "cpu" in names or len(set(names)) < len(names):
         return ",".join(names)
     each = min(processes, core_count() // len(names), shards // (2 * len(names)))
@@ -158,7 +158,7 @@ def _claim(plan: Plan, folder: Path) -> None:
             raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
         if folder.exists() and not folder.is_dir():
             raise FileError(f"{folder}: is a file; a folder is needed")
-        if folder.is_dir() and any(not one.name.startswith(".") for one in folder.iterdir()):
+        if folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -1,8 +1,8 @@
 """Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
 
-A recipe holds a scene, given as in a scene file, and distributions over what changes from scene to scene. A
-distribution is a number (always that), a list (one of these), or a table `{low = , high = }`, with `log = true` even in
-the logarithm.
+A recipe holds a scene, given as in a scene file, and distributions of what changes from scene to scene. A distribution
+is a number (a constant), a list (each value equally likely), or a table `{low = , high = }` (uniform; with `log = true`
+uniform in the logarithm).
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Fields as TOML has them, without those that are None."""
+        """Fields as TOML has them, without those that are None: `Recipe.from_dict` makes an equal recipe of them."""
         return {name: _plain(value) for name, value in self if value is not None}
 
 
 class Distribution(_Table):
-    """One of `choices`, or even between `low` and `high`."""
+    """One of `choices`, equally likely, or uniform between `low` and `high`."""
 
     choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
     low: float | None = Field(None, description="lowest value")
     high: float | None = Field(None, description="highest value")
-    log: bool = Field(False, description="whether the logarithm is even")
+    log: bool = Field(False, description="whether uniform in the logarithm")
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -71,7 +71,7 @@ class Distribution(_Table):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest value that can come."""
+        """Lowest and highest value that can be drawn."""
         if self.choices:
             return min(self.choices), max(self.choices)
         assert self.low is not None and self.high is not None
@@ -103,13 +103,13 @@ def _within(low: float, high: float, *, open_low: bool = False) -> AfterValidato
     """A distribution of numbers in [low, high], or (low, high]."""
 
     def check(value: Distribution) -> Distribution:
-        for one in value.choices:
-            if isinstance(one, bool) or not isinstance(one, (int, float)):
-                raise ValueError(f"{one!r} is not a number")
-        for one in value.limits:
-            if not low <= one <= high or (open_low and one == low):
+        for choice in value.choices:
+            if isinstance(choice, bool) or not isinstance(choice, (int, float)):
+                raise ValueError(f"{choice!r} is not a number")
+        for limit in value.limits:
+            if not low <= limit <= high or (open_low and limit == low):
                 left, right = "(" if open_low else "[", "]" if high < math.inf else ")"
-                raise ValueError(f"{one} is outside {left}{low}, {high}{right}")
+                raise ValueError(f"{limit} is outside {left}{low}, {high}{right}")
         return value
 
     return AfterValidator(check)
@@ -127,7 +127,7 @@ def _constant(value: float) -> Distribution:
 
 
 class Targets(_Table):
-    """What is looked at, and which targets are kept for validation and test; all others are for training."""
+    """The targets, and which of them are for validation and test; all others are for training."""
 
     builtin: Names | Literal["all"] = Field(
         "all", description='names from `spadwarp targets`; "all" objects, or none if meshes or exports are given'
@@ -143,15 +143,15 @@ class Targets(_Table):
 
 
 class Pose(_Table):
-    """Where a target stands, how it is turned, and how much it reflects."""
+    """Position, rotation, size and reflectance of a target."""
 
     distance: Positive = Field(_constant(15.0), description="of the target's centre, along the optical axis [m]")
-    shift: Real = Field(_constant(0.0), description="aside, drawn for x and for y [m]")
-    yaw_deg: Angle = Field(_constant(0.0), description="turn about the vertical [°]")
-    pitch_deg: Angle = Field(_constant(0.0), description="turn about the horizontal across the view [°]")
-    roll_deg: Angle = Field(_constant(0.0), description="turn about the optical axis [°]")
+    shift: Real = Field(_constant(0.0), description="sideways, drawn for x and for y [m]")
+    yaw_deg: Angle = Field(_constant(0.0), description="rotation about the vertical axis [°]")
+    pitch_deg: Angle = Field(_constant(0.0), description="rotation about the horizontal axis across the view [°]")
+    roll_deg: Angle = Field(_constant(0.0), description="rotation about the optical axis [°]")
     size: Positive = Field(_constant(1.0), description="scale of the target")
-    fill: Positive | None = Field(None, description="part of the view that it fills when not turned, in place of size")
+    fill: Positive | None = Field(None, description="part of the view that it fills without rotation; replaces size")
     reflectance: Share = Field(_constant(0.5), description="Lambertian reflectance of the target")
 
 
@@ -159,13 +159,13 @@ class Backdrop(_Table):
     """A wall behind the target."""
 
     probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
-    behind: NotNegative = Field(_constant(0.5), description="of the wall from the target's centre [m]")
+    behind: NotNegative = Field(_constant(0.5), description="distance of the wall behind the target's centre [m]")
     tilt_deg: Angle = Field(_constant(0.0), description="its yaw and pitch, each drawn [°]")
     reflectance: Share = Field(_constant(0.3), description="Lambertian reflectance of the wall")
 
 
 class Water(_Table):
-    """How turbid it is; what is not given here is the scene's."""
+    """Turbidity of the water; other values are those of the scene."""
 
     attenuation_lengths: Positive | None = Field(None, description="extinction times distance, one way")
 
@@ -179,7 +179,7 @@ class Window(_Table):
 
 
 class Exposure(_Table):
-    """How long a frame is exposed: by pulses, or by the photons that come back from the median pixel."""
+    """Exposure of a frame: its pulses, or the photons that the median pixel records from the target."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
     pulses_per_depth_frame: Positive | None = Field(
@@ -199,13 +199,13 @@ class Frames(_Table):
     per_scene: Whole = Field(20, ge=1, le=1_000_000, description="frames of each scene")
     backscatter_fraction: Literal["rates"] | Share = Field(
         _constant(0.183),
-        description='BS, part of the pixels that report backscatter; "rates": what the photon rates say',
+        description='part of the pixels that report backscatter; "rates": the photon rates decide',
     )
-    compression: Literal["none", "gzip"] = Field("none", description="of the frames; none reads fastest")
+    compression: Literal["none", "gzip"] = Field("none", description='of the frames; "none" reads fastest')
 
 
 class MonteCarlo(_Table):
-    """Scenes whose histograms are traced photon by photon; depth frames then come from the camera's counts."""
+    """Scenes that are traced photon by photon; their depth frames come from the counts of the camera."""
 
     share: float = Field(0.0, ge=0, le=1, description="part of the scenes that are traced; the others are analytic")
     photons: Whole = Field(100_000_000, ge=1, le=10**12, description="photons of a scene")
@@ -213,7 +213,7 @@ class MonteCarlo(_Table):
         "matched", description="how depth is found in counts"
     )
     counts: Literal["none", "sparse", "dense", "smaller"] = Field(
-        "smaller", description="how the counts of frames are stored; whichever takes less room, or not at all"
+        "smaller", description="how the counts of frames are stored, if at all"
     )
 
 
@@ -223,9 +223,7 @@ class Recipe(_Table):
     name: str = Field(..., min_length=1, description="what the dataset is called")
     description: str = Field("", description="one or two sentences for its card")
     seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of every draw; one seed gives the same dataset")
-    scenes_per_target: Whole = Field(
-        50, ge=1, le=1_000_000, description="scenes, each with a pose and a water of its own"
-    )
+    scenes_per_target: Whole = Field(50, ge=1, le=1_000_000, description="scenes, each with its own pose and water")
     scenes_per_shard: Whole = Field(25, ge=1, le=1_000_000, description="scenes in one file, all of one target")
     targets: Targets = Targets()
     pose: Pose = Pose()
@@ -245,7 +243,7 @@ class Recipe(_Table):
     def _consistent(self) -> Self:
         for name in ("targets", "gate"):
             if name in self.scene:
-                raise ValueError(f"scene.{name} is not the scene's: the recipe's own [{name}] says it")
+                raise ValueError(f"scene.{name} does not belong to the scene: it is in the recipe's own [{name}]")
         for field in self.vary:
             if field in ("camera.width", "camera.height") or field.split(".")[0] in ("gate", "targets"):
                 raise ValueError(f"vary.{field} cannot vary")
@@ -276,15 +274,8 @@ class Recipe(_Table):
 
     def template(self) -> Scene:
         """The scene before anything is drawn, without targets, its gate from 0 to 1 ns."""
-        tables = {
-            **self.scene,
-            "gate": {"start_ns": 0.0, "bin_width_ps": 1000.0 / self.gate.bins, "bins": self.gate.bins},
-        }
-        return Scene.from_dict(tables)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Tables from which `from_dict` makes an equal recipe."""
-        return super().to_dict()
+        gate = {"start_ns": 0.0, "bin_width_ps": 1000.0 / self.gate.bins, "bins": self.gate.bins}
+        return Scene.from_dict({**self.scene, "gate": gate})
 
     def __eq__(self, other: object) -> bool:
         """Equal in every field; where it came from does not matter."""
@@ -317,11 +308,9 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
 
 
 def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's own tables with the words that hold now; a scene sees to its own."""
-    return {
-        name: current_fields(name, table) if name == "exposure" and isinstance(table, Mapping) else table
-        for name, table in tables.items()
-    }
+    """The recipe's own tables with former names replaced; a scene replaces its own."""
+    exposure = tables.get("exposure")
+    return {**tables, "exposure": current_fields("exposure", exposure)} if isinstance(exposure, Mapping) else {**tables}
 
 
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
@@ -332,7 +321,7 @@ def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None
     folder, changed = Path(source).absolute().parent, dict(targets)
     for name in ("meshes", "exports"):
         if isinstance(given := targets.get(name), (list, tuple)):
-            changed[name] = [str(folder / Path(one).expanduser()) if isinstance(one, str) else one for one in given]
+            changed[name] = [str(folder / Path(path).expanduser()) if isinstance(path, str) else path for path in given]
     return {**tables, "targets": changed}
 
 
@@ -340,5 +329,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, _Table):
         return value.to_dict()
     if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
+        return {name: _plain(item) for name, item in value.items()}
     return list(value) if isinstance(value, tuple) else value

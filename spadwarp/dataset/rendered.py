@@ -16,15 +16,8 @@ from spadwarp.scene import Scene
 from spadwarp.scene.geometry import range_from_path
 from spadwarp.units import path_from_time
 
-__all__ = [
-    "PROFILE_BINS",
-    "Histograms",
-    "RenderedScene",
-    "StoredFrames",
-    "backscatter_profile",
-    "intensity_step",
-    "with_exposure",
-]
+__all__ = ["PROFILE_BINS", "Histograms", "RenderedScene", "StoredFrames", "backscatter_profile", "intensity_step"]
+__all__ += ["with_exposure"]
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""

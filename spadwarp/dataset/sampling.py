@@ -127,7 +127,7 @@ class Plan:
             distance = float(draw("pose.distance", recipe.pose.distance))
         else:
             distance = self._export_distance(source)
-        changes = {name: draw(f"vary.{former_path(name)}", one) for name, one in recipe.vary.items()}
+        changes = {name: draw(f"vary.{former_path(name)}", values) for name, values in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
         if lengths is None:
@@ -227,7 +227,7 @@ class Plan:
         """Offset and step [m] with which 65 535 codes span every gate that can be drawn, the step a round number."""
         recipe, camera = self.recipe, self._template.camera
         tangent = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
-        ranges = [self._export_distance(one) for one in self.targets if one.export]
+        ranges = [self._export_distance(source) for source in self.targets if source.export]
         if len(ranges) < len(self.targets):
             ranges += recipe.pose.distance.limits
         near = max(min(ranges) - recipe.gate.before.limits[1], _SHORTEST_RANGE)
@@ -235,7 +235,7 @@ class Plan:
         near /= math.hypot(1.0, tangent)
         span = (far - near) / 65534.0
         decade = 10.0 ** math.floor(math.log10(span))
-        step = next(decade * one for one in (1.0, 2.0, 5.0, 10.0) if decade * one >= span)
+        step = next(decade * digit for digit in (1.0, 2.0, 5.0, 10.0) if decade * digit >= span)
         return math.floor(near / step - 1.0) * step, step
 
 

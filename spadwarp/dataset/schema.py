@@ -12,15 +12,7 @@ from spadwarp.dataset.sampling import Plan
 from spadwarp.scene import phase_function
 from spadwarp.units import range_from_time
 
-__all__ = [
-    "FORMAT_VERSION",
-    "FRAME_COLUMNS",
-    "HISTOGRAM_COLUMNS",
-    "PACKED",
-    "describe",
-    "scene_columns",
-    "scene_row",
-]
+__all__ = ["FORMAT_VERSION", "FRAME_COLUMNS", "HISTOGRAM_COLUMNS", "PACKED", "describe", "scene_columns", "scene_row"]
 
 FORMAT_VERSION = 1
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,61 +16,25 @@ _LARGEST_Z = 4.5  # a correct simulator exceeds it once in 150 000 tests
 _PHOTONS = 400_000
 
 # A pencil beam at normal incidence on a plate in turbid water, seen by one pixel.
-_PLATE = """
-[medium]
-extinction = 0.5
-albedo = 0.8
-anisotropy = 0.924
-[laser]
-profile = "collimated"
-beam_radius = 0.0
-position = [0.0, 0.0, 0.0]
-[camera]
-width = 1
-height = 1
-horizontal_fov_deg = 10.0
-aperture_diameter = 0.01
-[gate]
-start_ns = 17.0
-bin_width_ps = 500.0
-bins = 8
-[[targets]]
-builtin = "plane"
-size = [4.0, 4.0]
-translation = [0.0, 0.0, 2.0]
-reflectance = 0.5
-[transport]
-axis_threshold = 1.0
-"""
-
+_PENCIL = {"profile": "collimated", "beam_radius": 0.0, "position": [0.0, 0.0, 0.0]}
+_PLATE = {
+    "medium": {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.924},
+    "laser": _PENCIL,
+    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01},
+    "gate": {"start_ns": 17.0, "bin_width_ps": 500.0, "bins": 8},
+    "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}],
+    "transport": {"axis_threshold": 1.0},
+}
 # Index-matched slab, normal incidence, g 0.75, albedo 0.9, optical depth 2 (van de Hulst, Multiple Light Scattering,
 # 1980).
-_SLAB = """
-[medium]
-extinction = 1.0
-albedo = 0.9
-anisotropy = 0.75
-[laser]
-profile = "collimated"
-beam_radius = 0.0
-[domain]
-shape = "slab"
-lower = [0.0, 0.0, 0.0]
-upper = [0.0, 0.0, 2.0]
-[camera]
-width = 1
-height = 1
-horizontal_fov_deg = 1.0
-aperture_diameter = 0.01
-[gate]
-start_ns = 0.0
-bin_width_ps = 1e6
-bins = 1
-[transport]
-axis_threshold = 1.0
-termination = "roulette"
-weight_cutoff = 0.05
-"""
+_SLAB = {
+    "medium": {"extinction": 1.0, "albedo": 0.9, "anisotropy": 0.75},
+    "laser": _PENCIL,
+    "domain": {"shape": "slab", "lower": [0.0, 0.0, 0.0], "upper": [0.0, 0.0, 2.0]},
+    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01},
+    "gate": {"start_ns": 0.0, "bin_width_ps": 1e6, "bins": 1},
+    "transport": {"axis_threshold": 1.0, "termination": "roulette", "weight_cutoff": 0.05},
+}
 _REFLECTED, _TRANSMITTED = 0.09739, 0.66096
 _ROUNDING = 5e-6  # of the published values
 
@@ -97,7 +60,7 @@ class SelfTest:
 
 def run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[SelfTest], dict[str, float]]:
     """The tests, and the seconds that it took to `compile` or load the kernels and to `run`."""
-    plate, slab = (Scene.from_dict(tomllib.loads(text)) for text in (_PLATE, _SLAB))
+    plate, slab = map(Scene.from_dict, (_PLATE, _SLAB))
     progress("loading kernels; the first time they are compiled")
     began = time.perf_counter()
     simulate(plate, photons=1, seed=1, device=device)

@@ -11,19 +11,6 @@ from spadwarp.viz.transient_video import video
 from spadwarp.viz.validation import draw_validation
 from spadwarp.viz.viewer import view
 
-__all__ = [
-    "describe_targets",
-    "draw_analytic",
-    "draw_budget",
-    "draw_dataset",
-    "draw_denoised",
-    "draw_depth",
-    "draw_learning_curves",
-    "draw_recording",
-    "draw_result",
-    "draw_sweep",
-    "draw_targets",
-    "draw_validation",
-    "video",
-    "view",
-]
+__all__ = ["describe_targets", "draw_analytic", "draw_budget", "draw_dataset", "draw_denoised", "draw_depth"]
+__all__ += ["draw_learning_curves", "draw_recording", "draw_result", "draw_sweep", "draw_targets", "draw_validation"]
+__all__ += ["video", "view"]

@@ -27,16 +27,8 @@ from spadwarp.viz.style import (
     new_figure,
 )
 
-__all__ = [
-    "Panels",
-    "arrival_line",
-    "coloured_depth",
-    "depth_bar",
-    "median_pixel",
-    "shown_limits",
-    "strips",
-    "target_limits",
-]
+__all__ = ["Panels", "arrival_line", "coloured_depth", "depth_bar", "median_pixel", "shown_limits", "strips"]
+__all__ += ["target_limits"]
 
 _WIDTH = 3.4  # of a panel [inch]
 

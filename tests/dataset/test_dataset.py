@@ -1,4 +1,4 @@
-"""Datasets: what is drawn, what is written, what a kill or a bad file does to it, and what the readers give back."""
+"""Datasets: what is drawn and written, what survives a kill or a bad file, and what the readers return."""
 
 import json
 import math
@@ -17,8 +17,18 @@ from scipy import stats
 
 import spadwarp
 from helpers.cli import DEVICE, ENVIRONMENT, ROOT, run, tables
-from helpers.datasets import BS, TABLES, checksums, recipe
-from spadwarp.dataset import FIELDS, SPLITS, Plan
+from helpers.datasets import FRACTIONS, TABLES, checksums, make, recipe, written
+from spadwarp.dataset import (
+    FIELDS,
+    SPLITS,
+    FrameReader,
+    Plan,
+    Recipe,
+    SpadDataset,
+    iterate_dataset,
+    load_recipe,
+    verify_dataset,
+)
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT
@@ -27,7 +37,7 @@ from spadwarp.units import SPEED_OF_LIGHT
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("dataset") / "data"
-    spadwarp.dataset.make_dataset(recipe(), place, device="cpu")
+    make(recipe(), place)
     return place
 
 
@@ -36,7 +46,7 @@ def test_splits_share_neither_targets_nor_seeds(folder):
     splits = manifest["splits"]
     assert splits["test"]["targets"] == ["staircase"] and splits["validation"]["targets"] == ["car"]
     assert splits["train"]["targets"] == ["amphora"]
-    assert len({one["seed"] for one in splits.values()}) == 3
+    assert len({split["seed"] for split in splits.values()}) == 3
     listed = [(folder / f"{name}.txt").read_text().split() for name in splits]
     assert sorted(name for names in listed for name in names) == sorted(
         path.name for path in folder.glob("frames-*.h5")
@@ -51,23 +61,23 @@ def test_splits_share_neither_targets_nor_seeds(folder):
 def test_every_dataset_of_a_file_has_the_same_first_dimension(folder):
     for path in [*folder.glob("frames-*.h5"), *folder.glob("scenes/*.h5"), folder / "scenes.h5"]:
         with h5py.File(path) as file:
-            assert len({one.shape[0] for one in file.values()}) == 1
-            assert all(one.attrs["unit"] and one.attrs["description"] for one in file.values())
+            assert len({stored.shape[0] for stored in file.values()}) == 1
+            assert all(stored.attrs["unit"] and stored.attrs["description"] for stored in file.values())
 
 
 def test_label_noisy_and_clean_depth_agree(folder):
     deviations = []
-    for item in spadwarp.dataset.iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
+    for item in iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
         noisy, clean, label, bound = (item[name][0] for name in ("noisy", "clean", "label", "bound"))
-        stray = label == 1
+        outlier = label == 1
         assert np.isin(label, (0, 1)).all()
-        # A stray pixel always reports something, in the water before what it looks at.
-        assert np.isfinite(noisy[stray]).all()
+        # An outlier always reports a depth, in the water in front of the target.
+        assert np.isfinite(noisy[outlier]).all()
         step = 1e-4
-        assert (noisy[stray & np.isfinite(clean)] <= clean[stray & np.isfinite(clean)] + step).all()
+        assert (noisy[outlier & np.isfinite(clean)] <= clean[outlier & np.isfinite(clean)] + step).all()
         # Others report the target with the noise of the bound, or nothing where there is none.
-        assert (np.isnan(noisy) == np.isnan(bound))[~stray].all()
-        seen = ~stray & np.isfinite(bound)
+        assert (np.isnan(noisy) == np.isnan(bound))[~outlier].all()
+        seen = ~outlier & np.isfinite(bound)
         deviations.append(((noisy - clean) / np.hypot(bound, step))[seen])
     z = np.concatenate(deviations)
     assert z.size > 5000
@@ -78,7 +88,7 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
     with h5py.File(folder / "scenes.h5") as file:
         profiles, edges = file["backscatter_profile"][...], file["profile_edges"][...]
     np.testing.assert_allclose((profiles * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
-    for item in spadwarp.dataset.iterate_dataset(folder, "train", fields=("noisy", "prior")):
+    for item in iterate_dataset(folder, "train", fields=("noisy", "prior")):
         noisy, prior = item["noisy"], item["prior"]
         assert (np.isnan(noisy) == np.isnan(prior)).all()
         bins = np.searchsorted(edges[item["scene"]], np.nan_to_num(noisy), side="right") - 1
@@ -91,19 +101,19 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
 
 def test_realised_fraction_is_the_requested_one(folder):
     values = []
-    for item in spadwarp.dataset.iterate_dataset(folder, "all", fields=("label",)):
+    for item in iterate_dataset(folder, "all", fields=("label",)):
         label = item["label"]
         values.append(stats.binomtest(int(label.sum()), label.size, float(item["backscatter_fraction"])).pvalue)
-        assert min(abs(item["backscatter_fraction"] - one) for one in BS) < 1e-6
+        assert min(abs(item["backscatter_fraction"] - fraction) for fraction in FRACTIONS) < 1e-6
     assert min(values) > 1e-3 / len(values)
 
 
 def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
     """Not its shard, not the number of scenes beside it, not the split of other targets changes a scene's frames."""
     other = {**TABLES, "scenes_per_shard": 2, "targets": {**TABLES["targets"], "validation": []}}
-    spadwarp.dataset.make_dataset(spadwarp.dataset.Recipe.from_dict(other), tmp_path / "other", device="cpu")
-    first = {item["sample"]: item for item in spadwarp.dataset.FrameReader(folder, "test")}
-    second = {item["sample"]: item for item in spadwarp.dataset.FrameReader(tmp_path / "other", "test")}
+    make(Recipe.from_dict(other), tmp_path / "other")
+    first = {item["sample"]: item for item in FrameReader(folder, "test")}
+    second = {item["sample"]: item for item in FrameReader(tmp_path / "other", "test")}
     assert first.keys() == second.keys()
     for sample, item in first.items():
         for name, value in item.items():
@@ -112,7 +122,7 @@ def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
 
 def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path):
     place, whole = tmp_path / "data", recipe(**{"frames.per_scene": 1})
-    spadwarp.dataset.make_dataset(whole, place, device="cpu")
+    make(whole, place)
     before = checksums(place)
     (place / "frames-00001.h5").unlink()
     damaged = bytearray((place / "frames-00002.h5").read_bytes())
@@ -120,22 +130,22 @@ def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path
     (place / "frames-00002.h5").write_bytes(damaged)
     (place / "shards/00003.json").write_text("{")
     (place / "scenes/scenes-00004.h5").write_bytes(b"")
-    wrong = "\n".join(spadwarp.dataset.verify_dataset(place))
+    wrong = "\n".join(verify_dataset(place))
     for name in ("frames-00001.h5: missing", "frames-00002.h5: damaged", "scenes-00004.h5: damaged"):
         assert name in wrong
-    report = spadwarp.dataset.make_dataset(whole, place, device="cpu")
+    report = make(whole, place)
     assert report.made == tuple(f"frames-0000{k}.h5" for k in (1, 2, 3, 4)) and len(report.kept) == 2
-    assert checksums(place) == before and not spadwarp.dataset.verify_dataset(place)
+    assert checksums(place) == before and not verify_dataset(place)
 
 
 def test_parts_make_one_dataset(tmp_path):
     whole = recipe(**{"frames.per_scene": 1})
-    spadwarp.dataset.make_dataset(whole, tmp_path / "one", device="cpu")
+    make(whole, tmp_path / "one")
     for part in (2, 1):
         if part == 1:
             with pytest.raises(spadwarp.FileError, match="not finished"):
-                spadwarp.dataset.FrameReader(tmp_path / "two")
-        report = spadwarp.dataset.make_dataset(whole, tmp_path / "two", device="cpu", shard=(part, 2))
+                FrameReader(tmp_path / "two")
+        report = make(whole, tmp_path / "two", shard=(part, 2))
         assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
     assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
 
@@ -143,12 +153,12 @@ def test_parts_make_one_dataset(tmp_path):
 def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     torch = pytest.importorskip("torch")
     images = [name for name in FIELDS if name not in ("counts", "expected")]
-    plain = spadwarp.dataset.FrameReader(folder, "train", fields=images)
-    tensors = spadwarp.dataset.SpadDataset(folder, "train", fields=images)
+    plain = FrameReader(folder, "train", fields=images)
+    tensors = SpadDataset(folder, "train", fields=images)
     assert len(plain) == len(tensors) == 6
     for name, value in plain[4].items():
         assert torch.equal(torch.nan_to_num(tensors[4][name]), torch.nan_to_num(torch.as_tensor(value)))
-    cut = spadwarp.dataset.SpadDataset(folder, "train", crop=12, augment=True, repeats=20)
+    cut = SpadDataset(folder, "train", crop=12, augment=True, repeats=20)
     assert len(cut) == 120
     item = cut[17]
     assert item["noisy"].shape == (1, 12, 12)
@@ -157,10 +167,9 @@ def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     assert not np.array_equal(cut[17]["noisy"], item["noisy"])
     frame = plain[17 % 6]["noisy"][0]
     windows = np.lib.stride_tricks.sliding_window_view(frame, (12, 12)).reshape(-1, 12, 12)
-    turned = [
-        np.rot90(one, k) for one in (item["noisy"][0].numpy(), item["noisy"][0].numpy()[:, ::-1]) for k in range(4)
-    ]
-    assert any(np.array_equal(np.nan_to_num(a), np.nan_to_num(b)) for a in windows for b in turned)
+    image = item["noisy"][0].numpy()
+    rotated = [np.rot90(mirrored, k) for mirrored in (image, image[:, ::-1]) for k in range(4)]
+    assert any(np.array_equal(a, b, equal_nan=True) for a in windows for b in rotated)
 
 
 MAKE = """
@@ -177,63 +186,63 @@ def start(recipe_path, out, **options):
 @pytest.mark.slow
 def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
     small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
-    (tmp_path / "recipe.toml").write_text(small.to_toml())
-    spadwarp.dataset.make_dataset(small, tmp_path / "whole", device="cpu")
+    path = written(small, tmp_path)
+    make(small, tmp_path / "whole")
     out, generator = tmp_path / "cut", np.random.default_rng(5)
     for shards in (2, 8):
-        process = start(tmp_path / "recipe.toml", out)
+        process = start(path, out)
         while len(list(out.glob("shards/*.json"))) < shards and process.poll() is None:
             time.sleep(0.01)
         time.sleep(generator.uniform(0.0, 0.3))
         process.send_signal(signal.SIGKILL)
         process.communicate()
         before = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
-    spadwarp.dataset.make_dataset(small, out, device="cpu")
+    make(small, out)
     assert checksums(out) == checksums(tmp_path / "whole")
     kept = {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
-    assert before and all(kept[name] == when for name, when in before.items())
+    assert before and all(kept[name] == changed for name, changed in before.items())
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_loses_nothing_else(tmp_path):
+def test_a_full_disk_is_reported_and_loses_nothing_else(tmp_path):
     """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
     small = recipe(**{"frames.per_scene": 1})
-    (tmp_path / "recipe.toml").write_text(small.to_toml())
+    path = written(small, tmp_path)
     out = tmp_path / "data"
-    spadwarp.dataset.make_dataset(small, out, device="cpu", shard=(1, 6))
+    make(small, out, shard=(1, 6))
     before = checksums(out)
 
     def limit():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
 
-    process = start(tmp_path / "recipe.toml", out, preexec_fn=limit)
+    process = start(path, out, preexec_fn=limit)
     last = process.communicate()[1].decode().splitlines()[-1]
     assert process.returncode == 1
     assert "FileError" in last and "cannot be written" in last and "-00001.h5" in last
     assert checksums(out) == before and not list(out.rglob(".*.tmp"))
 
 
-def test_folders_that_will_not_do_are_refused(folder, tmp_path):
+def test_unsuitable_folders_are_refused(folder, tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "used").mkdir()
     (tmp_path / "used/thesis.txt").write_text("")
     for place in (tmp_path / "file", tmp_path / "file/below", tmp_path / "used"):
         with pytest.raises(spadwarp.FileError, match=str(place)):
-            spadwarp.dataset.make_dataset(recipe(), place, device="cpu")
+            make(recipe(), place)
     with pytest.raises(spadwarp.ConfigError, match="another recipe"):
-        spadwarp.dataset.make_dataset(recipe(seed=12), folder, device="cpu")
+        make(recipe(seed=12), folder)
     with pytest.raises(spadwarp.FileError, match="no dataset there"):
-        spadwarp.dataset.FrameReader(tmp_path)
+        FrameReader(tmp_path)
     with pytest.raises(spadwarp.FileError, match="no dataset there"):
-        spadwarp.dataset.verify_dataset(tmp_path)
+        verify_dataset(tmp_path)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_told(tmp_path):
+def test_a_read_only_folder_is_reported(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(spadwarp.FileError, match="cannot be written"):
-        spadwarp.dataset.make_dataset(recipe(), tmp_path / "data", device="cpu")
+        make(recipe(), tmp_path / "data")
 
 
 def test_traced_scenes_hold_their_histograms(tmp_path):
@@ -241,47 +250,44 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
     changes |= {"scene.camera.width": 12, "scene.camera.height": 8, "scenes_per_target": 1}
     changes |= {"monte_carlo.share": 1.0, "monte_carlo.photons": 40_000}
     totals = {}
-    for how in ("sparse", "dense"):
-        spadwarp.dataset.make_dataset(recipe(**changes, **{"monte_carlo.counts": how}), tmp_path / how, device="cpu")
-        assert not spadwarp.dataset.verify_dataset(tmp_path / how)
+    for form in ("sparse", "dense"):
+        make(recipe(**changes, **{"monte_carlo.counts": form}), tmp_path / form)
+        assert not verify_dataset(tmp_path / form)
         fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
-        items = list(spadwarp.dataset.iterate_dataset(tmp_path / how, "test", fields=fields))
-        totals[how] = [item["counts"] for item in items]
+        items = list(iterate_dataset(tmp_path / form, "test", fields=fields))
+        totals[form] = [item["counts"] for item in items]
         for item in items:
             counts, expected = item["counts"], item["expected"]
             assert counts.shape == expected.shape == (64, 8, 12)
             assert math.isnan(item["backscatter_fraction"])
-            # Without pile-up to speak of, counts are Poisson about their expectation.
+            # Pile-up is negligible: counts are Poisson about their expectation.
             chi2 = float(((counts.sum(axis=0) - expected.sum(axis=0)) ** 2 / expected.sum(axis=0)).sum())
             assert 1e-3 < stats.chi2(96).sf(chi2) < 0.999
             np.testing.assert_array_equal(np.minimum(item["intensity"][0], 255), np.minimum(counts.sum(axis=0), 255))
-            found = np.isfinite(item["noisy"][0])
-            assert (found == (counts.sum(axis=0) > 0)).all()
-            # What reports no background and looks past the target saw light that went astray on its way back.
-            right = found & (item["label"][0] == 0) & np.isfinite(item["clean"][0])
+            reported = np.isfinite(item["noisy"][0])
+            assert (reported == (counts.sum(axis=0) > 0)).all()
+            right = reported & (item["label"][0] == 0) & np.isfinite(item["clean"][0])
             assert np.median(np.abs(item["noisy"] - item["clean"])[0][right]) < 0.05
     for sparse, dense in zip(totals["sparse"], totals["dense"], strict=True):
         np.testing.assert_array_equal(sparse, dense)
 
 
-def test_meshes_of_the_user_stand_with_their_centre_where_the_recipe_says(tmp_path):
+def test_the_centre_of_a_mesh_is_at_the_distance_of_the_recipe(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     (tmp_path / "meshes").mkdir()
     block = trimesh.creation.box(bounds=[(1.0, 2.0, 3.0), (1.2, 2.4, 3.1)])
     block.export(tmp_path / "meshes/block.stl")
     tables = {**TABLES, "targets": {"meshes": ["meshes"], "mesh_size": 2.0}, "scenes_per_target": 3}
-    (tmp_path / "recipe.toml").write_text(spadwarp.dataset.Recipe.from_dict(tables).to_toml())
-    plan = Plan(spadwarp.dataset.load_recipe(tmp_path / "recipe.toml"))
-    assert [one.name for one in plan.targets] == ["block"]
+    given = load_recipe(written(Recipe.from_dict(tables), tmp_path))
+    plan = Plan(given)
+    assert [target.name for target in plan.targets] == ["block"]
     for index in range(3):
         mesh = build_mesh(plan.scene(index).scene)
         np.testing.assert_allclose(mesh.bounds.mean(axis=0), [0.0, 0.0, 15.0], atol=1e-5)
-        turned = np.radians(plan.scene(index).scene.targets[0].rotation_deg[1])
+        angle = np.radians(plan.scene(index).scene.targets[0].rotation_deg[1])
         assert np.ptp(mesh.bounds[:, 1]) == pytest.approx(2.0, rel=1e-5)
-        assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(np.cos(turned) + 0.5 * abs(np.sin(turned)), rel=1e-5)
-    filled = Plan(
-        spadwarp.dataset.load_recipe(tmp_path / "recipe.toml").with_overrides({"pose.fill": 0.5, "pose.yaw_deg": 0.0})
-    )
+        assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(np.cos(angle) + 0.5 * abs(np.sin(angle)), rel=1e-5)
+    filled = Plan(given.with_overrides({"pose.fill": 0.5, "pose.yaw_deg": 0.0}))
     camera = filled.scene(0).scene.camera
     height = np.ptp(build_mesh(filled.scene(0).scene).bounds[:, 1])
     assert height == pytest.approx(0.5 * 15.0 * camera.pixel_tangent * camera.height, rel=1e-5)
@@ -294,20 +300,20 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
     write_exr(tmp_path / "exports/wall_RGBD.EXR", {**dict.fromkeys("RGB", np.zeros_like(depth)), "A": depth})
     write_exr(tmp_path / "exports/wall_Base_Col.EXR", dict.fromkeys("RGB", np.full_like(depth, 0.25)))
     tables = {**TABLES, "targets": {"exports": ["exports"]}}
-    (tmp_path / "recipe.toml").write_text(spadwarp.dataset.Recipe.from_dict(tables).to_toml())
-    spadwarp.dataset.make_dataset(tmp_path / "recipe.toml", tmp_path / "data", device="cpu")
-    for item in spadwarp.dataset.iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
-        clean, there = item["clean"][0], depth < 60000
-        assert (np.isfinite(clean) == there).all() and item["distance"] == 15.0
-        assert np.abs(clean[there] - 15.0).max() < 1e-4 and (item["albedo"][0][there] == 0.25).all()
-        right = there & (item["label"][0] == 0)
+    path = written(Recipe.from_dict(tables), tmp_path)
+    make(path, tmp_path / "data")
+    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
+        clean, valid = item["clean"][0], depth < 60000
+        assert (np.isfinite(clean) == valid).all() and item["distance"] == 15.0
+        assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["albedo"][0][valid] == 0.25).all()
+        right = valid & (item["label"][0] == 0)
         assert np.abs(item["noisy"][0][right] - 15.0).max() < 0.05
-    traced = spadwarp.dataset.load_recipe(tmp_path / "recipe.toml").with_overrides({"monte_carlo.share": 0.5})
+    traced = load_recipe(path).with_overrides({"monte_carlo.share": 0.5})
     with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.share"):
         Plan(traced)
 
 
-def test_recipes_that_cannot_be_are_told_field_by_field():
+def test_errors_of_recipes_name_each_field():
     wrong = {
         "pose": {"distance": -1.0, "yaw": 3.0},
         "water": {"attenuation_lengths": {"low": 2.0, "high": 1.0}},
@@ -315,23 +321,23 @@ def test_recipes_that_cannot_be_are_told_field_by_field():
         "exposure": {"pulses": 5.0, "signal_photons": 5.0},
     }
     with pytest.raises(spadwarp.ConfigError) as caught:
-        spadwarp.dataset.Recipe.from_dict({**TABLES, **wrong})
+        Recipe.from_dict({**TABLES, **wrong})
     text = str(caught.value)
     for words in ("pose.distance", "(0.0, inf)", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
         assert words in text
     with pytest.raises(spadwarp.ConfigError, match=r"scene: camera\.pixels"):
-        spadwarp.dataset.Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
+        Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
     for names in ({"test": ["boat"]}, {"test": ["car"], "validation": ["car"]}, {"builtin": ["boat"]}):
         with pytest.raises(spadwarp.ConfigError, match=r"targets\."):
-            Plan(spadwarp.dataset.Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
+            Plan(Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs/datasets").glob("*.toml")), ids=lambda path: path.stem)
-def test_recipes_that_come_with_spadwarp(path):
-    given = spadwarp.dataset.load_recipe(path)
+def test_recipes_in_configs(path):
+    given = load_recipe(path)
     plan = Plan(given)
-    assert spadwarp.dataset.Recipe.from_dict(tomllib.loads(given.to_toml())) == given
-    splits = {split: {one.name for one in plan.targets if one.split == split} for split in SPLITS}
+    assert Recipe.from_dict(tomllib.loads(given.to_toml())) == given
+    splits = {split: {target.name for target in plan.targets if target.split == split} for split in SPLITS}
     assert all(splits.values()) and "staircase" in splits["test"]
     if path.stem in ("lu2024", "montecarlo"):
         assert len(plan.targets) == 20 and plan.scene_count == 1000
@@ -344,21 +350,20 @@ def test_recipes_that_come_with_spadwarp(path):
 
 @pytest.mark.slow
 def test_commands(tmp_path):
-    (tmp_path / "recipe.toml").write_text(recipe().to_toml())
-    out = tmp_path / "data"
+    path, out = written(recipe(), tmp_path), tmp_path / "data"
 
     def dataset(*words, code=0):
         return run("dataset", *words, code=code).output
 
-    make = ["make", tmp_path / "recipe.toml", "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
-    told = dataset(*make, "--shard", "1/2")
-    assert "3 shards with 3 frames" in told and "3 shards, left to other machines" in told
+    make = ["make", path, "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
+    printed = dataset(*make, "--shard", "1/2")
+    assert "3 shards with 3 frames" in printed and "3 shards, left to other machines" in printed
     assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
-    assert "3 shards that were there" in dataset(*make, "--json", tmp_path / "told.json")
-    assert tables(tmp_path / "told.json")["frames"] == 3
+    assert "3 shards that were there" in dataset(*make, "--json", tmp_path / "report.json")
+    assert tables(tmp_path / "report.json")["frames"] == 3
     assert "whole" in dataset("verify", out)
-    told = dataset("info", out)
-    assert "staircase" in told and "36 x 24 pixels" in told
+    printed = dataset("info", out)
+    assert "staircase" in printed and "36 x 24 pixels" in printed
     dataset("preview", out, "--frames", "4", "--out", tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
     for wrong in (["--shard", "3/2"], ["--shard", "x"], ["--engine", "cloud"]):
@@ -388,7 +393,7 @@ def test_older_words_in_a_recipe_mean_and_draw_the_same():
         {**TABLES, "exposure": {name: pulses}, "vary": {path: [True, False], "analytic.form": [form, "radiometric"]}}
         for name, path, form in words
     )
-    older, now = (Plan(spadwarp.dataset.Recipe.from_dict(one)) for one in tables)
+    older, now = (Plan(Recipe.from_dict(table)) for table in tables)
     drawn = [older.scene(index).scene for index in range(older.scene_count)]
     assert drawn == [now.scene(index).scene for index in range(now.scene_count)]
     assert {scene.detector.wrap for scene in drawn} == {True, False}

@@ -1,9 +1,9 @@
 """A small dataset that the tests share."""
 
-import spadwarp
+from spadwarp.dataset import Recipe, make_dataset
 from spadwarp.dataset.shards import checksum
 
-BS = (0.042, 0.183, 0.480)
+FRACTIONS = (0.042, 0.183, 0.480)
 
 TABLES = {
     "name": "test",
@@ -15,7 +15,7 @@ TABLES = {
     "water": {"attenuation_lengths": {"low": 0.5, "high": 2.0}},
     "exposure": {"signal_photons": {"low": 20.0, "high": 200.0, "log": True}},
     "gate": {"before": 1.5, "behind": 1.0, "bins": 128},
-    "frames": {"per_scene": 3, "backscatter_fraction": list(BS)},
+    "frames": {"per_scene": 3, "backscatter_fraction": list(FRACTIONS)},
     "scene": {
         "medium": {"extinction": 0.1, "albedo": 0.5},
         "laser": {"preset": "lu2024", "half_angle_deg": 14.0, "repetition_rate": 5e6},
@@ -26,9 +26,20 @@ TABLES = {
 
 
 def recipe(**changes):
-    tested = spadwarp.dataset.Recipe.from_dict(TABLES)
-    return tested.with_overrides(changes) if changes else tested
+    return Recipe.from_dict(TABLES).with_overrides(changes)
 
 
-def checksums(place):
-    return {path.relative_to(place).as_posix(): checksum(path) for path in sorted(place.rglob("*.*")) if path.is_file()}
+def make(dataset, folder, **options):
+    return make_dataset(dataset, folder, device="cpu", **options)
+
+
+def written(dataset, folder):
+    """The path of a recipe's file in a folder."""
+    path = folder / "recipe.toml"
+    path.write_text(dataset.to_toml())
+    return path
+
+
+def checksums(folder):
+    paths = (path for path in sorted(folder.rglob("*.*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): checksum(path) for path in paths}

@@ -1,4 +1,4 @@
-"""The page of a run holds the run's numbers, alone, and shows them in a browser; the film shows when light arrives."""
+"""The page of a run holds the run's numbers, alone, and shows them in a browser; the video shows when light arrives."""
 
 import base64
 import json
@@ -125,7 +125,7 @@ def test_a_page_of_frames_holds_counts_to_the_last(frames):
         spadwarp.viz.view(frames, method="likelihood")
 
 
-def test_what_a_page_cannot_be_made_of(result, frames, tmp_path, monkeypatch):
+def test_unsuitable_sources_of_a_page_are_refused(result, frames, tmp_path, monkeypatch):
     with pytest.raises(FileError, match=r"holds no frames\.h5 and no result\.h5"):
         spadwarp.viz.view(tmp_path)
     save_result(result, tmp_path / "result.h5")
@@ -143,14 +143,14 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
     try:
         browser.command("Page.navigate", url=f"{page.as_uri()}#2,3")
         browser.wait("document.body?.dataset.ready === 'yes'")
-        assert browser.run("document.getElementById('told').textContent").startswith("row 2, column 3: ")
-        place = browser.run(
+        assert browser.run("document.getElementById('pixel').textContent").startswith("row 2, column 3: ")
+        position = browser.run(
             """(() => { const panel = document.getElementById("image-depth"); panel.scrollIntoView();
             const { left, top } = panel.getBoundingClientRect(), { xaxis, yaxis } = panel._fullLayout;
             return [left + xaxis._offset + xaxis.l2p(10), top + yaxis._offset + yaxis.l2p(7)]; })()"""
         )
-        browser.click(*place)
-        browser.wait("document.getElementById('told').textContent.startsWith('row 7, column 10: ')", seconds=20)
+        browser.click(*position)
+        browser.wait("document.getElementById('pixel').textContent.startsWith('row 7, column 10: ')", seconds=20)
         assert browser.run("location.hash") == "#7,10"
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
         for index, name in enumerate(COMPONENTS):
@@ -173,43 +173,43 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
         browser.close()
 
 
-# Film
+# Video
 
 
 @pytest.mark.slow
-def test_a_film_is_bright_when_the_target_answers(result, tmp_path):
+def test_a_video_is_bright_when_the_target_returns_light(result, tmp_path):
     path = spadwarp.viz.video(result, tmp_path / "light.gif", scale="linear", fps=10)
-    lit = np.flatnonzero(result.detections.any(axis=(0, 1)))
+    filled = np.flatnonzero(result.detections.any(axis=(0, 1)))
     brightness = []
     durations = 0
-    with Image.open(path) as film:
-        for index in range(film.n_frames):
-            film.seek(index)
-            durations += film.info["duration"]
-            pixels = np.asarray(film.convert("L"), float)
-            # Equal pictures in a row are one that stays longer.
-            brightness += [pixels[40:-150].mean()] * round(film.info["duration"] / 100)
-    assert durations == 100 * (lit[-1] - lit[0] + 1)
-    assert int(np.argmax(brightness)) == int(result.detections.sum(axis=(0, 1))[lit[0] :].argmax())
+    with Image.open(path) as images:
+        for index in range(images.n_frames):
+            images.seek(index)
+            durations += images.info["duration"]
+            pixels = np.asarray(images.convert("L"), float)
+            # Equal pictures in a row are stored once, with a longer duration.
+            brightness += [pixels[40:-150].mean()] * round(images.info["duration"] / 100)
+    assert durations == 100 * (filled[-1] - filled[0] + 1)
+    assert int(np.argmax(brightness)) == int(result.detections.sum(axis=(0, 1))[filled[0] :].argmax())
 
 
 def test_pictures_are_merged_and_windows_cut(result, frames, tmp_path):
     edges = 1e9 * result.bin_edges
     path = spadwarp.viz.video(frames, tmp_path / "some.gif", window_ns=(edges[10] + 0.01, edges[30] - 0.01), pictures=5)
-    with Image.open(path) as film:
-        assert film.n_frames == 5
-    for wrong, said in (
+    with Image.open(path) as images:
+        assert images.n_frames == 5
+    for wrong, message in (
         ({"window_ns": (1.0, 2.0)}, "has no part of the gate"),
         ({"pictures": 0}, "pictures = 0"),
         ({"fps": 0}, "fps = 0"),
         ({"frame": 5}, r"frame = 5 is outside"),
         ({"path": tmp_path / "x.avi"}, "ends neither in .gif nor in .mp4"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             spadwarp.viz.video(frames, **{"path": tmp_path / "x.gif", **wrong})
 
 
-def test_an_mp4_is_one_or_says_what_is_missing(result, tmp_path, monkeypatch):
+def test_an_mp4_is_written_or_the_error_names_what_is_missing(result, tmp_path, monkeypatch):
     try:
         path = spadwarp.viz.video(result, tmp_path / "light.mp4", pictures=8)
         assert path.read_bytes()[4:8] == b"ftyp"
@@ -222,10 +222,10 @@ def test_an_mp4_is_one_or_says_what_is_missing(result, tmp_path, monkeypatch):
     assert not (tmp_path / "none.mp4").exists()
 
 
-def test_commands_write_page_and_film(result, tmp_path):
+def test_commands_write_page_and_video(result, tmp_path):
     save_result(result, tmp_path / "result.h5")
     for command, name in ((["view", "--device", "cpu"], "page.html"), (["video", "--pictures", "3"], "light.gif")):
         out = tmp_path / name
-        told = run(command[0], tmp_path, "--out", out, *command[1:])
-        assert told.stdout.startswith(f"written: {out} (") and out.is_file()
+        outcome = run(command[0], tmp_path, "--out", out, *command[1:])
+        assert outcome.stdout.startswith(f"written: {out} (") and out.is_file()
     assert "two numbers" in run("video", tmp_path, "--window", "a", code=2).output
