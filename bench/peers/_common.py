@@ -1,4 +1,4 @@
-"""What the peers' scripts share: options, runs of theirs and ours in turn, and how a ratio is told."""
+"""Shared by the scripts of the peers: options, alternating runs of both simulators, and the ratio of their rates."""
 
 import argparse
 import ctypes
@@ -14,23 +14,23 @@ from statistics import median
 from types import ModuleType, SimpleNamespace
 
 
-def options(about: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None) -> argparse.Namespace:
-    """What every script takes, and integers of its own: name -> (default, help)."""
-    parser = argparse.ArgumentParser(description=about)
+def options(summary: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None) -> argparse.Namespace:
+    """The options of every script, and its own integers: name -> (default, help)."""
+    parser = argparse.ArgumentParser(description=summary)
     parser.add_argument("--device", help='both: "cpu", "cuda:0", ...; by default the first GPU, else the CPU')
-    parser.add_argument("--photons", type=lambda text: int(float(text)), default=photons, help="of one run, each")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of each in turn, whose median counts")
+    parser.add_argument("--photons", type=lambda text: int(float(text)), default=photons, help="of one run of each")
+    parser.add_argument("--repeats", type=int, default=5, help="alternating runs of each; the median counts")
     for name, (default, text) in (more or {}).items():
         parser.add_argument(f"--{name}", type=int, default=default, help=text)
     return parser.parse_args()
 
 
 def peer(name: str, hint: str) -> ModuleType:
-    """The installed package, or the end of the script: a peer that is not there is no failure."""
+    """The installed package; the script ends without an error where it is missing."""
     try:
         if sys.platform == "linux":
-            # The wheels of MCX and MMC carry a C++ library of their own; loaded first, its symbols would take the place
-            # of those that PoCL needs, which then forgets options of its compiler.
+            # The wheels of MCX and MMC contain their own C++ library; loaded first, its symbols would replace those
+            # that PoCL needs, which then loses options of its compiler.
             ctypes.CDLL("libstdc++.so.6", mode=ctypes.RTLD_GLOBAL)
         return importlib.import_module(name)
     except (ImportError, OSError) as error:
@@ -43,26 +43,26 @@ def skip(reason: str) -> None:
 
 
 @contextmanager
-def told() -> Iterator[SimpleNamespace]:
-    """What C code prints to standard output meanwhile, as `text` afterwards."""
-    got = SimpleNamespace(text="")
+def captured_output() -> Iterator[SimpleNamespace]:
+    """Captures what C code prints to standard output; afterwards it is `text`."""
+    output = SimpleNamespace(text="")
     sys.stdout.flush()
     kept = os.dup(1)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 1)
         try:
-            yield got
+            yield output
         finally:
             sys.stdout.flush()
             ctypes.CDLL(None).fflush(None)
             os.dup2(kept, 1)
             os.close(kept)
             file.seek(0)
-            got.text = file.read().decode(errors="replace")
+            output.text = file.read().decode(errors="replace")
 
 
 def processor() -> str:
-    """What the CPU calls itself, where the system tells."""
+    """Name of the CPU, where the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -73,7 +73,7 @@ def processor() -> str:
 def compare(
     case: str, theirs: Callable[[], float | None], *, name: str, unit: str, work: int, args: argparse.Namespace
 ) -> float:
-    """Runs theirs and ours in turn, on this machine, and prints both rates and their ratio.
+    """Runs both simulators alternately on this machine and prints their rates and the ratio.
 
     Args:
         case: Of `spadwarp bench`.

@@ -1,4 +1,4 @@
-"""cube60 for MCX, MCX-CL and MMC, which print what was absorbed; lengths in mm."""
+"""cube60 for MCX, MCX-CL and MMC, which print the absorbed fraction; lengths in mm."""
 
 import argparse
 import math
@@ -8,11 +8,11 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from _common import compare, skip, told
+from _common import captured_output, compare, skip
 
 
 def settings(photons: int) -> dict[str, Any]:
-    """The cube of 60 mm without reflections; no map of the fluence and no detectors: what our case tallies."""
+    """The cube of 60 mm without reflections; without a fluence map and detectors, like our case."""
     return {
         "nphoton": photons,
         "vol": np.ones((60, 60, 60), np.uint8),
@@ -34,7 +34,7 @@ def settings(photons: int) -> dict[str, Any]:
 def opencl_device(package: ModuleType, name: str, cpu: bool) -> int:
     """1-based number of the first OpenCL device that is, or is not, a CPU; leaves where there is none."""
     try:
-        with told():
+        with captured_output():
             found: Sequence[dict[str, Any]] = package.gpuinfo()
     except RuntimeError as error:
         skip(f"{name} finds no OpenCL device ({error})")
@@ -61,16 +61,16 @@ def measure(package: ModuleType, name: str, args: argparse.Namespace, settings: 
     def run() -> float | None:
         """Seconds by MCX's own clock, which leaves out its setup as ours does; MMC, whose setup is short, returns
         none."""
-        with told() as said:
-            got = package.run(settings)
-        if got.get("stat"):
-            fractions.append(got["stat"]["energyabs"] / got["stat"]["energytot"])
-            return 1e-3 * float(got["stat"]["runtime"])
-        if "flux" in got:  # fluence rate [1/(mm^2 s)] in voxels of 1 mm; times absorption [1/mm] and time [s]
-            fractions.append(float(got["flux"].sum()) * settings["prop"][1][0] * settings["tend"])
+        with captured_output() as output:
+            result = package.run(settings)
+        if result.get("stat"):
+            fractions.append(result["stat"]["energyabs"] / result["stat"]["energytot"])
+            return 1e-3 * float(result["stat"]["runtime"])
+        if "flux" in result:  # fluence rate [1/(mm^2 s)] in voxels of 1 mm; times absorption [1/mm] and time [s]
+            fractions.append(float(result["flux"].sum()) * settings["prop"][1][0] * settings["tend"])
             return None
-        fractions.append(number("absorbed", said.text) / 100.0)
-        return 1e-3 * args.photons / number("simulation speed", said.text)
+        fractions.append(number("absorbed", output.text) / 100.0)
+        return 1e-3 * args.photons / number("simulation speed", output.text)
 
     try:
         run()

@@ -171,8 +171,8 @@ if __name__ == "__main__":
     known = error < 0.05 * ratio
     print(f"means        theirs/ours over {known.sum()} time bins known to 5 %: ")
     scale = np.average(ratio[known], weights=error[known] ** -2.0)
-    told = [f"{r / scale:.3f}±{e / scale:.3f}" for r, e in zip(ratio[known], error[known], strict=True)]
-    print("             " + " ".join(told))
+    ratios = [f"{r / scale:.3f}±{e / scale:.3f}" for r, e in zip(ratio[known], error[known], strict=True)]
+    print("             " + " ".join(ratios))
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = (their_variance / their_mean**2 * their_seconds) / (our_variance / our_mean**2 * our_seconds)
         sums = [

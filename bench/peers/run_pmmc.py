@@ -48,6 +48,6 @@ if __name__ == "__main__":
     args = options("cube60 on MMC and on spadwarp", photons=10**6)
     number = opencl_device(pmmc, "pmmc", args.device == "cpu")
     measure(pmmc, "pmmc", args, {**settings(args.photons), "gpuid": number})
-    # MMC's own report comes when the process ends; what counts of it is told above.
+    # MMC prints its own report when the process ends; the numbers above are complete without it.
     sys.stdout.flush()
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

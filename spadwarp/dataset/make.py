@@ -37,7 +37,7 @@ class DatasetReport:
     Attributes:
         folder: The dataset.
         made: Names of the shards that were made.
-        kept: Those that were already whole.
+        kept: Those that were already complete.
         missing: Those that are missing because they were not asked for.
         broken: What was wrong with those that were made again.
         frames: Number of frames that were made.
@@ -75,7 +75,7 @@ def make_dataset(
 
     Raises:
         ConfigError: A recipe that cannot be used, or the folder holds the dataset of another recipe.
-        FileError: The folder cannot be written or is full; whole shards stay.
+        FileError: The folder cannot be written or is full; complete shards are kept.
         KeyboardInterrupt: Ctrl-C, once the shards that were begun are finished.
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))

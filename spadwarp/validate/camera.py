@@ -155,8 +155,9 @@ def _mean_path(run: Run) -> list[Quantity]:
     # exp(−0.49 path), which left an error of 1.5e-4 of the mean path after 15 m.
     early, late = 30.0, 50.0
     for body, target in bodies.items():
-        targets = [{**target, "reflectance": 1.0}]
-        expected = _four_volumes_per_area(targets[0])
+        targets: list[dict[str, Any]] = [{**target, "reflectance": 1.0}]
+        mesh = load_target(Target(**targets[0]))
+        expected = 4.0 * abs(mesh.volume) / mesh.area
         for water, medium in waters.items():
             means = ScoreMeans()
             until = [
@@ -171,15 +172,6 @@ def _mean_path(run: Run) -> list[Quantity]:
             estimate = Estimate(path, path / walls * events.standard_error)
             measured.append(Quantity(f"mean path [m], {body}, {water}", estimate, expected))
     return measured
-
-
-def _four_volumes_per_area(target: dict[str, Any]) -> float:
-    """4V/S [m] of a closed convex target about the origin."""
-    mesh = load_target(Target(**target))
-    corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    volume = abs(np.einsum("fi,fi->", corners[:, 0], cross)) / 6.0
-    return 4.0 * volume / (np.linalg.norm(cross, axis=1).sum() / 2.0)
 
 
 def _rotation_onto_z(direction: NDArray) -> NDArray:

@@ -146,8 +146,8 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
             found(replace(staircase, case=name, size={"photons": photons}, rates={"photons": rate}, memory=1 << 30))
 
     monkeypatch.setattr(spadwarp.benchmark, "run", grows)
-    told = run("bench", "scaling").stdout
-    assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in told
+    printed = run("bench", "scaling").stdout
+    assert "photons_10000000 -> photons_100000000: 0.909 times the time of a photon, 1 times the memory" in printed
 
 
 def test_unknown_case_is_named():
@@ -163,7 +163,7 @@ def test_numbers_out_of_range_are_named(option):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("{}", "not a file that `spadwarp bench --json` wrote"),
         ("not json", "not JSON"),
@@ -171,10 +171,10 @@ def test_numbers_out_of_range_are_named(option):
         ('{"format": "spadwarp bench", "format_version": 1, "results": [{}]}', "a result lacks one of"),
     ],
 )
-def test_files_that_are_no_report_are_refused(tmp_path, text, said):
+def test_unsuitable_files_are_refused(tmp_path, text, message):
     path = tmp_path / "other.json"
     path.write_text(text)
-    with pytest.raises(FileError, match=rf"other\.json: .*{said}"):
+    with pytest.raises(FileError, match=rf"other\.json: .*{message}"):
         load_report(path)
     with pytest.raises(FileError, match=r"no\.json: cannot be read"):
         load_report(tmp_path / "no.json")
@@ -207,7 +207,7 @@ def test_cases_are_listed():
 
 
 @pytest.mark.parametrize("script", ["run_pmcx", "run_pmcxcl", "run_pmmc", "run_mitransient"])
-def test_a_peer_that_is_missing_is_said_and_is_no_failure(script, tmp_path):
+def test_a_missing_peer_is_reported_and_is_no_failure(script, tmp_path):
     for module in ("pmcx", "pmcxcl", "pmmc", "mitsuba"):
         (tmp_path / f"{module}.py").write_text("raise ImportError('not here')")
     command, paths = [sys.executable, PEERS / f"{script}.py"], {"PYTHONPATH": str(tmp_path)}

@@ -359,9 +359,9 @@ def test_commands(tmp_path):
     printed = dataset(*make, "--shard", "1/2")
     assert "3 shards with 3 frames" in printed and "3 shards, left to other machines" in printed
     assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
-    assert "3 shards that were there" in dataset(*make, "--json", tmp_path / "report.json")
+    assert "3 shards that were complete" in dataset(*make, "--json", tmp_path / "report.json")
     assert tables(tmp_path / "report.json")["frames"] == 3
-    assert "whole" in dataset("verify", out)
+    assert "complete" in dataset("verify", out)
     printed = dataset("info", out)
     assert "staircase" in printed and "36 x 24 pixels" in printed
     dataset("preview", out, "--frames", "4", "--out", tmp_path / "sheet.png")

@@ -200,9 +200,9 @@ def test_wrong_physics_fails(monkeypatch):
 
 
 def test_one_seed_gives_one_result():
-    one, again, other = (run(["moments"], photons=1000, seed=seed, device="cpu") for seed in (6, 6, 7))
-    assert one == again
-    assert all(a.value != b.value for a, b in zip(one, other, strict=True))
+    first, again, other = (run(["moments"], photons=1000, seed=seed, device="cpu") for seed in (6, 6, 7))
+    assert first == again
+    assert all(a.value != b.value for a, b in zip(first, other, strict=True))
 
 
 @pytest.mark.physics

@@ -86,7 +86,7 @@ def test_pictures_for_print_are_vectors_and_the_same_again(tmp_path: Path) -> No
     result = make_result(make_scene())
     first, second = (draw_result(result, tmp_path / run, method="peak", formats=["pdf"]) for run in ("a", "b"))
     assert [path.name for path in first] == [name.replace("png", "pdf") for name in NAMES]
-    for one, other in zip(first, second, strict=True):
-        content = one.read_bytes()
+    for path, other in zip(first, second, strict=True):
+        content = path.read_bytes()
         assert content.startswith(b"%PDF")
         assert content == other.read_bytes()
