@@ -1,5 +1,7 @@
 """Pictures of budgets and sweeps."""
 
+import pytest
+
 import spadwarp
 from helpers.scenes import scene
 from spadwarp.viz import draw_budget, draw_sweep
@@ -12,6 +14,7 @@ SCENE = scene(
 )
 
 
+@pytest.mark.slow
 def test_pictures_are_written_whole(tmp_path):
     rows = spadwarp.budget(SCENE, ranges=[1, 3, 9], media=["uwoc-clear", "uwoc-harbour"])
     figure = draw_budget(rows, tmp_path / "budget.png")
