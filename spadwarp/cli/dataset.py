@@ -23,8 +23,11 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset's folder.
 def make(
     recipe_path: Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe (TOML).", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The dataset's folder.", show_default=False)],
-    shard: Annotated[
-        str, typer.Option(metavar="K/N", help="Only every N-th shard, starting with the K-th; for several machines.")
+    part: Annotated[
+        str,
+        typer.Option(
+            metavar="K/N", help="Only part K of N of the dataset: every N-th shard from the K-th; for several machines."
+        ),
     ] = "1/1",
     overrides: Annotated[
         list[str] | None,
@@ -49,7 +52,7 @@ def make(
     Examples:
       spadwarp dataset make configs/datasets/small.toml --out data/small/
       spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all
-      spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --shard 3/64
+      spadwarp dataset make configs/datasets/lu2024.toml --out data/lu2024/ --part 3/64
     """
     recipe = spadwarp.dataset.load_recipe(recipe_path)
     if overrides:
@@ -57,7 +60,7 @@ def make(
     engine = opt.read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
         found = spadwarp.dataset.make_dataset(
-            recipe, out, device=device, processes=processes, engine=engine, shard=_part(shard), progress=report
+            recipe, out, device=device, processes=processes, engine=engine, part=_part(part), progress=report
         )
     summary = {
         "folder": found.folder,
@@ -82,7 +85,7 @@ def make(
 def _part(text: str) -> tuple[int, int]:
     part, slash, parts = text.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
-        raise typer.BadParameter(f"{text!r} is not of the form K/N with 1 <= K <= N", param_hint="--shard")
+        raise typer.BadParameter(f"{text!r} is not of the form K/N with 1 <= K <= N", param_hint="--part")
     return int(part), int(parts)
 
 

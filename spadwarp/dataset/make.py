@@ -58,7 +58,7 @@ def make_dataset(
     device: str | None = None,
     processes: int = 1,
     engine: Ray | None = None,
-    shard: tuple[int, int] = (1, 1),
+    part: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
 ) -> DatasetReport:
     """Makes what is missing or broken of a dataset.
@@ -70,7 +70,7 @@ def make_dataset(
         processes: At most so many for each GPU, ≥ 1, since part of the work is done by CPU cores. With more than one
             process or device Python starts again for each: a script needs `if __name__ == "__main__":`.
         engine: `spadwarp.parallel.Ray` to use its workers, which must see the folder; None for this host.
-        shard: (k, n): every n-th shard from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
+        part: (k, n): every n-th shard from the k-th on, 1 ≤ k ≤ n; for several machines with one file system.
         progress: Called with ("frames", frames made, frames to make), and with (message, 0, 0).
 
     Raises:
@@ -79,14 +79,14 @@ def make_dataset(
         KeyboardInterrupt: Ctrl-C, once the shards that were begun are finished.
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
-    part, parts = shard
+    number, parts = part
     if processes < 1:
         raise ConfigError(f"processes = {processes} is outside [1, inf)")
-    if not 1 <= part <= parts:
-        raise ConfigError(f"shard = {part}/{parts}: {part} is outside [1, {parts}]")
+    if not 1 <= number <= parts:
+        raise ConfigError(f"part = {number}/{parts}: {number} is outside [1, {parts}]")
     folder = Path(out).absolute()
     _claim(plan, folder)
-    shards = [item for item in plan.shards if item.index % parts == part - 1]
+    shards = [item for item in plan.shards if item.index % parts == number - 1]
     state = check_shards(plan, folder, shards)
     missing = [item for item in shards if state[item.index]]
     total = sum(item.scenes for item in missing) * plan.frames_per_scene

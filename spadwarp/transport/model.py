@@ -210,7 +210,7 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
         return laser
     laser.profile = sk.LASER_PROFILES.index(beam.profile)
     if beam.profile == "gaussian":
-        laser.spread = math.tan(beam.half_angle) ** 2
+        laser.tan2 = math.tan(beam.half_angle) ** 2
     else:
         laser.spread = 2.0 * math.sin(0.5 * beam.half_angle) ** 2
     laser.radius = beam.beam_radius

@@ -145,7 +145,7 @@ def test_parts_make_one_dataset(tmp_path):
         if part == 1:
             with pytest.raises(spadwarp.FileError, match="not finished"):
                 FrameReader(tmp_path / "two")
-        report = make(whole, tmp_path / "two", shard=(part, 2))
+        report = make(whole, tmp_path / "two", part=(part, 2))
         assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
     assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
 
@@ -209,7 +209,7 @@ def test_a_full_disk_is_reported_and_loses_nothing_else(tmp_path):
     small = recipe(**{"frames.per_scene": 1})
     path = written(small, tmp_path)
     out = tmp_path / "data"
-    make(small, out, shard=(1, 6))
+    make(small, out, part=(1, 6))
     before = checksums(out)
 
     def limit():
@@ -356,7 +356,7 @@ def test_commands(tmp_path):
         return run("dataset", *words, code=code).output
 
     make = ["make", path, "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
-    printed = dataset(*make, "--shard", "1/2")
+    printed = dataset(*make, "--part", "1/2")
     assert "3 shards with 3 frames" in printed and "3 shards, left to other machines" in printed
     assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
     assert "3 shards that were complete" in dataset(*make, "--json", tmp_path / "report.json")
@@ -366,7 +366,7 @@ def test_commands(tmp_path):
     assert "staircase" in printed and "36 x 24 pixels" in printed
     dataset("preview", out, "--frames", "4", "--out", tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
-    for wrong in (["--shard", "3/2"], ["--shard", "x"], ["--engine", "cloud"]):
+    for wrong in (["--part", "3/2"], ["--part", "x"], ["--engine", "cloud"]):
         dataset(*make, *wrong, code=2)
 
 

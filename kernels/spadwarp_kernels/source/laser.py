@@ -18,7 +18,8 @@ class Laser:
         position: Centre of the exit pupil [m].
         axis: Unit vector of the beam.
         profile: Index into LASER_PROFILES.
-        spread: 1 - cos of the half angle in [0, 2] (uniform cone), or tan^2 of the 1/e^2 half angle (gaussian).
+        spread: 1 - cos of the half angle, in [0, 2] (uniform cone).
+        tan2: tan^2 of the half angle at which the irradiance is 1/e^2 of that on the axis (gaussian).
         radius: Beam radius at the exit [m] (collimated; 0 is a pencil beam).
         rows, columns: Distribution functions of a measured profile, see `profile_tables`; this and what follows is
             read by `emit_measured` alone.
@@ -29,6 +30,7 @@ class Laser:
     axis: wp.vec3
     profile: int
     spread: float
+    tan2: float
     radius: float
     rows: wp.array(dtype=float)
     columns: wp.array2d(dtype=float)
@@ -59,7 +61,7 @@ def emit_along(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
         direction = rotate_direction(axis, laser.spread * xi, azimuth)
     elif laser.profile == 1:
         # tan^2 is exponential; 1 - cos from tan^2 without cancellation: tan^2/((1 + s) s), s = sqrt(1 + tan^2).
-        tan2 = -0.5 * laser.spread * wp.log(1.0 - u01(block[0]))
+        tan2 = -0.5 * laser.tan2 * wp.log(1.0 - u01(block[0]))
         s = wp.sqrt(1.0 + tan2)
         direction = rotate_direction(axis, tan2 / ((1.0 + s) * s), azimuth)
     else:

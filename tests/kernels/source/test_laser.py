@@ -21,10 +21,12 @@ def _emit(laser: Laser, x: Vectors, u: Vectors):
     u[i] = direction
 
 
-def _photons(profile, device, spread=0.0, radius=0.0):
+def _photons(profile, device, **sizes):
     laser = Laser()
     laser.position, laser.axis = wp.vec3(1.0, 2.0, 3.0), wp.vec3(*AXIS)
-    laser.profile, laser.spread, laser.radius = LASER_PROFILES.index(profile), spread, radius
+    laser.profile = LASER_PROFILES.index(profile)
+    for name, value in sizes.items():
+        setattr(laser, name, value)
     x, u = launched(_emit, [laser], (wp.vec3, wp.vec3), device, sample_count(device))
     return x - [1, 2, 3], u
 
@@ -44,7 +46,7 @@ def test_uniform_cone_is_uniform_in_solid_angle(half_angle, device):
 @pytest.mark.physics
 def test_gaussian_has_its_irradiance_profile_on_a_plane(device):
     tangent = math.tan(math.radians(5.0))
-    _, u = _photons("gaussian", device, spread=tangent**2)
+    _, u = _photons("gaussian", device, tan2=tangent**2)
     cosine = u @ AXIS
     radius2 = np.maximum(1 - cosine**2, 0.0) / cosine**2
     # Irradiance exp(-2 r^2/w^2): the power within r is 1 - exp(-2 r^2/w^2).
