@@ -169,7 +169,7 @@ def check_writable(directory: Path) -> None:
 
 
 def write_json(summary: dict[str, Any], path: Path | None) -> None:
-    """The machine-readable twin of what a command tells; numbers that are not finite become null."""
+    """The machine-readable twin of what a command prints; numbers that are not finite become null."""
     if path is not None:
         spadwarp.io.write_json(summary, path)
 

@@ -45,23 +45,23 @@ class _Pace:
 def _lines(unit: str) -> Report:
     """A line at every tenth, but not more often than every second; in a long run soon, then ever more seldom."""
     pace = _Pace()
-    told, told_done, patience = time.monotonic(), 0, 2.0
+    reported_at, reported_done, patience = time.monotonic(), 0, 2.0
 
     def report(stage: str, done: int, total: int) -> None:
-        nonlocal told, told_done, patience
+        nonlocal reported_at, reported_done, patience
         if not total:
             complain(_COMPILING if stage == "compile" else stage)
             return
         rate, seconds = pace(done)
-        waited = time.monotonic() - told
-        due = (done - told_done >= 0.1 * total and waited >= 1.0) or waited >= patience
-        if done > told_done and (due or done == total):
+        waited = time.monotonic() - reported_at
+        due = (done - reported_done >= 0.1 * total and waited >= 1.0) or waited >= patience
+        if done > reported_done and (due or done == total):
             line = f"{100 * done / total:3.0f} %  {opt.count(done)} of {opt.count(total)} {unit}"
             if rate:
                 line += f", {rate:.3g} {unit}/s"
                 line += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
             complain(line)
-            told, told_done, patience = time.monotonic(), done, min(2.0 * patience, 60.0)
+            reported_at, reported_done, patience = time.monotonic(), done, min(2.0 * patience, 60.0)
 
     return report
 

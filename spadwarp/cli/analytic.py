@@ -123,7 +123,7 @@ def analytic(
     written.append(draw_analytic(result, out / "analytic.png"))
     summary = {"frames": frames, "seed": seed, **_summary(result)}
     if not quiet:
-        say(opt.rows({**_told(summary), "written": ", ".join(path.name for path in written) + f" in {out}"}))
+        say(opt.rows({**_lines(summary), "written": ", ".join(path.name for path in written) + f" in {out}"}))
     opt.write_json({**summary, "files": written}, json_path)
 
 
@@ -157,7 +157,7 @@ def _summary(result: AnalyticResult) -> dict[str, Any]:
     }
 
 
-def _told(summary: dict[str, Any]) -> dict[str, str]:
+def _lines(summary: dict[str, Any]) -> dict[str, str]:
     return {
         "pixels": f"{opt.count(summary['pixels'])}, {opt.count(summary['pixels_with_target'])} see a target, "
         f"{opt.count(summary['pixels_with_estimate'])} have an estimate; medians of these:",

@@ -93,7 +93,7 @@ def denoise(
         except (OSError, ValueError, EOFError) as error:
             raise FileError(f"{profile}: not a .npy file that can be read: {error}") from error
     opt.prepare_directory(out, overwrite=overwrite, needed=sum(one.stat().st_size for one in paths if one.is_file()))
-    told, summary, failed = {}, [], 0
+    lines, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
         try:
             done = denoise_file(
@@ -121,7 +121,7 @@ def denoise(
             continue
         there = float(np.isfinite(done.depth).mean())
         frames = "1 frame" if len(done.depth) == 1 else f"{opt.count(len(done.depth))} frames"
-        told[one.name] = f"{frames}, {100 * there:.3g} % of the pixels have a depth"
+        lines[one.name] = f"{frames}, {100 * there:.3g} % of the pixels have a depth"
         summary.append({"file": one, "gate": done.gate, "filled": there, "files": done.files, "notes": done.notes})
         if not quiet:
             for note in done.notes:
@@ -129,7 +129,7 @@ def denoise(
             if len(paths) > 1:
                 complain(f"{number} of {len(paths)}")
     if not quiet:
-        say(opt.rows({**told, "written": f"{3 * len(summary)} files in {out}"}))
+        say(opt.rows({**lines, "written": f"{3 * len(summary)} files in {out}"}))
     opt.write_json({"model": model, "files": summary}, json_path)
     if failed:
         raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")

@@ -90,7 +90,7 @@ def detect(
     written = [recording.path, draw_recording(recording, result, out / "frame.png")]
     summary = _summary(recording, frames)
     if not quiet:
-        lines = _told(recording, summary)
+        lines = _lines(recording, summary)
         lines["written"] = ", ".join(path.name for path in written) + f" in {out}"
         say(opt.rows(lines))
     opt.write_json({**summary, "files": written}, json_path)
@@ -122,7 +122,7 @@ def _summary(recording: Recording, frames: int) -> dict[str, Any]:
     }
 
 
-def _told(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
+def _lines(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
     median = summary["bound"]["median_m"]
     lines = {
         "frames": f"{opt.count(summary['frames'])} of {opt.count(summary['pulses'])} pulses, seed {summary['seed']}",

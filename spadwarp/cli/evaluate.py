@@ -96,7 +96,7 @@ def evaluate(
             json_path=json_path,
         )
         return
-    with progress(quiet=quiet, unit="frames") as told:
+    with progress(quiet=quiet, unit="frames") as shown:
         found = run(
             data,
             models=chosen,
@@ -106,7 +106,7 @@ def evaluate(
             crop=crop,
             weights=weights,
             device=device,
-            progress=told,
+            progress=shown,
         )
     written = write_report(found, report) if report is not None else []
     if not quiet:
@@ -155,14 +155,14 @@ def _sweep(
     from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
 
     result = opt.load_run(data)
-    with progress(quiet=quiet, unit="frames") as told:
+    with progress(quiet=quiet, unit="frames") as shown:
         found = photon_sweep(
             result,
             models=[one for one in models if one != "bm3d"],
             weights=weights,
             seed=seed,
             device=device,
-            progress=told,
+            progress=shown,
         )
     written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
     if not quiet:

@@ -28,11 +28,11 @@ def info(
     result = opt.load_run(path)
     summary = result.summary()
     outside = {name: result.counters[name] * result.unit / result.photons for name in ("before_gate", "after_gate")}
-    say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _told(summary, outside).items()))
+    say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _lines(summary, outside).items()))
     opt.write_json(summary, json_path)
 
 
-def _told(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str, dict[str, str]]:
+def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str, dict[str, str]]:
     """A result's summary by headings."""
     image, gate, medium, made = summary["image"], summary["gate"], summary["medium"], summary["provenance"]
     depth, ledger, timing = summary["truth"]["depth_m"], summary["ledger"], summary["timing"]

@@ -56,8 +56,8 @@ def train(
         raise ConfigError(f"--out: {out} is a file; a directory is needed")
     opt.check_writable(out)
     first = int(os.environ.get("RANK", "0")) == 0
-    with progress(quiet=quiet or not first, unit="steps") as told:
-        trained = run(chosen, out, device=device, progress=told)
+    with progress(quiet=quiet or not first, unit="steps") as shown:
+        trained = run(chosen, out, device=device, progress=shown)
     if first:
         if not quiet:
             say(

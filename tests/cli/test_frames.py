@@ -12,7 +12,7 @@ from spadwarp.io.exr import read_exr
 def test_frames_are_those_of_detect(done, tmp_path):
     out = tmp_path / "out"
     options = ("--pulses", "2e3", "--frames", 3, "--seed", 5, "--tags", *DEVICE)
-    told = run("detect", done, "--out", out, *options, "--json", tmp_path / "told.json")
+    printed = run("detect", done, "--out", out, *options, "--json", tmp_path / "printed.json")
     result = spadwarp.load_result(done / "result.h5")
     twin = spadwarp.detect(result, pulses=2000, frames=3, seed=5, tags=True, device="cpu")
     with h5py.File(out / "frames.h5") as file:
@@ -27,9 +27,9 @@ def test_frames_are_those_of_detect(done, tmp_path):
     error = np.abs(depth.astype(float) - result.truth.depth)
     # No estimator beats its bound; this one comes near it: 20 pixels, bins of 15 mm, light that was scattered forward.
     assert 0.3 * np.median(bound) < np.median(error) < 10 * np.median(bound)
-    plain = tables(tmp_path / "told.json")
+    plain = tables(tmp_path / "printed.json")
     assert plain["depth"]["likelihood"]["median"] == pytest.approx(np.median(error), rel=1e-3)
-    assert "Cramér–Rao" in told.stdout and told.stdout.count("% of the target's pixels") == 4
+    assert "Cramér–Rao" in printed.stdout and printed.stdout.count("% of the target's pixels") == 4
 
 
 def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, monkeypatch):
@@ -95,9 +95,9 @@ def test_depth_of_measured_histograms(tmp_path):
         assert np.abs(distance - 3.0).max() < (5 if method == "likelihood" else 40) * bound, method
         assert "Z" not in read_exr(out / "range.exr")[0]
 
-    seen = ("--horizontal-fov-deg", 60, "--ply", tmp_path / "points.ply", "--json", tmp_path / "told.json")
+    seen = ("--horizontal-fov-deg", 60, "--ply", tmp_path / "points.ply", "--json", tmp_path / "printed.json")
     run("depth", tmp_path / "counts.npy", "--out", tmp_path / "seen", *axis, *seen, *DEVICE)
-    assert tables(tmp_path / "told.json")["quantity"] == "depth"
+    assert tables(tmp_path / "printed.json")["quantity"] == "depth"
     depth = np.load(tmp_path / "seen" / "depth.npy")
     assert depth[1, 1] == pytest.approx(3.0 / np.sqrt(1 + 0.1443**2), rel=2e-3)  # half a pixel off the axis
 

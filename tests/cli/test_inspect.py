@@ -15,10 +15,10 @@ from spadwarp.cli import app
 @pytest.mark.slow
 def test_validation_says_what_failed(tmp_path, monkeypatch):
     report = tmp_path / "report.json"
-    told = run("validate", "ledger", "--photons", "2e3", "--json", report, "--plots", tmp_path / "plots", *DEVICE)
+    printed = run("validate", "ledger", "--photons", "2e3", "--json", report, "--plots", tmp_path / "plots", *DEVICE)
     found = tables(report)
     assert found["passed"] and found["photons"] == 2000
-    assert f"{len(found['results'])} of {len(found['results'])} agree" in told.stdout
+    assert f"{len(found['results'])} of {len(found['results'])} agree" in printed.stdout
     assert (tmp_path / "plots" / "ledger.png").is_file()
 
     wrong = [spadwarp.validate.CaseResult("ledger", "its sum", 1.0, 2.0, 0.1, -10.0, 1e-20, False)]
@@ -32,10 +32,10 @@ def test_validation_says_what_failed(tmp_path, monkeypatch):
 
 def test_targets_are_listed_and_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr("spadwarp.viz.targets.builtin_names", lambda: ("plane", "staircase"))
-    told = run("targets", "--out", tmp_path / "out", "--json", tmp_path / "told.json", *DEVICE)
-    assert "staircase" in told.stdout and "4.00 x 4.00 x 0.70 m" in told.stdout
+    printed = run("targets", "--out", tmp_path / "out", "--json", tmp_path / "printed.json", *DEVICE)
+    assert "staircase" in printed.stdout and "4.00 x 4.00 x 0.70 m" in printed.stdout
     assert (tmp_path / "out" / "targets.png").read_bytes().startswith(b"\x89PNG")
-    assert tables(tmp_path / "told.json")["targets"][0] == {"name": "plane", "faces": 2, "extent": [1.0, 1.0, 0.0]}
+    assert tables(tmp_path / "printed.json")["targets"][0] == {"name": "plane", "faces": 2, "extent": [1.0, 1.0, 0.0]}
     assert "not empty" in run("targets", "--out", tmp_path / "out", code=2).stderr
 
 
@@ -54,8 +54,8 @@ def test_check_accepts_every_scene_that_comes_along():
     for path in sorted((ROOT / "configs" / "scenes").glob("*.toml")):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            told = run("check", path).stdout
-        lengths = told.partition("attenuation length")[2].partition("\n")[0].split("; ")
+            printed = run("check", path).stdout
+        lengths = printed.partition("attenuation length")[2].partition("\n")[0].split("; ")
         assert len(lengths) == len(spadwarp.load_scene(path).medium.waters) and all("albedo" in one for one in lengths)
 
 
@@ -63,23 +63,23 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     result = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu")
     result.save(tmp_path / "result.h5")
     summary = tmp_path / "summary.json"
-    told = run("info", tmp_path / "result.h5", "--json", summary).stdout
-    assert run("info", tmp_path).stdout == told  # the directory stands for the result in it
-    assert "20 000, seed 3" in told and "Energy balance, exact" in told and "100.000000 %" in told
+    printed = run("info", tmp_path / "result.h5", "--json", summary).stdout
+    assert run("info", tmp_path).stdout == printed  # the directory stands for the result in it
+    assert "20 000, seed 3" in printed and "Energy balance, exact" in printed and "100.000000 %" in printed
     assert tables(summary) == json.loads(json.dumps(result.summary()))
 
 
 def test_presets_water_and_devices_are_those_of_python(tmp_path):
     summary = tmp_path / "summary.json"
-    told = run("presets", "medium", "--json", summary).stdout
+    printed = run("presets", "medium", "--json", summary).stdout
     names = [preset["name"] for preset in tables(summary)["presets"]]
     assert names == list(spadwarp.scene.presets("medium"))
-    assert all(name in told for name in names) and "picoquant" not in told
+    assert all(name in printed for name in names) and "picoquant" not in printed
     assert "picoquant-visuv-532" in run("presets").stdout
 
-    told = run("water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", summary).stdout
+    printed = run("water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", summary).stdout
     optics = spadwarp.water.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
-    assert f"{optics.extinction:.4g} 1/m" in told and f"{optics.group_index:.5f}" in told
+    assert f"{optics.extinction:.4g} 1/m" in printed and f"{optics.group_index:.5f}" in printed
     assert tables(summary)["absorption"] == optics.absorption
 
     assert "cpu" in run("devices", "--json", summary).stdout
@@ -91,8 +91,8 @@ def test_every_help_shows_an_example():
     assert "Example" in run("--help").stdout
     for command in app.registered_commands:
         name = command.name or command.callback.__name__
-        told = run(name, "--help").stdout
-        assert f"spadwarp {name}" in told.split("Example", 1)[1], name
+        printed = run(name, "--help").stdout
+        assert f"spadwarp {name}" in printed.split("Example", 1)[1], name
 
 
 def test_version():
@@ -101,18 +101,18 @@ def test_version():
 
 def test_importing_the_command_line_loads_nothing_heavy():
     code = "import sys, spadwarp.cli; print(*sys.modules)"
-    told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    printed = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     heavy = {"warp", "h5py", "matplotlib", "trimesh", "torch", "OpenEXR", "pydantic", "numpy", "scipy", "manifold3d"}
-    assert heavy.isdisjoint(told.stdout.split())
+    assert heavy.isdisjoint(printed.stdout.split())
 
 
 def test_a_process_keeps_stdout_for_the_answer(scene):
     """Also on a machine without a GPU, of which Warp's native code would complain."""
     process = start("devices")
-    told, complaints = process.communicate(timeout=120)
+    printed, complaints = process.communicate(timeout=120)
     assert process.returncode == 0
-    assert "Warp" not in told + complaints
-    assert told.startswith("cpu")
+    assert "Warp" not in printed + complaints
+    assert printed.startswith("cpu")
 
 
 def test_exit_code_of_a_process_that_was_used_wrongly(scene):

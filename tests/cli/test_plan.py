@@ -11,7 +11,7 @@ from spadwarp.result.file import save_truth_maps
 
 def test_analytic_frames_are_those_of_python(spad_scene, tmp_path):
     options = ("--frames", 7, "--seed", 3, "--set", "analytic.backscatter_fraction=0.2", *DEVICE)
-    told = run("analytic", spad_scene, "--out", tmp_path, *options, "--json", tmp_path / "told.json")
+    printed = run("analytic", spad_scene, "--out", tmp_path, *options, "--json", tmp_path / "printed.json")
     twin = spadwarp.simulate_analytic(
         spadwarp.load_scene(spad_scene, {"analytic.backscatter_fraction": 0.2}), frames=7, seed=3, device="cpu"
     )
@@ -19,8 +19,8 @@ def test_analytic_frames_are_those_of_python(spad_scene, tmp_path):
         assert np.array_equal(file["depth"], twin.depth, equal_nan=True)
         assert np.array_equal(file["labels"], twin.labels)
         assert np.array_equal(file["maps/sigma_depth"], twin.sigma_depth, equal_nan=True)
-    assert tables(tmp_path / "told.json")["sigma_depth"] == np.median(twin.sigma_depth)
-    assert "20 % of their pixels report background" in told.stdout and (tmp_path / "analytic.png").is_file()
+    assert tables(tmp_path / "printed.json")["sigma_depth"] == np.median(twin.sigma_depth)
+    assert "20 % of their pixels report background" in printed.stdout and (tmp_path / "analytic.png").is_file()
 
 
 @pytest.mark.slow
@@ -46,12 +46,14 @@ def test_analytic_takes_truth_and_profile_from_files(spad_scene, done, tmp_path)
 
 
 def test_budget_is_that_of_python(spad_scene, tmp_path):
-    summary = tmp_path / "told.json"
+    summary = tmp_path / "printed.json"
     waters = ("--medium", "uwoc-clear", "--medium", "uwoc-harbour")
-    told = run("budget", spad_scene, "--range", "1:3:3", *waters, "--out", tmp_path / "out", "--json", summary, *DEVICE)
+    printed = run(
+        "budget", spad_scene, "--range", "1:3:3", *waters, "--out", tmp_path / "out", "--json", summary, *DEVICE
+    )
     twin = spadwarp.budget(spadwarp.load_scene(spad_scene), [1, 2, 3], ["uwoc-clear", "uwoc-harbour"], device="cpu")
     assert [row["signal"] for row in tables(summary)["rows"]] == [row.signal for row in twin]
-    assert "uwoc-harbour" in told.stdout and "range [m]" in told.stdout and "σ* [mm]" in told.stdout
+    assert "uwoc-harbour" in printed.stdout and "range [m]" in printed.stdout and "σ* [mm]" in printed.stdout
     csv = (tmp_path / "out" / "budget.csv").read_text().splitlines()
     assert len(csv) == 7 and csv[0].startswith("medium,extinction,range")
     assert (tmp_path / "out" / "budget.png").is_file()
@@ -61,7 +63,7 @@ def test_budget_is_that_of_python(spad_scene, tmp_path):
 
 @pytest.mark.parametrize("of", ["budget", "depth-error"])
 def test_sweep_is_that_of_python(spad_scene, tmp_path, of):
-    summary, vary = tmp_path / "told.json", "medium.extinction=0.1:2:3"
+    summary, vary = tmp_path / "printed.json", "medium.extinction=0.1:2:3"
     run("sweep", spad_scene, "--vary", vary, "--of", of, "--out", tmp_path / "out", "--json", summary, *DEVICE)
     twin = spadwarp.sweep(spadwarp.load_scene(spad_scene), vary=vary, of=of, device="cpu")
     found = tables(summary)

@@ -21,12 +21,12 @@ def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):
     assert first.photons < 200_000 and not first.partial
 
     total = 2 * first.photons
-    told = run("simulate", "--resume", out, "--photons", total, *DEVICE)
+    printed = run("simulate", "--resume", out, "--photons", total, *DEVICE)
     result = spadwarp.load_result(out / "result.h5")
     long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=total, device="cpu")
     assert np.array_equal(result.tallies, long.tallies) and result.ledger == long.ledger
     assert result.photons == total == spadwarp.load_scene(out / "scene.toml").transport.photons
-    assert f"{100 * result.relative_error:.3g} % in the bins that decide the depth" in told.stdout
+    assert f"{100 * result.relative_error:.3g} % in the bins that decide the depth" in printed.stdout
 
 
 def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
@@ -36,12 +36,12 @@ def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
     for out, photons, begin in ((one, first, 0), (two, second, first)):
         options = ("--photons", photons, "--first-photon", begin, "--quiet", *DEVICE)
         run("simulate", spad_scene, "--out", out, *options)
-    told = run("merge", one, two / "result.h5", "--out", both, "--json", tmp_path / "both.json", *DEVICE)
+    printed = run("merge", one, two / "result.h5", "--out", both, "--json", tmp_path / "both.json", *DEVICE)
     merged = spadwarp.load_result(both / "result.h5")
     long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=first + second, device="cpu")
     assert np.array_equal(merged.tallies, long.tallies) and merged.ledger == long.ledger
     assert tables(tmp_path / "both.json")["photon_ranges"] == [[0, first + second]]
-    assert "energy balance is exact" in told.stdout and (both / "depth.exr").is_file()
+    assert "energy balance is exact" in printed.stdout and (both / "depth.exr").is_file()
     assert "photon ids 0 to" in run("merge", one, one, "--out", tmp_path / "twice", code=2).stderr
 
 
@@ -115,11 +115,11 @@ def test_shards_are_merged(scene, tmp_path):
     parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
     for number, out in enumerate(parts, 1):
         run("simulate", scene, "--out", out, *DEVICE, "--shard", f"{number}/3", "--uncertainty", "--quiet")
-    told = run("merge", *parts, "--out", tmp_path / "all", *DEVICE)
+    printed = run("merge", *parts, "--out", tmp_path / "all", *DEVICE)
     merged = spadwarp.load_result(tmp_path / "all" / "result.h5")
     whole = spadwarp.simulate(spadwarp.load_scene(scene), device="cpu", uncertainty=True)
     assert np.array_equal(merged.tallies, whole.tallies) and np.array_equal(merged.second_moment, whole.second_moment)
-    assert f"photon ids  0 to {whole.photons - 1:,}".replace(",", " ") in told.stdout
+    assert f"photon ids  0 to {whole.photons - 1:,}".replace(",", " ") in printed.stdout
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from spadwarp.transport.records import load_records
 def test_simulate_writes_what_python_computes(scene, tmp_path):
     out, summary = tmp_path / "out", tmp_path / "json" / "summary.json"
     options = ("--set", "medium.extinction=0.5", "--set", "output.png=true", "--json", summary)
-    told = run("simulate", scene, "--out", out, *DEVICE, *options)
+    printed = run("simulate", scene, "--out", out, *DEVICE, *options)
 
     twin = spadwarp.simulate(spadwarp.load_scene(scene, ["medium.extinction=0.5", "output.png=true"]), device="cpu")
     result = spadwarp.load_result(out / "result.h5")
@@ -29,8 +29,8 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     plain = tables(summary)
     assert plain["collected_fraction"] == twin.summary()["collected_fraction"]
     assert {Path(name).name for name in plain["files"]} == FILES | PICTURES
-    assert "energy balance is exact" in told.stdout
-    assert "20 000 of 20 000 photons" in told.stderr
+    assert "energy balance is exact" in printed.stdout
+    assert "20 000 of 20 000 photons" in printed.stderr
 
 
 def test_options_lie_over_the_scene(scene, tmp_path):

@@ -70,7 +70,7 @@ def test_depth_camera(depth_camera):
     assert 1e-4 < np.nanmedian(error[:, near]) < np.nanmedian(error[:, far])
     spread = np.std(frames[:, near], axis=0)
     mean = frames[:, near].mean(axis=0) - true[near]
-    clean = (error[:, near] < 0.5).all(axis=0)  # pixels without a stray photon
+    clean = (error[:, near] < 0.5).all(axis=0)  # pixels without a photon of the background
     assert clean.sum() > 20
     assert np.mean((mean[clean] / spread[clean] * np.sqrt(60)) ** 2) == pytest.approx(1.0, abs=0.7)
 

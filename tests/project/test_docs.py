@@ -124,16 +124,16 @@ def commands(text):
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_commands_in_the_text_name_what_there_is(page):
     """Commands, options, configurations and scripts; the tutorial runs most of them."""
-    told = {}
+    printed = {}
     for words in commands(page.read_text(encoding="utf-8")):
         if words[:1] == ["python"] and words[1].startswith("kernels/examples/"):
             known = (ROOT / words[1]).read_text()
         elif "spadwarp" in words[:1] or words[-2:-1] == ["spadwarp"]:
             words = words[words.index("spadwarp") + 1 :]
             command = tuple(words[: 2 if words[0] == "dataset" else 1])
-            if command not in told:
-                told[command] = CliRunner().invoke(app, [*command, "--help"]).stdout
-            known = told[command] + "--help"
+            if command not in printed:
+                printed[command] = CliRunner().invoke(app, [*command, "--help"]).stdout
+            known = printed[command] + "--help"
         else:
             continue
         assert known, words

@@ -17,13 +17,13 @@ def python_blocks(readme):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("readme", "roots", "told"),
+    ("readme", "roots", "printed"),
     [
         ("README.md", (".", "kernels"), "depth"),
         ("kernels/README.md", ("kernels",), "reach the plate without a collision"),
     ],
 )
-def test_python_blocks_run(readme, roots, told, tmp_path):
+def test_python_blocks_run(readme, roots, printed, tmp_path):
     """One after the other, as one program, from the checkout; the kernels' without `spadwarp` in reach."""
     blocks = python_blocks(readme)
     assert blocks
@@ -35,7 +35,7 @@ def test_python_blocks_run(readme, roots, told, tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / root) for root in roots)}
     process = subprocess.run([sys.executable, program], cwd=folder, env=environment, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
-    assert told in process.stdout
+    assert printed in process.stdout
 
 
 PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
@@ -55,7 +55,7 @@ def test_shell_commands_name_what_there_is(page):
         words = [command]
         if "COMMAND [ARGS]" in CliRunner().invoke(app, [command, "--help"]).stdout:  # a group of commands
             words.append(arguments.split()[0])
-        told = CliRunner().invoke(app, [*words, "--help"])
-        assert told.exit_code == 0, words
+        printed = CliRunner().invoke(app, [*words, "--help"])
+        assert printed.exit_code == 0, words
         for option in re.findall(r"--[a-z-]+", arguments):
-            assert option in told.stdout, f"{words} {option}"
+            assert option in printed.stdout, f"{words} {option}"

@@ -187,19 +187,19 @@ def test_what_cannot_be_written_is_named(frames, detection, result, tmp_path):
 
 
 def test_command(frames, tmp_path):
-    def told(source, out, *options, code=0):
+    def printed(source, out, *options, code=0):
         return run("export", source, "--format", "npy", "--out", tmp_path / out, *options, code=code).output
 
-    assert "frames-00000.mat to frames-00001.mat (2 files)" in told(frames.parent, "a", "--format", "mat")
+    assert "frames-00000.mat to frames-00001.mat (2 files)" in printed(frames.parent, "a", "--format", "mat")
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy"]
-    told(frames, "b", "--frames", "1:2", "--quiet")
+    printed(frames, "b", "--frames", "1:2", "--quiet")
     assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
-    assert "holds no frames.h5 and no result.h5" in told(tmp_path, "c", code=1)
-    assert "outside" in told(frames, "d", "--frames", 9, code=2)
-    assert "none of them in 5:" in told(frames, "d", "--frames", "5:", code=2)
+    assert "holds no frames.h5 and no result.h5" in printed(tmp_path, "c", code=1)
+    assert "outside" in printed(frames, "d", "--frames", 9, code=2)
+    assert "none of them in 5:" in printed(frames, "d", "--frames", "5:", code=2)
     make_result(make_scene()).save(tmp_path / "result.h5")
-    assert "draw frames first" in told(tmp_path / "result.h5", "e", "--format", "mat", code=2)
+    assert "draw frames first" in printed(tmp_path / "result.h5", "e", "--format", "mat", code=2)
     assert not list((tmp_path / "e").iterdir())  # the array neither
 
 

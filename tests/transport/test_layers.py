@@ -195,10 +195,10 @@ def test_optical_depth_along_and_across_layers():
 
 def test_checks_and_the_analytic_simulator_know_of_layers():
     one = scene(medium=LAYERED, camera={"aperture_diameter": 0.02})
-    told = summary(one)
-    assert told["optical_depth"] == pytest.approx(DEPTH * told["target_range"][0] / 2.2)
-    assert [(layer["start"], layer["albedo"]) for layer in told["layers"]] == [(1.2, 0.6), (1.7, pytest.approx(0.9))]
-    assert [layer["attenuation_length"] for layer in told["layers"]] == pytest.approx([1 / 1.5, 1 / 0.2])
+    printed = summary(one)
+    assert printed["optical_depth"] == pytest.approx(DEPTH * printed["target_range"][0] / 2.2)
+    assert [(layer["start"], layer["albedo"]) for layer in printed["layers"]] == [(1.2, 0.6), (1.7, pytest.approx(0.9))]
+    assert [layer["attenuation_length"] for layer in printed["layers"]] == pytest.approx([1 / 1.5, 1 / 0.2])
     with pytest.raises(spadwarp.ConfigError, match=r"medium\.layers: 2 given; the analytic simulator takes one water"):
         spadwarp.simulate_analytic(one, device="cpu")
     harbour = {"layers": [{"start": 1.0, "preset": "uwoc-harbour"}]}

@@ -134,9 +134,9 @@ def test_beam_and_line_of_sight_cross_at_the_distance_of_the_scan():
 
 def test_the_check_knows_that_a_pixel_gets_the_photons_of_its_position_alone():
     few = {"laser": CONFOCAL["laser"], "transport": {"estimator": "analog", "photons": 100}}
-    told = [
+    printed = [
         next(message for message in spadwarp.check(one) if message.field == "transport.estimator")
         for one in (scene(**few), scene(**few, scan={"mode": "confocal"}))
     ]
-    flash, scan = (message.values["photons_per_pixel"] for message in told)
+    flash, scan = (message.values["photons_per_pixel"] for message in printed)
     assert scan == pytest.approx(flash / 16, rel=0.05)

@@ -232,9 +232,9 @@ def test_estimators_agree_in_water_that_scatters_by_itself():
 
 def test_what_layers_leave_out_is_told():
     layers = {"chlorophyll": 0.05, "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "chlorophyll": 0.5}]}
-    told = [message for message in spadwarp.check(scene(layers)) if message.field.endswith("chlorophyll")]
-    assert [message.field for message in told] == ["medium.chlorophyll", "medium.layers[1].chlorophyll"]
-    assert told[0].values["missing"] == pytest.approx(0.7655, abs=0.002)
-    assert told[1].values["missing"] == pytest.approx(0.363, abs=0.002)
+    printed = [message for message in spadwarp.check(scene(layers)) if message.field.endswith("chlorophyll")]
+    assert [message.field for message in printed] == ["medium.chlorophyll", "medium.layers[1].chlorophyll"]
+    assert printed[0].values["missing"] == pytest.approx(0.7655, abs=0.002)
+    assert printed[1].values["missing"] == pytest.approx(0.363, abs=0.002)
     assert scene(layers).medium.molecular_share == 0.0
     assert not [m for m in spadwarp.check(scene({"chlorophyll": 0.05})) if m.field.endswith("chlorophyll")]

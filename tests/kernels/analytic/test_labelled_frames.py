@@ -39,17 +39,17 @@ def draw(device, *, depth=14.0, sigma=0.01, alpha=1e-4, pulses=20_000, probabili
 def test_noise_is_normal_and_background_has_the_share_asked_for(device):
     fractions = np.array([0.0, 0.042, 0.264, 0.48, 1.0] * 3)
     offset, step = 13.5, 2e-5  # fine beside the noise
-    codes, _, stray = draw(device, fraction=fractions, depth_offset=offset, depth_step=step)
-    for share, labels in zip(fractions, stray, strict=True):
+    codes, _, outliers = draw(device, fraction=fractions, depth_offset=offset, depth_step=step)
+    for share, labels in zip(fractions, outliers, strict=True):
         assert stats.binomtest(int(labels.sum()), labels.size, share).pvalue > 1e-3 / len(fractions)
-    depth = offset + step * codes[~stray].astype(float)
+    depth = offset + step * codes[~outliers].astype(float)
     assert stats.kstest((depth - 14.0) / 0.01, "norm").pvalue > 1e-3
 
 
 @pytest.mark.parametrize("flat", [0.0, 0.3, 1.0])
 def test_background_photons_follow_the_distribution_over_path(device, flat):
-    codes, _, stray = draw(device, fraction=np.full(20, 0.5), flat=flat)
-    depth = OFFSET + STEP * codes[stray].astype(float)
+    codes, _, outliers = draw(device, fraction=np.full(20, 0.5), flat=flat)
+    depth = OFFSET + STEP * codes[outliers].astype(float)
 
     def law(z):
         return (1.0 - flat) * np.interp(2.0 * z, PATHS, CUMULATIVE) + flat * np.clip((2.0 * z - 20.0) / 14.0, 0.0, 1.0)
@@ -71,8 +71,8 @@ def test_counts_are_binomial(device, mean):
 
 
 def test_what_has_no_estimate_reports_nothing_unless_it_is_stray(device):
-    codes, _, stray = draw(device, depth=np.nan, sigma=np.nan, fraction=np.full(4, 0.3))
-    assert ((codes == 0) == ~stray).all()
+    codes, _, outliers = draw(device, depth=np.nan, sigma=np.nan, fraction=np.full(4, 0.3))
+    assert ((codes == 0) == ~outliers).all()
 
 
 def test_estimates_stay_within_the_gate(device):
