@@ -13,6 +13,7 @@ from typing import Any
 
 from spadwarp.errors import ConfigError
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
+from spadwarp.scene.phase_fields import PHASE_FIELDS
 from spadwarp.scene.preset import PRESETS
 from spadwarp.scene.renamed import current_fields
 
@@ -31,7 +32,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "chlorophyll": (*COEFFICIENTS, "preset"),
         "temperature": ("phase_index", "group_index"),
         "salinity": ("phase_index", "group_index"),
-        "phase_function": ("g1", "g2", "alpha", "phase_table"),
+        "phase_function": tuple(name for fields in PHASE_FIELDS.values() for name in fields.needed),
     },
     "camera": {
         "horizontal_fov_deg": ("pixel_pitch_um", *_INTRINSICS),

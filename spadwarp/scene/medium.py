@@ -13,18 +13,11 @@ from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model
 from spadwarp.scene.coefficients import COEFFICIENTS
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.layers import Layer, Water
+from spadwarp.scene.phase_fields import PHASE_FIELDS
 from spadwarp.scene.preset import PHASE_TABLES, PRESETS, WATER_INDICES
 from spadwarp.scene.sections import Vector, listed
 from spadwarp.units import pulse_speed
 from spadwarp.water import water_optics
-
-# Fields that each phase function takes. Those that are None by default it needs, and no other takes.
-_PHASE_FIELDS = {
-    "henyey_greenstein": ("anisotropy",),
-    "two_term_henyey_greenstein": ("g1", "g2", "alpha"),
-    "fournier_forand": ("particle_index", "junge_slope"),
-    "tabulated": ("phase_table",),
-}
 
 
 class Medium(Water):
@@ -84,12 +77,11 @@ class Medium(Water):
 
     @model_validator(mode="after")
     def _fields_of_the_phase_function(self) -> Self:
-        for law, names in _PHASE_FIELDS.items():
-            own = [name for name in names if type(self).model_fields[name].default is None]
-            missing = [name for name in own if getattr(self, name) is None]
+        for law, (needed, _) in PHASE_FIELDS.items():
+            missing = [name for name in needed if getattr(self, name) is None]
             if law == self.phase_function and missing:
                 raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
-            if law != self.phase_function and (given := [name for name in own if name not in missing]):
+            if law != self.phase_function and (given := [name for name in needed if name not in missing]):
                 value = getattr(self, given[0])
                 raise ValueError(f"{given[0]} = {value!r} goes with phase_function = {law!r} only")
         return self
@@ -146,7 +138,8 @@ class Medium(Water):
     @property
     def phase_parameters(self) -> dict[str, float | str]:
         """The fields that `phase_function` takes."""
-        return {name: getattr(self, name) for name in _PHASE_FIELDS[self.phase_function]}
+        needed, optional = PHASE_FIELDS[self.phase_function]
+        return {name: getattr(self, name) for name in (*needed, *optional)}
 
     @property
     def molecular_share(self) -> float:
