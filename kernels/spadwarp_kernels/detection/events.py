@@ -8,13 +8,12 @@ import warp as wp
 
 from spadwarp_kernels.math.float64 import log1p
 from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import uniforms
+from spadwarp_kernels.random.binomial import PURPOSE_EVENTS, uniforms
 
 from .first_photon import zeroed_counts
 
 wp.set_module_options({"enable_backward": False})
 
-_EVENTS = wp.constant(wp.uint32(1))
 _ONE = wp.constant(wp.uint32(1))
 
 EVENT_LIMIT = 2**27
@@ -151,7 +150,7 @@ def _event_kernel(
     passed = wp.float64(0.0)  # hazard of the window up to now
     trapped = wp.float64(0.0)  # mean number of afterpulses still to come
     while now.pulse < pulses:
-        draw = uniforms(seed, id, _EVENTS, block)
+        draw = uniforms(seed, id, PURPOSE_EVENTS, block)
         block = block + _ONE
         found = _next_primary(cumulative, edges, local, pulses, now.pulse, passed, draw[0])
         found = _next_afterpulse(found, now, pulses, period, time_constant, trapped, draw[1])

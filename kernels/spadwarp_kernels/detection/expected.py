@@ -12,11 +12,10 @@ import warp as wp
 
 from spadwarp_kernels.math.float64 import expm1, log1p
 from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import uniforms
+from spadwarp_kernels.random.binomial import PURPOSE_DARK_COUNTS, uniforms
 
 wp.set_module_options({"enable_backward": False})
 
-_PATTERN = wp.constant(wp.uint32(2))
 _ONE = wp.constant(wp.uint32(1))
 
 
@@ -60,8 +59,8 @@ def _dark_count_kernel(
 ):
     pixel = first_pixel + wp.tid()
     id = wp.uint64(pixel)
-    u = uniforms(seed, id, _PATTERN, wp.uint32(0))
-    chance = uniforms(seed, id, _PATTERN, _ONE)
+    u = uniforms(seed, id, PURPOSE_DARK_COUNTS, wp.uint32(0))
+    chance = uniforms(seed, id, PURPOSE_DARK_COUNTS, _ONE)
     if chance[0] < wp.float64(hot_fraction):
         rate[pixel] = hot_rate + offset
     else:

@@ -8,11 +8,10 @@ from typing import Any
 import warp as wp
 
 from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import binomial, uniforms
+from spadwarp_kernels.random.binomial import PURPOSE_COUNTS, binomial, uniforms
 
 wp.set_module_options({"enable_backward": False})
 
-_COUNTS = wp.constant(wp.uint32(0))
 _ONE = wp.constant(wp.uint32(1))
 
 _SPARSE = wp.constant(
@@ -56,20 +55,20 @@ def _first_photon_kernel(
                 if wp.float64(left) * h < _SPARSE:
                     # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
                     if waiting == 0:
-                        wait = _exponential(seed, id, _COUNTS, block)
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
                         block = block + _ONE
                         waiting = 1
                     while left > 0 and wait < wp.float64(left) * h:
                         h = h - wait / wp.float64(left)
                         left = left - 1
                         count = count + 1
-                        wait = _exponential(seed, id, _COUNTS, block)
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
                         block = block + _ONE
                     wait = wait - wp.float64(left) * h
                 else:
                     # Exponential waits have no memory: the one begun may be dropped.
                     waiting = 0
-                    count, block = binomial(left, h, seed, id, _COUNTS, block)
+                    count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
                     left = left - count
                 if count > 0:
                     counts[row, k] = counts[row, k] + wp.min(count, depth)

@@ -12,6 +12,12 @@ from .philox import STREAM_DETECTOR, random_block
 
 wp.set_module_options({"enable_backward": False})
 
+# Purposes of a detector's random numbers, each with blocks of its own. A new random number takes the next one (to 15),
+# so that the counts of the others keep their bits.
+PURPOSE_COUNTS = wp.constant(wp.uint32(0))  # first-photon counts
+PURPOSE_EVENTS = wp.constant(wp.uint32(1))  # detections one by one: the next photon or dark count, the next afterpulse
+PURPOSE_DARK_COUNTS = wp.constant(wp.uint32(2))  # dark count rate of a pixel
+
 _PURPOSE_SHIFT = wp.constant(wp.uint32(28))
 _LN2 = wp.constant(wp.float64(0.6931471805599453))  # hazard of p = 1/2
 
@@ -35,7 +41,7 @@ _STIRLING_REST = wp.constant(
 
 @wp.func
 def uniforms(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.uint32) -> wp.vec2d:
-    """Two float64 uniforms in [0, 1) on the grid k / 2^53; `purpose` (0 … 15) and `block` (< 2^28) name the draw."""
+    """Two float64 uniforms in [0, 1) on the grid k / 2^53; `purpose` (PURPOSE_…) and `block` (< 2^28) name the draw."""
     words = random_block(seed, id, (purpose << _PURPOSE_SHIFT) | block, STREAM_DETECTOR)
     scale = wp.float64(1.1102230246251565e-16)
     high = wp.float64(67108864.0)
