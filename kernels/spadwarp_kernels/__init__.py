@@ -14,7 +14,7 @@ from .analytic import (
     statistics_maps,
 )
 from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
-from .estimators import ESTIMATORS, next_event_value
+from .estimators import ESTIMATORS, Estimator, next_event_value
 from .intersect import segment_meets_box
 from .math import one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 from .medium import (
@@ -112,6 +112,7 @@ __all__ = [
     "Batches",
     "Camera",
     "Data",
+    "Estimator",
     "Gate",
     "Guiding",
     "Laser",

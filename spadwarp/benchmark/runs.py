@@ -91,6 +91,7 @@ class TransportRun:
     Attributes:
         setup, compile: Seconds that this took, see `BenchResult`.
         faces: Triangles of the target.
+        scores: Whether the estimator fills a histogram; else photons travel without a camera.
         tally_bytes: Of the histograms; None without a camera.
     """
 
@@ -100,16 +101,16 @@ class TransportRun:
         scene = Scene.from_dict(case.scene)
         began = time.perf_counter()
         mesh = build_mesh(scene)
-        without_camera = case.estimator == "none"
-        self._model: Model = build_model(scene, device, mesh, camera=not without_camera)
-        self._data: Data = sk.make_data(self._model)
         self._spec = transport_spec(scene, mesh, **({} if case.estimator is None else {"estimator": case.estimator}))
+        self.scores: bool = sk.ESTIMATORS[self._spec.estimator](self._spec).scores
+        self._model: Model = build_model(scene, device, mesh, camera=self.scores)
+        self._data: Data = sk.make_data(self._model)
         _wait(device)
         ready = time.perf_counter()
         sk.load_transport_kernel(self._spec, device)
         self.setup, self.compile = ready - began, time.perf_counter() - ready
         self.faces = 0 if mesh is None else mesh.face_count
-        self.tally_bytes = None if without_camera else 8 * self._model.tally_size
+        self.tally_bytes = 8 * self._model.tally_size if self.scores else None
 
     def run(self, photons: int, *, first: int = 0) -> tuple[dict[str, int], dict[str, int], float]:
         """Ledger and counters of the photons with ids from `first` on, on a CPU with a thread for each core, and the
@@ -160,9 +161,9 @@ def measure_transport(case: Case, device: wp.Device, photons: int | None, repeat
     rates = {unit: number / seconds[fastest] for unit, number in work.items()}
     used = memory.peak()
     setup, compiled, faces, tally_bytes = traced.setup, traced.compile, traced.faces, traced.tally_bytes
+    error = case.error and traced.scores
     del traced  # and its histograms, before the next run makes its own
     scene = Scene.from_dict(case.scene)
-    error = case.error and case.estimator != "none"
     return BenchResult(
         case=case.name,
         device=device.alias,

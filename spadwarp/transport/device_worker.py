@@ -30,6 +30,7 @@ class DeviceWorker:
         threads: Launches at a time. On a CPU all of them add to one tally, with atomics of their own.
         batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         tallies: The caller's own, to be filled.
+        histogram: False: none is made, for records of photons without a camera.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class DeviceWorker:
         threads: int = 1,
         batch_size: int = 0,
         tallies: Any = None,
+        histogram: bool = True,
     ) -> None:
         camera, gate = model.camera, model.gate
         self._shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
@@ -49,7 +51,7 @@ class DeviceWorker:
         self.model, self.threads, self.launch_size = model, threads, launch_size
         self._spec, self._seed, self._batch_size = spec, seed, batch_size
         with device_errors(model.device):
-            self.data = sk.make_data(model, tally=None if batch_size else own, histogram=spec.estimator != "none")
+            self.data = sk.make_data(model, tally=None if batch_size else own, histogram=histogram)
             self._batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)

@@ -95,7 +95,7 @@ def trace(
         progress("compile", 0, 0)
     spec = transport_spec(scene, mesh, estimator="none", records=True)
     size = LAUNCH_SIZE["cuda" if model.device.is_cuda else "cpu"]
-    worker = DeviceWorker(model, spec, seed=seed, launch_size=size)
+    worker = DeviceWorker(model, spec, seed=seed, launch_size=size, histogram=False)
     parts: list[dict[str, NDArray[Any]]] = []
     for first in range(0, photons, size):
         stop = min(first + size, photons)

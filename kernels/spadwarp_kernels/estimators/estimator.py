@@ -63,3 +63,8 @@ class Estimator(NamedTuple):
     request_event: wp.Function | None = None
     score: wp.Function | None = None
     direct: wp.Function | None = None
+
+    @property
+    def scores(self) -> bool:
+        """Whether it adds anything to the histogram."""
+        return self.cross is not None or self.score is not None

@@ -76,7 +76,7 @@ class Data:
 def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
     """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to.
 
-    `histogram=False` makes none, for the estimator "none", which has nothing to put into it.
+    `histogram=False` makes none, for an estimator that scores nothing.
     """
     size = model.tally_size if histogram else 1
     if tally is None:

@@ -6,11 +6,11 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.estimators import Estimator, Request, make_next_event
+from spadwarp_kernels.estimators import Request, make_next_event
 from spadwarp_kernels.photon import PhotonState
 
 
-def make_half(spec: sk.TransportSpec) -> Estimator:
+def make_half(spec: sk.TransportSpec) -> sk.Estimator:
     """next_event with half of the light."""
     next_event = make_next_event(spec)
     whole = next_event.request_event
@@ -39,17 +39,20 @@ def water_model():
 
 def test_an_estimator_of_ones_own(monkeypatch):
     monkeypatch.setitem(sk.ESTIMATORS, "half", make_half)
-    monkeypatch.setitem(sk.ESTIMATORS, "nothing", lambda spec: Estimator())
-    model, totals, contributions = water_model(), {}, {}
+    monkeypatch.setitem(sk.ESTIMATORS, "nothing", lambda spec: sk.Estimator())
+    model, totals, contributions, ledgers = water_model(), {}, {}, {}
     for name in ("next_event", "half", "nothing"):
         data = sk.make_data(model)
         spec = sk.TransportSpec(name, mesh=False)
         sk.launch_transport(spec, model, data, seed=3, first_id=0, photon_count=5000)
         totals[name] = int(data.tally.numpy().sum())
-        contributions[name] = sk.read_ledger(data)[1]["contributions"]
+        ledgers[name], counters = sk.read_ledger(data)
+        contributions[name] = counters["contributions"]
+        assert sk.ESTIMATORS[name](spec).scores == (name != "nothing")
     assert totals["half"] == pytest.approx(0.5 * totals["next_event"], rel=1e-6)
     assert contributions["half"] == contributions["next_event"] > 0
     assert totals["nothing"] == contributions["nothing"] == 0
+    assert ledgers["nothing"] == ledgers["half"] == ledgers["next_event"]
 
 
 def test_a_name_that_is_not_in_the_table():
