@@ -114,7 +114,7 @@ def _model(field: FieldInfo) -> type[BaseModel] | None:
 def _table(fields: Mapping[str, FieldInfo]) -> str:
     lines = ["| field | kind | range | default | what it is |", "|---|---|---|---|---|"]
     for field, info in fields.items():
-        about = (info.description or "").replace("|", "\\|")
+        about = " ".join((info.description or "").split()).replace("|", "\\|")
         # Of the coefficients of water two are given, and the others follow.
         default = "" if field in COEFFICIENTS else _default(info)
         lines.append(f"| {' | '.join((f'`{field}`', _kind(info), _range(info), default, about))} |")

@@ -19,7 +19,8 @@ class Transport(Section):
     seed: Whole = Field(0, ge=0, le=2**64 - 1)
     """key of the random numbers; one seed gives the same bits"""
     estimator: Literal["analog", "next_event", "guided"] = "guided"
-    """what scores: the photon itself, every event, or guided flights"""
+    """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;
+    `spadwarp.transport.trace` uses it"""
     termination: Literal["cutoff", "roulette"] = "cutoff"
     """drop light photons (biased), or Russian roulette"""
     weight_cutoff: float = Field(2e-4, ge=0, lt=1)
