@@ -61,7 +61,12 @@ class LocalWorkers:
                 models.append(build_model(plan.scene, device, plan.mesh, copies=copies))
         built = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh)
-        settings = {"seed": plan.seed, "launch_size": size, "threads": threads, "batch_size": plan.batch_size}
+        settings: dict[str, Any] = {
+            "seed": plan.seed,
+            "launch_size": size,
+            "threads": threads,
+            "batch_size": plan.batch_size,
+        }
         self.workers = [DeviceWorker(model, spec, tallies=tallies, **settings) for model in models]
         self.timing = {"setup": built - began, "compile": time.perf_counter() - built}
         self.first_block = threads * size
