@@ -170,8 +170,25 @@ def check_writable(directory: Path) -> None:
 
 def write_json(summary: dict[str, Any], path: Path | None) -> None:
     """The machine-readable twin of what a command prints; numbers that are not finite become null."""
-    if path is not None:
+    if path is None:
+        return
+    if not path.is_symlink() and (path.is_file() or not path.exists()):
         spadwarp.io.write_json(summary, path)
+        return
+    try:  # a pipe, a device or a link such as /dev/stdout, which no file may replace
+        path.write_text(spadwarp.io.json_text(summary), encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def read_part(text: str | None, option: str) -> tuple[int, int] | None:
+    """The numbers of `3/64`, which Python checks."""
+    if text is None:
+        return None
+    number, _, parts = text.partition("/")
+    if not (number.isdecimal() and parts.isdecimal()):
+        raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint=option)
+    return int(number), int(parts)
 
 
 # Numbers for people

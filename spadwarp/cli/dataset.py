@@ -24,11 +24,11 @@ def make(
     recipe_path: Annotated[Path, typer.Argument(metavar="RECIPE", help="Recipe (TOML).", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="DIR", help="The dataset's folder.", show_default=False)],
     part: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="K/N", help="Only part K of N of the dataset: every N-th shard from the K-th; for several machines."
         ),
-    ] = "1/1",
+    ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Overrides a field of the recipe; may be repeated."),
@@ -60,7 +60,13 @@ def make(
     engine = opt.read_engine(engine_name, ray_address, workers)
     with progress(quiet=quiet, unit="frames") as report:
         found = spadwarp.dataset.make_dataset(
-            recipe, out, device=device, processes=processes, engine=engine, part=_part(part), progress=report
+            recipe,
+            out,
+            device=device,
+            processes=processes,
+            engine=engine,
+            part=opt.read_part(part, "--part") or (1, 1),
+            progress=report,
         )
     summary = {
         "folder": found.folder,
@@ -80,13 +86,6 @@ def make(
             table["missing"] = f"{opt.count(len(found.missing))} shards, left to other machines"
         say(opt.rows(table))
     opt.write_json(summary, json_path)
-
-
-def _part(text: str) -> tuple[int, int]:
-    part, slash, parts = text.partition("/")
-    if not (slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
-        raise typer.BadParameter(f"{text!r} is not of the form K/N with 1 <= K <= N", param_hint="--part")
-    return int(part), int(parts)
 
 
 @group.command()

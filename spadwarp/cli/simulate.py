@@ -121,7 +121,8 @@ def simulate(
         photons = None
     if records:
         _check_records(scene, whole=not (first_photon or shard_text))
-    shard, engine = _shard(shard_text), opt.read_engine(engine_name, ray_address, workers)
+    shard = opt.read_part(shard_text, "--shard")
+    engine = opt.read_engine(engine_name, ray_address, workers)
     for message in spadwarp.check(scene):
         if message.level == "warning":
             complain(str(message))
@@ -182,15 +183,6 @@ def _check_records(scene: Scene, *, whole: bool) -> None:
         raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
     if scene.transport.photons >= 2**31:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
-
-
-def _shard(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    number, _, parts = text.partition("/")
-    if not (number.isdecimal() and parts.isdecimal()):
-        raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint="--shard")
-    return int(number), int(parts)
 
 
 def _prepare(out: Path, needed: int, *, resume: bool, overwrite: bool) -> None:

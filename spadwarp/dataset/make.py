@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spadwarp.dataset.manifest import check_shards, finish, record_path, write_json
+from spadwarp.dataset.manifest import check_shards, finish, record_path
 from spadwarp.dataset.recipe import Recipe, load_recipe
 from spadwarp.dataset.sampling import Plan
 from spadwarp.dataset.shards import write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.text import write_json
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
 
 __all__ = ["DatasetReport", "make_dataset"]
@@ -134,7 +135,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     except OSError as error:
         raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
     written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
-    write_json(record, written)
+    write_json(written, record, indent=1)
     return shard.scenes * plan.frames_per_scene
 
 

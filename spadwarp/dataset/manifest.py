@@ -17,9 +17,9 @@ from spadwarp.dataset.shards import checksum, write_scene_index
 from spadwarp.device import core_count
 from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
-from spadwarp.io.text import json_text
+from spadwarp.io.text import write_json
 
-__all__ = ["check_shards", "finish", "read_manifest", "record_path", "verify_dataset", "write_json"]
+__all__ = ["check_shards", "finish", "read_manifest", "record_path", "verify_dataset"]
 
 
 def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
         files["scenes.h5"] = checksum(folder / "scenes.h5")
         manifest = _manifest(plan, files)
         _write_text(folder / "README.md", card(plan, manifest))
-        write_json(folder / "manifest.json", manifest)
+        write_json(manifest, folder / "manifest.json", indent=1)
     return tuple(missing)
 
 
@@ -158,8 +158,3 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
 def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes a JSON file, whole or not at all."""
-    _write_text(path, json_text(value, indent=1))

@@ -32,10 +32,10 @@ def json_text(value: Any, *, indent: int = 2) -> str:
     return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
 
 
-def write_json(value: Any, path: str | Path) -> Path:
+def write_json(value: Any, path: str | Path, *, indent: int = 2) -> Path:
     """Writes `json_text` of a value; returns the path. Raises `FileError`."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json_text(value), encoding="utf-8")
+        temporary.write_text(json_text(value, indent=indent), encoding="utf-8")
     return Path(path)
 
 

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.text import json_text
+from spadwarp.io import text
 from spadwarp.validate import camera, phase, water
 from spadwarp.validate.case import Case, Run
 from spadwarp.validate.statistics import holm, two_sided_p
@@ -114,8 +113,7 @@ def write_json(results: Sequence[CaseResult], path: str | Path, *, photons: int,
         "cases": {result.name: CASES[result.name].summary for result in results},
         "results": [asdict(result) for result in results],
     }
-    with atomic_path(path) as temporary:
-        temporary.write_text(json_text(report, indent=1))
+    text.write_json(report, path, indent=1)
 
 
 def draw_results(results: Sequence[CaseResult], folder: str | Path) -> list[Path]:
