@@ -45,7 +45,7 @@ from .phase import (
     two_term_henyey_greenstein_density,
 )
 from .photon import BRUTE_FORCE_FACES, Records, TransportSpec, make_records
-from .random import philox4x32, random_block, u01, u01_fine
+from .random import philox4x32, random_block, u01, u01_fine, u01_tail
 from .ray_cast import truth_kernel
 from .sensor import (
     C0,
@@ -193,5 +193,6 @@ __all__ = [
     "two_term_henyey_greenstein_density",
     "u01",
     "u01_fine",
+    "u01_tail",
     "unshadowed",
 ]

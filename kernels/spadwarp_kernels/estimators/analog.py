@@ -5,7 +5,7 @@ import warp as wp
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.random.philox import u01_last
+from spadwarp_kernels.random.philox import u01
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
@@ -34,7 +34,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
                     component = BALLISTIC
                 found.value = s.weight.value
                 found.index = tally_index(camera, gate, pixel, s.path + crossing, component)
-                found.rounding_sample = u01_last(s.flight.block[0])
+                found.rounding_sample = u01(s.flight.block[2])
         return found
 
     return Estimator(cross=cross)

@@ -11,7 +11,7 @@ from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.random.philox import u01, u01_fine, u01_high, u01_last, u01_low
+from spadwarp_kernels.random.philox import u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.sensor.camera import Camera, lens_point, project
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.sensor.projection import PINHOLE
@@ -39,7 +39,7 @@ class Request:
         lens: The point of the lens, if it has been drawn.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
         first, second: Random words: of the lens's point or, of a flight, of the choice and the distance.
-        rounding_sample: A random word with 8 bits for the tally.
+        rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
         component: Index into COMPONENTS.
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
         target: The pixel of a scan, else -1.
@@ -129,7 +129,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                     q.lens = s.flight.lens  # that of the flight; others draw one from `first`
                 q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
-                q.rounding_sample = s.flight.block[0]  # bits that the flight left
+                q.rounding_sample = s.flight.block[2]  # of the azimuth to come
                 q.slot = -1
                 q.target = s.target
                 q.component = FORWARD_SCATTERED
@@ -238,7 +238,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         scan: Scan,
     ) -> Scored:
         found = Scored()
-        found.contribution.rounding_sample = u01_last(request.rounding_sample)
+        found.contribution.rounding_sample = u01(request.rounding_sample)
         found.origin = request.x
         weight = float(request.weight)
         path = float(request.path)

@@ -84,7 +84,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.interval = s.flight.interval
         q.first = s.flight.sample_block[0]
         q.second = s.flight.sample_block[1]
-        q.rounding_sample = s.flight.sample_block[2]
+        q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1
         q.target = s.target

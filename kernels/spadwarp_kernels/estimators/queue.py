@@ -9,6 +9,9 @@ from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_size, 
 
 from .contribution import Request
 
+# A request's 24 bits for the tally share a word with its component and slot.
+_UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
+
 
 @functools.cache
 def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
@@ -21,7 +24,7 @@ def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
 
     @wp.func
     def write(entry: int, request: Request):
-        packed = request.component + 4 * (request.slot + 1) + (int(request.rounding_sample & wp.uint32(255)) << 8)
+        packed = request.component + 4 * (request.slot + 1) + int(request.rounding_sample & _UPPER_24)
         queue_vector(True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         queue_vector(True, entry + QUEUE_ENTRIES, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
         queue_vector(
@@ -64,7 +67,7 @@ def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
         packed = bits_of(c[2])
         request.component = packed & 3
         request.slot = ((packed >> 2) & 63) - 1
-        request.rounding_sample = wp.uint32(packed >> 8)
+        request.rounding_sample = wp.uint32(packed)
         request.target = bits_of(c[3])
         if wp.static(flights):
             d = queue_vector(False, entry + 3 * QUEUE_ENTRIES, wp.vec4())

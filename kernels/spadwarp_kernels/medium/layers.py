@@ -56,13 +56,13 @@ def _boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: 
 
 @wp.func
 def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float) -> float:
-    """Free flight [m] from x along u for uniform xi in [0, 1): where the optical depth reaches -ln(1 - xi)."""
+    """Free flight [m] from x along u for uniform xi in (0, 1]: where the optical depth reaches -ln(xi)."""
     along = wp.dot(layers.axis, x)
     slope = wp.dot(layers.axis, u)
     step = wp.where(slope > 0.0, 1, -1)
     layer = layer_index(layers, along)
     extinction = float(layers.extinction[layer])
-    depth = -wp.log(1.0 - xi)
+    depth = -wp.log(xi)
     begin = float(0.0)  # of the stretch of this extinction
     boundary = _boundary_ahead(layers, layer, step, along, slope)
     while boundary < 1.0e30 and extinction * (boundary - begin) < depth:

@@ -26,9 +26,9 @@ class Medium:
 
 
 @wp.func
-def free_path(u: float, extinction: float) -> float:
-    """Free flight [m] = -ln(1 - u)/c for uniform u in [0, 1) (eq 12, 13); its mean is 1/c. Infinite (1e30) in
-    vacuum."""
+def free_path(xi: float, extinction: float) -> float:
+    """Free flight [m] = -ln(xi)/c for uniform xi in (0, 1], from `u01_tail` (eq 12, 13); its mean is 1/c. Infinite
+    (1e30) in vacuum."""
     if extinction <= 0.0:
         return 1.0e30
-    return -wp.log(1.0 - u) / extinction
+    return -wp.log(xi) / extinction

@@ -20,9 +20,9 @@ from .philox import (
     u01,
     u01_fine,
     u01_high,
-    u01_last,
     u01_low,
     u01_open,
+    u01_tail,
 )
 from .quantiles import count_quantile
 
@@ -45,8 +45,8 @@ __all__ = [
     "u01",
     "u01_fine",
     "u01_high",
-    "u01_last",
     "u01_low",
     "u01_open",
+    "u01_tail",
     "uniforms",
 ]

@@ -130,12 +130,6 @@ def u01_low(word: wp.uint32) -> float:
 
 
 @wp.func
-def u01_last(word: wp.uint32) -> float:
-    """Uniform in [0, 1) from the last 8 bits, on the grid (k + 1/2) / 2^8; independent of `u01` of the same word."""
-    return (float(word & wp.uint32(0xFF)) + 0.5) * 0.00390625
-
-
-@wp.func
 def u01_fine(word: wp.uint32) -> float:
     """Uniform float32 in [0, 1 - 2^-24] with the full 32-bit resolution near 0, for densities that peak at 0."""
     return wp.min(float(word) * 2.3283064365386963e-10, 0.99999994)
@@ -145,3 +139,12 @@ def u01_fine(word: wp.uint32) -> float:
 def u01_open(word: wp.uint32) -> float:
     """Uniform in (0, 1] with full resolution near 0, for the logarithm of Box and Muller."""
     return (float(word) + 0.5) * 2.3283064365386963e-10
+
+
+@wp.func
+def u01_tail(word: wp.uint32, more: wp.uint32) -> float:
+    """Uniform float32 in [2^-41, 1] from a word and the last 8 bits of another, which `u01` leaves.
+
+    For logarithms: -ln reaches 28.4, and the probability of more than l is exp(-l) to 0.1 % up to l = 20.
+    """
+    return float(word) * 2.3283064365386963e-10 + (float(more & wp.uint32(0xFF)) + 0.5) * 9.094947017729282e-13

@@ -5,7 +5,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.math.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
-from spadwarp_kernels.random.philox import STREAM_EMISSION, random_block, u01, u01_fine
+from spadwarp_kernels.random.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 
 LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
 
@@ -61,7 +61,7 @@ def emit_along(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
         direction = rotate_direction(axis, laser.spread * xi, azimuth)
     elif laser.profile == 1:
         # tan^2 is exponential; 1 - cos from tan^2 without cancellation: tan^2/((1 + s) s), s = sqrt(1 + tan^2).
-        tan2 = -0.5 * laser.tan2 * wp.log(1.0 - u01(block[0]))
+        tan2 = -0.5 * laser.tan2 * wp.log(u01_open(block[0]))
         s = wp.sqrt(1.0 + tan2)
         direction = rotate_direction(axis, tan2 / ((1.0 + s) * s), azimuth)
     else:

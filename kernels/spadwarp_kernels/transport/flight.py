@@ -9,7 +9,7 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Flight, PhotonState, is_planned
-from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_TRANSPORT, RoundKeys, random_block_keyed, u01
+from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_TRANSPORT, RoundKeys, random_block_keyed, u01, u01_tail
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 
@@ -33,7 +33,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Functio
     ) -> Flight:
         f = Flight()
         f.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
-        f.distance = water_free_path(medium, layers, s.x, s.u, u01(f.block[0]))
+        f.distance = water_free_path(medium, layers, s.x, s.u, u01_tail(f.block[0], f.block[2]))
         f.reach = wp.min(f.distance, limits.max_path - s.path)
         if wp.static(plans):
             plan = plan_flight(s, medium, camera, gate, limits, keys, id)
