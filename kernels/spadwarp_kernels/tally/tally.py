@@ -52,7 +52,8 @@ def add_pending(tally: wp.array(dtype=wp.int64), pending: wp.vec2l, index: int, 
 def to_fixed_point(value: float, scale: float, rounding_sample: float) -> wp.int64:
     """value * scale >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1).
 
-    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more. Returns -1 for what is clipped and -2 for what is not a number.
+    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more. Returns
+    -1 for what is clipped and -2 for what is not a number.
     """
     units = value * scale
     if units <= _DEPOSIT_LIMIT:

@@ -9,7 +9,14 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Flight, PhotonState, is_planned
-from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_TRANSPORT, RoundKeys, random_block_keyed, u01, u01_tail
+from spadwarp_kernels.random.philox import (
+    STREAM_ROULETTE,
+    STREAM_TRANSPORT,
+    RoundKeys,
+    random_block_keyed,
+    u01,
+    u01_tail,
+)
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 
