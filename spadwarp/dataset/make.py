@@ -2,7 +2,8 @@
 
 A shard is two or three files and a small record of their checksums, written in this order, each renamed into place when
 it is whole. When a process is killed only its unfinished shard is lost; a later call makes what has no record or does
-not match it.
+not match it. A process that makes a shard holds a lock on it: of two calls for one folder, each makes what the other
+has not begun.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from spadwarp.dataset.shards import write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.lock import lock
 from spadwarp.io.text import write_json
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
 
@@ -124,18 +126,26 @@ class _Job(NamedTuple):
 
 
 def _make_shard(job: _Job, worker: Worker) -> int:
-    """Makes a shard and its record; returns its frames."""
+    """Makes a shard and its record, unless another process does; returns its frames."""
     known = worker.state.get("plan")
     plan = known if known is not None and known.recipe == job.recipe else Plan(job.recipe)
     worker.state["plan"] = plan
     shard = plan.shards[job.shard]
     record = record_path(job.folder, shard)
     try:
-        record.unlink(missing_ok=True)
+        record.parent.mkdir(exist_ok=True)
     except OSError as error:
-        raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
-    written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
-    write_json(written, record, indent=1)
+        raise FileError(f"{record.parent}: cannot be made: {error.strerror}") from error
+    with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
+        if not obtained:  # interrupted while another process was making it
+            return 0
+        if check_shards(plan, job.folder, [shard])[shard.index]:
+            try:
+                record.unlink(missing_ok=True)
+            except OSError as error:
+                raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
+            written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
+            write_json(written, record, indent=1)
     return shard.scenes * plan.frames_per_scene
 
 
@@ -150,21 +160,32 @@ def _processes(device: str | None, processes: int, shards: int) -> str:
 
 def _claim(plan: Plan, folder: Path) -> None:
     """Writes the recipe into a new folder; refuses one that holds something else."""
-    path, text = folder / "recipe.toml", plan.recipe.to_toml()
     try:
-        if path.is_file():
-            with suppress(tomllib.TOMLDecodeError):
-                if tomllib.loads(path.read_text(encoding="utf-8")) == tomllib.loads(text):
-                    return
-            raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
-        if folder.exists() and not folder.is_dir():
-            raise FileError(f"{folder}: is a file; a folder is needed")
-        if folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
-            raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        if _holds(plan, folder):
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        with lock(folder / ".claim.lock", wait=lambda: True):
+            if _holds(plan, folder):  # another process was faster
+                return
+            if any(not path.name.startswith(".") for path in folder.iterdir()):
+                raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
+            with atomic_path(folder / "recipe.toml") as temporary:
+                temporary.write_text(plan.recipe.to_toml(), encoding="utf-8")
+    except FileExistsError:
+        raise FileError(f"{folder}: is a file; a folder is needed") from None
     except OSError as error:
         raise FileError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def _holds(plan: Plan, folder: Path) -> bool:
+    """Whether the folder holds the dataset of this recipe; `ConfigError` for one of another recipe."""
+    path = folder / "recipe.toml"
+    if not path.is_file():
+        return False
+    with suppress(ValueError):  # not TOML, or not UTF-8
+        if tomllib.loads(path.read_text(encoding="utf-8")) == tomllib.loads(plan.recipe.to_toml()):
+            return True
+    raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
 
 
 def _check_space(plan: Plan, folder: Path, frames: int) -> None:

@@ -6,7 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from spadwarp.dataset.sampling import Plan, Shard
 from spadwarp.dataset.schema import FORMAT_VERSION, FRAME_COLUMNS, PACKED, describe, scene_columns, scene_row
 from spadwarp.device import core_count, pick_device
 from spadwarp.errors import DeviceError
+from spadwarp.io.atomic import remove_temporaries
 from spadwarp.io.hdf5 import write_hdf5
 
 __all__ = ["checksum", "render_scene", "write_scene_index", "write_shard"]
@@ -37,10 +38,8 @@ def write_shard(
     They are put together in memory. Raises `FileError` where they cannot be written.
     """
     names = plan.files_of(shard)
-    for path in map(folder.joinpath, names):
-        for temporary in path.parent.glob(f".{path.name}.*.tmp"):  # of runs that were killed
-            with suppress(OSError):
-                temporary.unlink()
+    for name in names:
+        remove_temporaries(folder / name)
     with ExitStack() as stack:
         files = [stack.enter_context(write_hdf5(folder / name, libver=_LIBRARY)) for name in names]
         for name, file in zip(names, files, strict=True):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from spadwarp.errors import FileError, SpadwarpError
+
+_LONGEST_PREFIX = 100  # bytes of a file's name in that of its temporary file; file systems allow 255 in all
 
 
 def file_within(path: str | Path, names: Sequence[str]) -> Path:
@@ -24,14 +27,19 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its name when the block ends well, and is removed when it does not.
+    """A new empty file beside `path` that takes its name when the block ends well, and is removed when it does not.
 
-    What was at `path` stays untouched until then. Raises `FileError` where the folder or the file cannot be written.
+    What was at `path` stays untouched until then; a symbolic link is replaced, not what it leads to. No other process,
+    on this machine or another, gets the same temporary name. Raises `FileError` where the folder or the file cannot be
+    written.
     """
     target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    if not target.name:
+        raise FileError(f"{target}: is no name of a file")
+    temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -43,3 +51,16 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def remove_temporaries(path: str | Path) -> None:
+    """Removes the temporary files of `path` that killed processes have left; nobody may be writing it."""
+    target = Path(path)
+    with suppress(OSError):
+        for other in list(target.parent.iterdir()):
+            if other.name.startswith(_prefix(target)) and other.suffix == ".tmp":
+                other.unlink(missing_ok=True)
+
+
+def _prefix(target: Path) -> str:
+    return f".{os.fsdecode(os.fsencode(target.name)[:_LONGEST_PREFIX])}."

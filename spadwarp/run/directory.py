@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import secrets
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
 from spadwarp.frames import detector_response
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.atomic import atomic_path, remove_temporaries
 from spadwarp.result import Result, save_depth_exr, save_truth_maps
 from spadwarp.scene import Scene
 
@@ -85,7 +85,7 @@ def _save(result: Result, path: Path) -> Path:
     try:
         return result.save(path)
     except FileError as error:
-        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{os.getpid()}-result.h5"
+        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{secrets.token_hex(8)}-result.h5"
         result.save(refuge)
         raise FileError(f"{error}\n{refuge}: the result is here instead") from error
 
@@ -99,9 +99,9 @@ def newest_result(path: str | Path) -> Path:
 
 def remove_checkpoint(out: str | Path) -> None:
     """Removes the checkpoint of a directory, and the parts of one that a killed run has left."""
-    folder = Path(out)
-    for path in (folder / CHECKPOINT, *folder.glob(f".{CHECKPOINT}.*.tmp")):
-        path.unlink(missing_ok=True)
+    path = Path(out) / CHECKPOINT
+    path.unlink(missing_ok=True)
+    remove_temporaries(path)
 
 
 def bytes_needed(scene: Scene, *, batches: bool = False, records: bool = False, checkpoint: bool = False) -> int:

@@ -1,6 +1,8 @@
 """Files appear whole or not at all, and EXR stores what it was given."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from helpers.cli import ENVIRONMENT
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.atomic import atomic_path, remove_temporaries
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import write_hdf5
+from spadwarp.io.lock import lock
 
 
 def test_a_write_that_fails_midway_says_where_and_cleans_up(tmp_path):
@@ -38,6 +42,92 @@ def test_folders_that_cannot_be_made_are_named(tmp_path):
         write_exr(tmp_path / "file" / "image.exr", {"Z": np.ones((2, 2))})
     with pytest.raises(FileError, match="cannot be written"), write_hdf5(tmp_path / "file" / "result.h5"):
         pass
+
+
+def test_two_writers_of_one_file_do_not_share_a_temporary_one(tmp_path, monkeypatch):
+    """Processes in containers have the same number: a name made of it would be one for both."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    path = tmp_path / "file.txt"
+    with atomic_path(path) as one, atomic_path(path) as two:
+        assert one != two
+        one.write_text("one")
+        two.write_text("two")
+    assert path.read_text() == "one" and list(tmp_path.iterdir()) == [path]
+
+
+def test_names_as_long_as_a_file_system_allows(tmp_path):
+    path = tmp_path / ("é" * 127)  # 254 bytes
+    with atomic_path(path) as temporary:
+        temporary.write_text("whole")
+    assert path.read_text() == "whole"
+    with pytest.raises(FileError, match="cannot be written"), atomic_path(tmp_path / ("a" * 300)):
+        pass
+    with pytest.raises(FileError, match="no name"), atomic_path(""):
+        pass
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    with atomic_path(tmp_path / "atomic") as temporary:
+        temporary.write_text("")
+    (tmp_path / "plain").write_text("")
+    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_link_to_a_file_is_replaced_and_a_link_to_a_folder_followed(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("folder")
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "folder" / "file.txt").symlink_to(tmp_path / "mine.txt")
+    with atomic_path(tmp_path / "link" / "file.txt") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert (tmp_path / "folder" / "file.txt").read_text() == "new" and (tmp_path / "link").is_symlink()
+
+
+def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path):
+    for name in (".file.h5.0123456789abcdef.tmp", ".file.h5.77.tmp", ".file.h50.77.tmp", "file.h5", ".file.h5.txt"):
+        (tmp_path / name).touch()
+    remove_temporaries(tmp_path / "file.h5")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".file.h5.txt", ".file.h50.77.tmp", "file.h5"]
+
+
+# Locks
+
+
+def test_a_lock_has_one_holder_and_leaves_no_file(tmp_path):
+    path, asked = tmp_path / "lock", []
+    with lock(path) as first, lock(path) as second:
+        assert first and not second
+        with lock(path, wait=lambda: asked.append(1) or len(asked) < 3) as third:
+            assert not third and len(asked) == 3
+    with lock(path) as again:
+        assert again
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(FileError, match="cannot be written"), lock(tmp_path / "none" / "lock"):
+        pass
+
+
+HOLD = """
+import sys
+from spadwarp.io.lock import lock
+with lock(sys.argv[1]):
+    print(flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="has no such locks")
+def test_the_lock_of_a_killed_process_is_free(tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "lock")]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process.stdout.readline()
+    with lock(tmp_path / "lock") as held:
+        assert not held
+    process.kill()
+    process.communicate()
+    assert list(tmp_path.iterdir())
+    with lock(tmp_path / "lock") as free:
+        assert free
 
 
 # EXR
