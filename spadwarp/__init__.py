@@ -21,7 +21,7 @@ _ROOMS = {
     "parallel": ("Ray",),
     "result": ("Result", "load_result", "merge"),
     "frames": ("Frames", "arrival_time", "crlb", "detect"),
-    "analytic": ("budget", "simulate_analytic", "sweep"),
+    "analytic": ("budget", "plan", "simulate_analytic", "sweep"),
     "dataset": (),
     "denoise": (),
     "viz": (),
@@ -38,7 +38,7 @@ _HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
-    from spadwarp.analytic import budget, simulate_analytic, sweep
+    from spadwarp.analytic import budget, plan, simulate_analytic, sweep
     from spadwarp.checks import check
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.frames import Frames, arrival_time, crlb, detect

@@ -1,22 +1,35 @@
 """The analytic simulator and photon budgets: numbers without photon transport."""
 
+from spadwarp.analytic.experiment import Proposal, plan
+from spadwarp.analytic.exposure_proposal import PILE_UP, Exposure
+from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, permissible_exposure
 from spadwarp.analytic.model import pixel_maps
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budget
+from spadwarp.analytic.pilot import Pilot
 from spadwarp.analytic.result import AnalyticResult, background_photons
 from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.analytic.sweeps import DepthErrorRow, Sweep, parse_vary, sweep
 
 __all__ = [
     "OUTLIERS",
+    "PILE_UP",
     "TOLERANCE",
     "AnalyticResult",
     "BudgetRow",
     "DepthErrorRow",
+    "Exposure",
+    "EyeLimit",
+    "Pilot",
+    "Proposal",
     "Sweep",
+    "axis_fluence",
     "background_photons",
     "budget",
+    "eye_limit",
     "parse_vary",
+    "permissible_exposure",
     "pixel_maps",
+    "plan",
     "simulate_analytic",
     "sweep",
 ]

@@ -12,6 +12,7 @@ from spadwarp.cli import (  # noqa: F401  in the order of the help
     export,
     merge,
     analytic,
+    plan,
     budget,
     sweep,
     water,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import shutil
 import tempfile
@@ -13,6 +14,7 @@ import typer
 
 import spadwarp
 from spadwarp.errors import FileError
+from spadwarp.units import quantity
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +31,34 @@ def whole_number(text: str | int) -> int:
     if not value.is_finite() or value.adjusted() > 30 or value != value.to_integral_value():
         raise typer.BadParameter(f"{text!r} is not a whole number, such as 2000000 or 2e6")
     return int(value)
+
+
+def _quantity(text: str | float, unit: str) -> float:
+    """A number in the unit, bare or with a unit of its own: `0.01`, `1cm`."""
+    with contextlib.suppress(ValueError):
+        return float(text)
+    try:
+        return quantity(str(text), unit)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} {error}") from None
+
+
+def length(text: str | float) -> float:
+    """Metres from `0.01` or `1cm`."""
+    return _quantity(text, "m")
+
+
+def duration(text: str | float) -> float:
+    """Seconds from `0.1` or `100ms`."""
+    return _quantity(text, "s")
+
+
+def two_lengths(text: str, option: str) -> tuple[float, float]:
+    """Metres from `2:3` or `80cm:1.2m`."""
+    first, colon, second = text.partition(":")
+    if not colon:
+        raise typer.BadParameter(f"{text!r} is not FROM:TO, two lengths", param_hint=option)
+    return length(first), length(second)
 
 
 ScenePath = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (TOML).", show_default=False)]

@@ -3,7 +3,17 @@
 from spadwarp.io.atomic import atomic_path, file_within
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.lock import lock
-from spadwarp.io.text import json_text, read_toml, write_csv, write_json
+from spadwarp.io.text import json_text, read_toml, write_csv, write_json, write_text
 
-__all__ = ["atomic_path", "file_within", "json_text", "lock", "read_exr", "read_toml", "write_csv", "write_exr"]
-__all__ += ["write_json"]
+__all__ = [
+    "atomic_path",
+    "file_within",
+    "json_text",
+    "lock",
+    "read_exr",
+    "read_toml",
+    "write_csv",
+    "write_exr",
+    "write_json",
+    "write_text",
+]

@@ -14,7 +14,7 @@ from typing import Any
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
 
-__all__ = ["json_text", "read_toml", "write_csv", "write_json"]
+__all__ = ["json_text", "read_toml", "write_csv", "write_json", "write_text"]
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -32,11 +32,16 @@ def json_text(value: Any, *, indent: int = 2) -> str:
     return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
 
 
+def write_text(text: str, path: str | Path) -> Path:
+    """Writes UTF-8 text; returns the path. Raises `FileError`."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
 def write_json(value: Any, path: str | Path, *, indent: int = 2) -> Path:
     """Writes `json_text` of a value; returns the path. Raises `FileError`."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json_text(value, indent=indent), encoding="utf-8")
-    return Path(path)
+    return write_text(json_text(value, indent=indent), path)
 
 
 def write_csv(table: Sequence[Mapping[str, Any]], path: str | Path) -> Path:

@@ -72,3 +72,18 @@ def test_sweep_is_that_of_python(spad_scene, tmp_path, of):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep.png", "sweep.csv"}
     for wrong, words in (("medium.typo=1:2:2", "medium.typo"), ("nonsense", "from:to:count")):
         assert words in run("sweep", spad_scene, "--vary", wrong, "--out", tmp_path / "x", code=2).stderr
+
+
+def test_plan_is_that_of_python_and_writes_a_scene(spad_scene, tmp_path):
+    summary, written = tmp_path / "printed.json", tmp_path / "planned.toml"
+    options = ("--depth-error", "5cm", "--time", "100ms", "--photons", "2e4", "--no-range", "--write", written)
+    printed = run("plan", spad_scene, *options, "--json", summary, *DEVICE)
+    scene = spadwarp.load_scene(spad_scene)
+    twin = spadwarp.plan(scene, depth_error=0.05, time=0.1, photons=20_000, largest_range=False, device="cpu")
+    found = tables(summary)
+    assert found["values"] == twin.values and found["terms"] == twin.terms and found["limit"] == twin.limit
+    assert spadwarp.load_scene(written) == twin.scene
+    for words in ("start_ns", "eye limit", "IEC 60825-1", "Cramér–Rao bound", "forward scattering", twin.limit):
+        assert words in printed.stdout, words
+    assert "is a time" in run("plan", spad_scene, "--depth-error", "1ns", code=2).stderr
+    assert "FROM:TO" in run("plan", spad_scene, "--range", "3", code=2).stderr

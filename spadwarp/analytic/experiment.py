@@ -1,0 +1,162 @@
+"""An experiment from the depth error that is asked for: gate, pulses, laser power, largest range, what limits it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from spadwarp.analytic.exposure_proposal import Exposure, Progress, Question, propose_exposure
+from spadwarp.analytic.eye_safety import axis_fluence
+from spadwarp.analytic.gate_proposal import propose_gate, target_span
+from spadwarp.analytic.largest_range import largest_range as find_largest_range
+from spadwarp.analytic.largest_range import with_plane
+from spadwarp.errors import ArgumentError
+from spadwarp.frames import METHODS, Method
+from spadwarp.units import range_from_time
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["Proposal", "plan"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proposal(Exposure):
+    """A proposed experiment: an `Exposure`, and
+
+    Attributes:
+        depth_error: Asked for [m].
+        time: Longest time for a depth frame [s].
+        method: Estimator whose floor counts.
+        target_range: Least and largest range of the target [m].
+        optical_depth: To the nearest of it, one way, along the axis.
+        gate_range: Ranges at the ends of the gate, laser at the lens [m].
+        unambiguous_range: At the proposed repetition rate [m].
+        largest_rate: Repetition rate up to which the gate ends before the next pulse [Hz].
+        irradiance: On the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²].
+        largest_range: For a plane square to the axis, depth error and time as asked for [m]; NaN: not sought, 0: none.
+        range_limit: What limits it.
+    """
+
+    depth_error: float
+    time: float
+    method: str
+    target_range: tuple[float, float]
+    optical_depth: float
+    gate_range: tuple[float, float]
+    unambiguous_range: float
+    largest_rate: float
+    irradiance: float
+    largest_range: float
+    range_limit: str
+
+    @property
+    def values(self) -> dict[str, float | int]:
+        """The proposed values by the names of the scene's fields."""
+        scene = self.scene
+        return {
+            "gate.start_ns": scene.gate.start_ns,
+            "gate.bin_width_ps": scene.gate.bin_width_ps,
+            "gate.bins": scene.gate.bins,
+            "laser.repetition_rate": scene.laser.repetition_rate,
+            "laser.pulse_energy": scene.laser.pulse_energy,
+            "detector.pulses_per_frame": scene.detector.pulses_per_frame,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the scene, in numbers and text that JSON can hold."""
+        fields = {name: value for name, value in vars(self).items() if name not in ("scene", "eye", "pilot")}
+        return {
+            "values": self.values,
+            **fields,
+            "eye": dataclasses.asdict(self.eye),
+            "pilot": dataclasses.asdict(self.pilot),
+        }
+
+
+def plan(
+    scene: Scene,
+    *,
+    depth_error: float = 0.01,
+    time: float = 1.0,
+    ranges: tuple[float, float] | None = None,
+    margin: float = 0.25,
+    method: Method = "likelihood",
+    full_power: bool = False,
+    eye_distance: float | None = None,
+    eye_exposure: float = 100.0,
+    photons: int = 2_000_000,
+    seed: int = 0,
+    largest_range: bool = True,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> Proposal:
+    """Proposes gate, pulses, repetition rate and pulse energy for a depth error, and says what limits it.
+
+    Counts, background and the error that scattering leaves are measured by a Monte Carlo run of a window of the image
+    (`spadwarp.analytic.Pilot`); the Cramér–Rao bound is that of its histograms. The bound falls with the pulses; the
+    floor, the error of an estimator that takes the scattered light for unscattered, does not.
+
+    Args:
+        scene: Water, laser, camera, detector, target; of the gate the bins' width alone.
+        depth_error: Asked for [m], of a single pixel, in the median.
+        time: Longest time for a depth frame [s].
+        ranges: Least and largest range where the target may be [m]; default: that of the scene's targets. If given, the
+            target is a plane at the largest, with the reflectance of the scene's first target, else 0.5.
+        margin: Range of water that the gate holds before and behind the target [m].
+        method: Estimator whose floor counts.
+        full_power: Take the largest pulse energy within the limits, not only the scene's if it is within them.
+        eye_distance: An eye at this distance from the laser limits the pulse energy [m]; default: reported for 0.1 m,
+            and no limit.
+        eye_exposure: For which it looks into the beam [s].
+        photons: Of the Monte Carlo run.
+        seed: Of it.
+        largest_range: Whether to look for the largest range, which takes several shorter runs.
+        device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
+        progress: Called with ("trace", photons done, photons asked for) and the like.
+
+    Raises:
+        ConfigError: No target in view, or no light from it.
+        ArgumentError: An argument out of range.
+    """
+    _check(depth_error=depth_error, time=time, photons=photons, eye_exposure=eye_exposure)
+    if not (margin >= 0 and math.isfinite(margin)):
+        raise ArgumentError(f"margin = {margin} m is outside [0, inf)")
+    if method not in METHODS:
+        raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
+    if ranges is not None:
+        if not 0 < ranges[0] <= ranges[1] < math.inf:
+            raise ArgumentError(f"ranges = {ranges} m: 0 < least <= largest < inf is needed")
+        scene = with_plane(scene, ranges[1])
+    span = ranges or target_span(scene, device)
+    question = Question(depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device)
+    gate = propose_gate(scene, span, margin)
+    exposure = propose_exposure(scene, gate, question, photons, progress)
+    optical_depth = scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, span[0]))
+    farthest = (math.nan, "")
+    if largest_range:
+        farthest = find_largest_range(exposure.scene, 0.5 * sum(span), question, max(photons // 8, 1), progress)
+    index, chosen = scene.medium.group_index, exposure.scene
+    fluence = axis_fluence(chosen.laser, span[0]) * math.exp(-optical_depth)
+    return Proposal(
+        **vars(exposure),
+        depth_error=depth_error,
+        time=time,
+        method=method,
+        target_range=span,
+        optical_depth=optical_depth,
+        gate_range=(range_from_time(chosen.gate.start, index), range_from_time(chosen.gate.stop, index)),
+        unambiguous_range=range_from_time(1.0 / chosen.laser.repetition_rate, index),
+        largest_rate=gate.largest_rate,
+        irradiance=fluence * chosen.laser.pulse_energy * chosen.laser.repetition_rate,
+        largest_range=farthest[0],
+        range_limit=farthest[1],
+    )
+
+
+def _check(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not (value > 0 and math.isfinite(value)):
+            raise ArgumentError(f"{name} = {value} is outside (0, inf)")

@@ -1,0 +1,172 @@
+"""Limits of laser power for the eye: maximum permissible exposure (MPE) after IEC 60825-1:2014. A guide, no more.
+
+Table A.1 for a small source (C6 = 1), 400 to 1050 nm, radiant exposure H at the cornea for an exposure of t, with
+C4 = 10^(0.002 (λ/nm − 700)) beyond 700 nm, else 1:
+
+    100 fs ... 10 ps: 1e-3·C4 J/m²     10 ps ... 5 µs: 2e-3·C4 J/m²     5 µs ... 10 s: 18·t^0.75·C4 J/m²
+    beyond 10 s: an irradiance of 10·C4 W/m²; from 400 to 600 nm also 100·C3 J/m² up to 100 s and C3 W/m² beyond,
+    C3 = 10^(0.02 (λ/nm − 450)) from 450 nm on, else 1
+
+A train of pulses must keep three limits (A.3): (1) each pulse the limit of its duration; (2) the mean over the exposure
+the limit of that duration; (3) each pulse, the pulses within T_i = 5 µs counted as one of duration T_i, C5 times its
+limit, C5 = max(0.4, 5·N^−0.25) for more than 600 pulses N in the exposure (10 s at most) if that is longer than 0.25 s,
+else 1. Exposures are means over a 7 mm aperture in the middle of the beam, in clear water.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from spadwarp.errors import ArgumentError
+from spadwarp.scene.beam_profile import load_profile
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Laser
+
+__all__ = ["STANDARD", "EyeLimit", "axis_fluence", "eye_limit", "permissible_exposure"]
+
+STANDARD = "IEC 60825-1:2014, Table A.1 and A.3, small source, 7 mm aperture; a guide, not a classification"
+
+_APERTURE = 3.5e-3  # radius [m]
+_AREA = math.pi * _APERTURE**2
+_GROUP = 5e-6  # T_i [s]
+_FARTHEST = 1e4  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EyeLimit:
+    """The largest laser power at which an eye in the beam is within the MPE.
+
+    Attributes:
+        distance: Of the eye from where the beam begins [m].
+        exposure: How long it may look into the beam [s].
+        pulse_energy: Largest energy of a pulse at the laser's repetition rate and duration [J].
+        average_power: The same as average power [W].
+        criterion: Which of the limits decides: "single pulse", "average" or "pulse train".
+        hazard_distance: From where on the laser as it is keeps the limits [m]; 0: everywhere; infinite: nowhere.
+        standard: The standard, and how it was read.
+    """
+
+    distance: float
+    exposure: float
+    pulse_energy: float
+    average_power: float
+    criterion: str
+    hazard_distance: float
+    standard: str = STANDARD
+
+
+def permissible_exposure(duration: float, wavelength_nm: float) -> float:
+    """MPE of a single exposure of a duration [s]: radiant exposure at the cornea [J/m²], Table A.1.
+
+    Raises `ArgumentError` outside 400 to 1050 nm.
+    """
+    if not 400.0 <= wavelength_nm <= 1050.0:
+        raise ArgumentError(f"wavelength_nm = {wavelength_nm} is outside [400, 1050], where the eye limits are known")
+    c4 = 10.0 ** (0.002 * max(wavelength_nm - 700.0, 0.0))
+    if duration < 1e-11:
+        return 1e-3 * c4 * min(1.0, duration / 1e-13)
+    if duration < _GROUP:
+        return 2e-3 * c4
+    thermal = 18.0 * duration**0.75 * c4 if duration < 10.0 else 10.0 * duration * c4
+    if duration < 10.0 or wavelength_nm > 600.0:
+        return thermal
+    c3 = 10.0 ** (0.02 * max(wavelength_nm - 450.0, 0.0))
+    return min(thermal, c3 * max(100.0, duration))
+
+
+def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -> EyeLimit:
+    """The largest pulse energy and average power of a laser within the MPE, and its hazard distance.
+
+    Args:
+        laser: Its profile, divergence, wavelength, repetition rate and pulse duration; its energy for the distance.
+        distance: Of the eye from where the beam begins [m], ≥ 0; 0.1 m is that of the standard's third condition.
+        exposure: [s], in [1e-6, 3e4]; 100 s is the standard's time base where nobody means to look into the beam,
+            0.25 s the time within which one turns away from visible light.
+
+    Raises:
+        ArgumentError: A value out of its range, or a wavelength outside 400 to 1050 nm.
+        FileError: The image of a measured beam.
+    """
+    if not (distance >= 0.0 and math.isfinite(distance)):
+        raise ArgumentError(f"distance = {distance} m is outside [0, inf)")
+    if not 1e-6 <= exposure <= 3e4:
+        raise ArgumentError(f"exposure = {exposure} s is outside [1e-6, 3e4]")
+    limit, criterion = _pulse_limit(laser, exposure)
+    densest = _densest(laser)
+    energy = limit * _AREA / _share(laser, distance, densest)
+    return EyeLimit(
+        distance=distance,
+        exposure=exposure,
+        pulse_energy=energy,
+        average_power=energy * laser.repetition_rate,
+        criterion=criterion,
+        hazard_distance=_hazard_distance(laser, limit * _AREA / laser.pulse_energy, densest),
+    )
+
+
+def axis_fluence(laser: Laser, distance: float) -> float:
+    """Energy of a pulse through a unit of area in the middle of the beam, over the pulse's energy [1/m²].
+
+    In clear water, at a distance [m] from where the beam begins; infinite for a pencil beam.
+    """
+    if laser.profile == "collimated":
+        return 1.0 / (math.pi * laser.beam_radius**2) if laser.beam_radius > 0.0 else math.inf
+    if laser.profile == "gaussian":
+        return 2.0 / (math.pi * (math.tan(laser.half_angle) * distance) ** 2)
+    if laser.profile == "measured":
+        return _densest(laser) / distance**2
+    return 1.0 / (4.0 * math.pi * (math.sin(0.5 * laser.half_angle) * distance) ** 2)
+
+
+def _pulse_limit(laser: Laser, exposure: float) -> tuple[float, str]:
+    """Largest radiant exposure of a pulse [J/m²], and which limit it is."""
+    rate, nm = laser.repetition_rate, laser.wavelength_nm
+    pulse = max(laser.pulse_fwhm_ps * 1e-12, 1e-13)
+    together = max(1.0, rate * _GROUP)  # pulses that count as one
+    groups = rate / together * min(exposure, 10.0)
+    c5 = max(0.4, 5.0 * groups**-0.25) if exposure > 0.25 and groups > 600.0 else 1.0
+    limits = {
+        "single pulse": permissible_exposure(pulse, nm),
+        "average": permissible_exposure(exposure, nm) / max(rate * exposure, 1.0),
+        "pulse train": c5 * permissible_exposure(_GROUP if together > 1.0 else pulse, nm) / together,
+    }
+    criterion = min(limits, key=limits.__getitem__)
+    return limits[criterion], criterion
+
+
+def _densest(laser: Laser) -> float:
+    """Of a measured beam the largest share of the light per unit of the tangents' plane, else 0."""
+    if laser.profile != "measured":
+        return 0.0
+    image = load_profile(laser)
+    return float(image.max() / image.sum()) / (2.0 * math.tan(laser.half_angle) / image.shape[1]) ** 2
+
+
+def _share(laser: Laser, distance: float, densest: float) -> float:
+    """Part of a pulse that passes the 7 mm aperture in the middle of the beam, at a distance [m]."""
+    if laser.profile == "collimated":
+        return min(1.0, (_APERTURE / laser.beam_radius) ** 2) if laser.beam_radius > 0.0 else 1.0
+    if distance <= 0.0:
+        return 1.0
+    tangent = _APERTURE / distance
+    if laser.profile == "gaussian":
+        return -math.expm1(-2.0 * (tangent / math.tan(laser.half_angle)) ** 2)
+    if laser.profile == "measured":
+        return min(1.0, densest * math.pi * tangent**2)
+    return min(1.0, (math.sin(0.5 * math.atan(tangent)) / math.sin(0.5 * laser.half_angle)) ** 2)
+
+
+def _hazard_distance(laser: Laser, allowed: float, densest: float) -> float:
+    """The distance [m] at which the share through the aperture falls to `allowed`."""
+    if _share(laser, 0.0, densest) <= allowed:
+        return 0.0
+    if _share(laser, _FARTHEST, densest) > allowed:
+        return math.inf
+    low, high = 1e-6, _FARTHEST
+    for _ in range(80):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if _share(laser, middle, densest) > allowed else (low, middle)
+    return high

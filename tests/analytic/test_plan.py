@@ -1,0 +1,203 @@
+"""`spadwarp.plan`: the gate holds the target, the numbers are those of a simulated detector, limits are named."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure
+from spadwarp.scene import Laser, Scene
+from spadwarp.units import range_from_time
+
+SCENE = {
+    "medium": {"extinction": 0.4, "albedo": 0.7, "group_index": 1.36},
+    "laser": {"position": [-0.1, 0, 0], "half_angle_deg": 10.0, "repetition_rate": 1e5, "pulse_energy": 1e-8},
+    "camera": {"width": 32, "height": 24, "horizontal_fov_deg": 12.0, "aperture_diameter": 0.02},
+    "gate": {"start_ns": 0.0, "bin_width_ps": 50.0, "bins": 10},
+    "targets": [{"builtin": "plane", "size": [8, 8], "translation": [0, 0, 6.0], "rotation_deg": [0, 10, 0]}],
+}
+
+
+def make(**sections):
+    return Scene.from_dict({**SCENE, **{name: {**SCENE.get(name, {}), **fields} for name, fields in sections.items()}})
+
+
+def proposal(scene=None, **options):
+    options = {"photons": 200_000, "device": "cpu", "largest_range": False} | options
+    return spadwarp.plan(scene or make(), **options)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return proposal(photons=400_000)
+
+
+def test_the_gate_holds_the_target_and_its_margin(found):
+    truth = spadwarp.truth_maps(found.scene, device="cpu").range
+    assert found.target_range == (float(truth.min()), float(truth.max()))
+    low, high = found.gate_range
+    assert low < truth.min() - 0.25 and truth.max() + 0.25 < high < truth.max() + 0.5
+    warnings = [str(message) for message in spadwarp.check(found.scene) if message.level == "warning"]
+    assert not any("gate" in text for text in warnings), warnings
+    assert found.scene.detector.pulses_per_frame == found.scene.analytic.pulses_per_depth_frame == found.pulses
+
+
+def test_terms_add_up(found):
+    terms = found.terms
+    bound = math.hypot(terms["shot noise"], terms["background"])
+    assert terms["Cramér–Rao bound"] == pytest.approx(bound)
+    assert terms["total"] == pytest.approx(math.hypot(bound, terms["forward scattering"], terms["pile-up"]))
+    assert found.frame_time == found.pulses / 1e5
+
+
+@pytest.mark.physics
+def test_counts_and_floor_are_those_of_the_whole_simulation(found):
+    """Independent photons, all pixels; many pulses leave the floor alone."""
+    whole = found.scene.with_overrides(transport={"photons": 1_000_000, "seed": 99})
+    result = spadwarp.simulate(whole, device="cpu")
+    detections = np.median(result.detections.sum(-1))
+    assert found.pilot.target + found.pilot.backscatter == pytest.approx(detections, rel=0.1)
+    frames = spadwarp.detect(result, pulses=2_000_000_000, seed=1, device="cpu")
+    time = frames.arrival_time("likelihood", device="cpu")[0]
+    depth = spadwarp.scene.geometry.depth_from_time(time, scene=whole)
+    floor = np.nanmedian(np.abs(depth - result.truth.depth))
+    assert found.pilot.floor["likelihood"] == pytest.approx(floor, rel=0.25)
+    assert floor > 3 * found.pilot.unscattered_floor["likelihood"]
+
+
+@pytest.mark.physics
+def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
+    square = {**SCENE["targets"][0], "rotation_deg": [0, 0, 0]}
+    clear = proposal(
+        make(medium={"extinction": 0.1, "albedo": 0.0}, detector={"dark_count_rate": 0.0}).with_overrides(
+            targets=[square]
+        )
+    )
+    bin_range = range_from_time(50e-12, 1.36)  # within a bin the run does not know where the light is
+    assert clear.pilot.floor == clear.pilot.unscattered_floor
+    assert clear.pilot.floor["likelihood"] < 0.5 * bin_range and clear.limit in ("jitter", "shot noise")
+    assert clear.pilot.backscatter == 0 and clear.terms["background"] < 0.2 * clear.terms["shot noise"]
+    # Light is spread evenly over a bin of the run, and then over one of the detector.
+    sigma = range_from_time(1e-12 * math.hypot(85 / 2.3548, 200 / 2.3548, 50 / math.sqrt(6.0)), 1.36)
+    assert clear.pilot.shot_noise == pytest.approx(sigma / math.sqrt(clear.pilot.target), rel=0.03)
+
+
+def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
+    worse, better = (proposal(depth_error=factor * found.pilot.floor["likelihood"]) for factor in (1.2, 1.05))
+    assert worse.pulses < better.pulses and better.pulses_for == "depth error"
+    assert better.terms["total"] == pytest.approx(better.depth_error, rel=0.02)
+    coarse = proposal(depth_error=0.5)
+    assert coarse.pulses_for == "false peaks" and coarse.terms["total"] < 0.5
+    hopeless = proposal(depth_error=0.2 * found.pilot.floor["likelihood"])
+    assert not hopeless.reached and hopeless.limit == "forward scattering"
+    assert "do not help" in hopeless.advice
+    assert hopeless.terms["total"] < 1.1 * hopeless.terms["forward scattering"]
+
+
+def test_a_rate_that_would_fold_is_lowered():
+    fast = proposal(make(laser={"repetition_rate": 50e6}))
+    assert fast.scene.laser.repetition_rate <= fast.largest_rate < 50e6
+    assert fast.unambiguous_range > fast.target_range[1]
+    kept = proposal(make(laser={"repetition_rate": 50e6}, detector={"wrap": False}))
+    assert kept.scene.laser.repetition_rate == 50e6
+
+
+def test_pulse_energy_keeps_the_limits():
+    strong = make(laser={"pulse_energy": 1e-3})
+    lowered = proposal(strong)
+    assert lowered.energy_limit == "pile-up" and lowered.scene.laser.pulse_energy <= lowered.pile_up_energy
+    assert lowered.pilot.brightest == pytest.approx(PILE_UP, rel=0.01)
+    safe = proposal(strong, eye_distance=0.005)
+    assert safe.energy_limit == "eye"
+    assert eye_limit(safe.scene.laser, distance=0.1).hazard_distance <= 0.005
+    assert proposal(full_power=True).scene.laser.pulse_energy > 1e-8
+
+
+@pytest.mark.slow
+def test_largest_range_falls_with_the_extinction():
+    clear, turbid = (proposal(make(medium={"extinction": c}), largest_range=True, depth_error=0.02) for c in (0.2, 0.8))
+    assert 0 < turbid.largest_range < clear.largest_range
+    assert turbid.range_limit
+
+
+def test_ranges_stand_for_an_unknown_target():
+    anywhere = proposal(ranges=(3.0, 5.0))
+    assert anywhere.target_range == (3.0, 5.0) and anywhere.gate_range[0] < 2.75 and anywhere.gate_range[1] > 5.25
+    assert anywhere.scene.targets[0].translation == (0.0, 0.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"depth_error": 0.0}, "depth_error = 0.0"),
+        ({"ranges": (5.0, 3.0)}, "least <= largest"),
+        ({"method": "guess"}, "'guess' is not one of"),
+        ({"margin": -1.0}, "margin = -1.0"),
+        ({"eye_exposure": 1e9}, "exposure = 1000000000.0"),
+    ],
+)
+def test_wrong_arguments_are_named(options, words):
+    with pytest.raises(spadwarp.ArgumentError, match=words.replace("(", r"\(")):
+        proposal(**options)
+
+
+def test_a_scene_without_a_target_says_what_it_needs():
+    scene = Scene.from_dict({name: fields for name, fields in SCENE.items() if name != "targets"})
+    with pytest.raises(spadwarp.ConfigError, match="no target is in view"):
+        proposal(scene)
+
+
+# Eye safety. The accessible emission limits of class 1 (IEC 60825-1:2014, Table 3) are the MPE times the area of 7 mm.
+
+PENCIL = {"profile": "collimated", "wavelength_nm": 532.0}
+
+
+@pytest.mark.parametrize(
+    ("laser", "exposure", "energy", "power", "criterion"),
+    [
+        ({"repetition_rate": 1.0, "pulse_fwhm_ps": 1000.0}, 0.25, 77e-9, None, "single pulse"),  # class 1: 7.7e-8 J
+        ({"repetition_rate": 1.0, "pulse_fwhm_ps": 5.0}, 0.25, 38e-9, None, "single pulse"),  # 3.8e-8 J
+        ({"repetition_rate": 1e8}, 100.0, None, 0.39e-3, "average"),  # class 1: 0.39 mW
+        ({"repetition_rate": 1e8}, 0.25, None, 1.0e-3, "average"),  # class 2: 1 mW
+        ({"repetition_rate": 1e8, "wavelength_nm": 450.0}, 100.0, None, 3.9e-5, "average"),  # photochemical, 39 µW
+        ({"repetition_rate": 1e3}, 10.0, 0.5 * 77e-9, None, "pulse train"),  # C5 = 5·10⁴^-0.25 = 0.5
+    ],
+)
+def test_eye_limits_are_those_of_the_classes(laser, exposure, energy, power, criterion):
+    found = eye_limit(Laser(**PENCIL | laser), exposure=exposure)
+    assert found.criterion == criterion
+    assert energy is None or found.pulse_energy == pytest.approx(energy, rel=0.03)
+    assert power is None or found.average_power == pytest.approx(power, rel=0.03)
+
+
+def test_mpe_is_continuous():
+    for nm in (532.0, 900.0):
+        below, above = permissible_exposure(10.0 * (1 - 1e-9), nm), permissible_exposure(10.0, nm)
+        assert above == pytest.approx(below, rel=0.02)
+    assert permissible_exposure(5e-6, 532.0) == pytest.approx(2e-3, rel=0.05)
+    with pytest.raises(spadwarp.ArgumentError, match="outside \\[400, 1050\\]"):
+        permissible_exposure(1.0, 1550.0)
+
+
+@pytest.mark.parametrize("profile", ["uniform_cone", "gaussian"])
+def test_the_hazard_distance_is_where_the_limit_is(profile):
+    laser = Laser(profile=profile, half_angle_deg=5.0)
+    distance = eye_limit(laser).hazard_distance
+    assert eye_limit(laser, distance=distance).pulse_energy == pytest.approx(laser.pulse_energy, rel=1e-6)
+    assert distance < eye_limit(laser.model_copy(update={"pulse_energy": 1e-6})).hazard_distance
+
+
+def test_the_aperture_far_away_sees_the_fluence_on_the_axis():
+    for profile in ("uniform_cone", "gaussian"):
+        laser = Laser(profile=profile, half_angle_deg=5.0)
+        limit = eye_limit(laser, distance=5.0)
+        per_area = permissible_exposure(100.0, 532.0) / (100.0 * laser.repetition_rate)
+        assert limit.pulse_energy == pytest.approx(per_area / axis_fluence(laser, 5.0), rel=1e-4)
+
+
+def test_proposals_go_into_json(found):
+    fields = found.to_dict()
+    assert fields["values"]["gate.bins"] == found.scene.gate.bins and "scene" not in fields
+    assert set(fields["pilot"]) == {field.name for field in dataclasses.fields(found.pilot)}
