@@ -13,7 +13,7 @@ from spadwarp.units import range_from_time
 
 SCENE = {
     "medium": {"extinction": 0.4, "albedo": 0.7, "group_index": 1.36},
-    "laser": {"position": [-0.1, 0, 0], "half_angle_deg": 10.0, "repetition_rate": 1e5, "pulse_energy": 1e-8},
+    "laser": {"position": [-0.1, 0, 0], "half_angle_deg": 10.0, "repetition_rate": 1e5, "pulse_energy": 1e-9},
     "camera": {"width": 32, "height": 24, "horizontal_fov_deg": 12.0, "aperture_diameter": 0.02},
     "gate": {"start_ns": 0.0, "bin_width_ps": 50.0, "bins": 10},
     "targets": [{"builtin": "plane", "size": [8, 8], "translation": [0, 0, 6.0], "rotation_deg": [0, 10, 0]}],
@@ -109,10 +109,10 @@ def test_pulse_energy_keeps_the_limits():
     lowered = proposal(strong)
     assert lowered.energy_limit == "pile-up" and lowered.scene.laser.pulse_energy <= lowered.pile_up_energy
     assert lowered.pilot.brightest == pytest.approx(PILE_UP, rel=0.01)
-    safe = proposal(strong, eye_distance=0.005)
+    safe = proposal(make(laser={"pulse_energy": 1e-3, "wavelength_nm": 450.0}), eye_distance=0.005)
     assert safe.energy_limit == "eye"
     assert eye_limit(safe.scene.laser, distance=0.1).hazard_distance <= 0.005
-    assert proposal(full_power=True).scene.laser.pulse_energy > 1e-8
+    assert proposal(full_power=True).scene.laser.pulse_energy > 1e-9
 
 
 @pytest.mark.slow
