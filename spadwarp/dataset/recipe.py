@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.text import read_toml
+from spadwarp.io.parsing import read_toml
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
@@ -321,7 +321,9 @@ def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None
     folder, changed = Path(source).absolute().parent, dict(targets)
     for name in ("meshes", "exports"):
         if isinstance(given := targets.get(name), (list, tuple)):
-            changed[name] = [str(folder / Path(path).expanduser()) if isinstance(path, str) else path for path in given]
+            changed[name] = [
+                str(folder / os.path.expanduser(path)) if isinstance(path, str) else path for path in given
+            ]
     return {**tables, "targets": changed}
 
 

@@ -11,7 +11,7 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.text import read_toml
+from spadwarp.io.parsing import read_toml
 from spadwarp.scene.messages import describe
 
 __all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]

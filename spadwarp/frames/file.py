@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
+from spadwarp.io.parsing import parse_toml
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
@@ -99,7 +99,7 @@ class FramesFile:
                 edges=file["edges"][...],
                 period=period if np.isfinite(period) else None,
                 irf=irf,
-                scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=source or None),
+                scene=Scene.from_dict(parse_toml(file["config"].asstr()[()]), source=source or None),
                 truth_depth=file["truth/depth"][...],
                 methods=tuple(file["depth"]),
                 **cubes,

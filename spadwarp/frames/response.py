@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,7 +11,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.io.parsing import file_problem, read_columns
+from spadwarp.limits import shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -259,24 +260,14 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
 
 
 def _read_csv(path: Path) -> InstrumentResponse:
-    if not path.is_file():
-        raise ArgumentError(f"irf = {str(path)!r} is neither a known shape nor a file")
-    rows: list[tuple[float, float]] = []
-    named = False
-    with path.open(newline="") as file:
-        for number, row in enumerate(csv.reader(file), 1):
-            if not row or row[0].lstrip().startswith("#"):
-                continue
-            try:
-                time, value = (float(cell) for cell in row[:2])
-            except ValueError:
-                if rows or named:
-                    raise ArgumentError(f"{path}, line {number}: {','.join(row)!r} is not time_ps,value") from None
-                named = True
-                continue
-            rows.append((time * 1e-12, value))
+    if file_problem(path) is not None:
+        raise ArgumentError(f"irf = {shown(str(path))} is neither a known shape nor a file")
     try:
-        return InstrumentResponse(times=[time for time, _ in rows], values=[value for _, value in rows])
+        times, values = read_columns(path, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
+    except (ConfigError, FileError) as error:
+        raise ArgumentError(str(error)) from None
+    try:
+        return InstrumentResponse(times=times * 1e-12, values=values)
     except ValueError as error:
         raise ArgumentError(f"{path}: {error}") from None
 

@@ -1,4 +1,4 @@
-"""Text formats: TOML files in, JSON and CSV out."""
+"""Text files written: JSON and CSV."""
 
 from __future__ import annotations
 
@@ -6,25 +6,13 @@ import csv
 import json
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
 
-__all__ = ["json_text", "read_toml", "write_csv", "write_json", "write_text"]
-
-
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The tables of a TOML file. Raises `FileError` if it cannot be read, `ConfigError` if it is not TOML."""
-    try:
-        return tomllib.loads(Path(path).read_bytes().decode())
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"not valid TOML: {error}", source=str(path)) from None
+__all__ = ["json_text", "write_csv", "write_json", "write_text"]
 
 
 def json_text(value: Any, *, indent: int = 2) -> str:

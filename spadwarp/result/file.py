@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.io.parsing import parse_toml
 from spadwarp.result.result import COMPONENTS, Result, Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
@@ -96,7 +96,7 @@ def load_result(path: str | Path) -> Result:
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         return Result(
-            scene=Scene.from_dict(tomllib.loads(file["config"].asstr()[()]), source=file.attrs.get("source")),
+            scene=Scene.from_dict(parse_toml(file["config"].asstr()[()]), source=file.attrs.get("source")),
             tallies=file["tallies"][...],
             unit=float(file.attrs["unit"]),
             photons=int(file.attrs["photons"]),

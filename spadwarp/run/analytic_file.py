@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import response_sigma
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.io.parsing import parse_toml
 from spadwarp.scene import Scene
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def load_analytic(path: str | Path) -> FrameSequence:
     """The depth frames in a file of `save_analytic`. Raises `FileError`."""
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         config, source = file["config"].asstr()[()], file.attrs.get("source")
-        scene, truth = Scene.from_dict(tomllib.loads(config), source=source or None), file["truth/depth"][...]
+        scene, truth = Scene.from_dict(parse_toml(config), source=source or None), file["truth/depth"][...]
         count = len(file["depth"])
 
     def frame(number: int) -> SequenceFrame:

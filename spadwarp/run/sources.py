@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.frames.file import FORMAT, FramesFile
 from spadwarp.frames.frames import Frames
 from spadwarp.io.hdf5 import hdf5_format
+from spadwarp.io.parsing import parse_toml
 from spadwarp.result.file import load_result
 from spadwarp.result.result import Result
 from spadwarp.run import analytic_file
@@ -123,7 +123,7 @@ def _of_dataset(folder: Path, split: str) -> Iterator[FrameSequence]:
         def frame(number: int) -> SequenceFrame:
             item = depth[number]
             row = int(item["scene"])
-            scene = Scene.from_dict(tomllib.loads(scenes["config"][row].decode()))
+            scene = Scene.from_dict(parse_toml(scenes["config"][row].decode()))
             common: dict[str, Any] = {
                 "images": {name: item[field][0] for name, field in _DATASET_IMAGES.items()},
                 "scene": scene,

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
+from spadwarp.io.parsing import parse_json, read_text
+from spadwarp.limits import check_integer, check_real, parse_number, shown
 
 __all__ = ["load_calibration"]
+
+_LARGEST = 1 << 19  # bytes; one with all corners of 100 views has 300 kB
 
 # What programs call the same thing.
 _NAMES = {
@@ -42,14 +44,9 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
 
     Raises:
         FileError: The file cannot be read.
-        ConfigError: It holds no calibration, or one of a lens model other than Brown's.
+        ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise FileError(f"{path}: not a text file") from None
+    text = read_text(path, largest=_LARGEST)
     try:
         return _fields(_entries(text))
     except ValueError as error:
@@ -59,9 +56,11 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
 def _entries(text: str) -> dict[str, Any]:
     is_json = text.lstrip().startswith("{")
     try:  # OpenCV's first line is no YAML
-        entries = json.loads(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        entries = parse_json(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
+    except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"not valid {'JSON' if is_json else 'YAML'}: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ValueError("not valid YAML: lists or tables are nested too deeply") from None
     return entries if isinstance(entries, dict) else {}
 
 
@@ -81,31 +80,38 @@ def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
 
     model = entries.get("distortion_model", entries.get("camera_model", "plumb_bob"))
     if str(model).lower() not in ("plumb_bob", "brown", "pinhole", "opencv", "radtan"):
-        raise ValueError(f"the lens model {model!r} is not Brown's (k1, k2, p1, p2, k3)")
+        raise ValueError(f"the lens model {shown(model)} is not Brown's (k1, k2, p1, p2, k3)")
     matrix = find("camera_matrix")
     if matrix is None or len(matrix) != 9:
         raise ValueError("holds no camera_matrix of 3 x 3 numbers")
     fx, skew, cx, zero, fy, cy, *last = matrix
     if skew or zero or last != [0, 0, 1] or fx <= 0 or fy <= 0:
-        raise ValueError(f"camera_matrix = {matrix} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+        raise ValueError(f"camera_matrix = {shown(matrix)} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
     distortion = find("distortion") or []
     if any(distortion[5:]) or len(distortion) not in (0, 4, 5, 8, 12, 14):
         raise ValueError(
-            f"distortion_coefficients = {distortion}: k1, k2, p1, p2, k3 are known, no rational, prism or tilt terms"
+            f"distortion_coefficients = {shown(distortion)}: k1, k2, p1, p2, k3 are known, no rational, prism or tilt"
+            " terms"
         )
     coefficients = tuple([*distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5])
     fields: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": coefficients}
     for name in ("width", "height"):
         if (pixels := find(name)) is not None:
-            if len(pixels) != 1 or not 1 <= pixels[0] < 2**31:
-                raise ValueError(f"image_{name} = {pixels} is not a number of pixels")
-            fields[name] = int(pixels[0])
+            fields[name] = check_integer(f"image_{name}", pixels[0] if len(pixels) == 1 else pixels, "[1, 16384]")
     return fields
 
 
 def _numbers(name: str, value: Any) -> list[float]:
     """The numbers of a matrix as OpenCV and ROS write it, of a list of rows, or of a list; or the one number."""
+    data = value.get("data") if isinstance(value, Mapping) else value
+    items = data if isinstance(data, list) else [data]
+    cells = [cell for item in items for cell in (item if isinstance(item, list) else [item])]
+    return [_number(name, cell) for cell in cells]
+
+
+def _number(name: str, cell: Any) -> float:
     try:
-        return np.array(value["data"] if isinstance(value, Mapping) else value, np.float64).ravel().tolist()
-    except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{name} is neither a number nor a matrix") from None
+        number = parse_number(cell) if isinstance(cell, str) else cell
+    except ValueError as error:
+        raise ValueError(f"{name} = {shown(cell)} {error}") from None
+    return check_real(name, number, "[-1e9, 1e9]")

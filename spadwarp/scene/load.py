@@ -7,11 +7,12 @@ exclude each other: there a later one displaces the earlier ones (`merge_section
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from spadwarp.errors import ConfigError
+from spadwarp.io.parsing import parse_toml
+from spadwarp.limits import parse_number, shown
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.phase_fields import PHASE_FIELDS
 from spadwarp.scene.preset import PRESETS
@@ -101,18 +102,24 @@ def merge_scene(base: Mapping[str, Any], layer: Mapping[str, Any]) -> Table:
     for section, fields in layer.items():
         old = merged.get(section)
         if section == "targets" and isinstance(fields, Mapping):
-            targets = list(old) if isinstance(old, Sequence) else []
-            for index, target in sorted(fields.items()):
-                if index > len(targets):
-                    raise ConfigError(f"targets[{index}] does not exist; the scene has {len(targets)}")
-                targets[index : index + 1] = [merge_section("targets", dict(*targets[index : index + 1]), target)]
-            merged[section] = targets
+            merged[section] = _merge_targets(old or [], fields)
         elif isinstance(fields, Mapping):
             whole = merge_section(section, {}, old) if isinstance(old, Mapping) else {}  # its own preset first
             merged[section] = merge_section(section, whole, fields)
         else:
             merged[section] = fields
     return merged
+
+
+def _merge_targets(old: Any, layer: Mapping[int, Any]) -> list[Any]:
+    if not (isinstance(old, list | tuple) and all(isinstance(target, Mapping) for target in old)):
+        raise ConfigError(f"targets = {shown(old)} is not a list of tables, [[targets]]")
+    targets = list(old)
+    for index, target in sorted(layer.items()):
+        if index > len(targets):
+            raise ConfigError(f"targets[{index}] does not exist; the scene has {len(targets)}")
+        targets[index : index + 1] = [merge_section("targets", dict(*targets[index : index + 1]), target)]
+    return targets
 
 
 def parse_override(text: str) -> tuple[Key, Any]:
@@ -124,7 +131,7 @@ def parse_override(text: str) -> tuple[Key, Any]:
     """
     name, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not value:
-        raise ConfigError(f"override {text!r} is not of the form section.field=value")
+        raise ConfigError(f"override {shown(text)} is not of the form section.field=value")
     return parse_key(name), _parse_value(value, text)
 
 
@@ -133,21 +140,22 @@ def parse_key(name: str) -> Key:
 
     Raises `ConfigError`.
     """
-    parts = re.sub(r"\[(\d+)\]", r".\1", name).split(".")
-    if not all(re.fullmatch(r"\w+", part) for part in parts) or parts[0].isdigit():
-        raise ConfigError(f"override {name!r} does not name a field; write section.field or targets[0].field")
-    return tuple(int(part) if part.isdigit() else part for part in parts)
+    parts = re.sub(r"\[([0-9]+)\]", r".\1", name).split(".")
+    if not all(re.fullmatch(r"[a-zA-Z_]\w*|[0-9]{1,9}", part, re.ASCII) for part in parts) or _is_index(parts[0]):
+        raise ConfigError(f"override {shown(name)} does not name a field; write section.field or targets[0].field")
+    return tuple(int(part) if _is_index(part) else part for part in parts)
 
 
 def _parse_value(value: str, text: str) -> Any:
     try:
-        table = tomllib.loads(f"value = {value}")
-    except tomllib.TOMLDecodeError as error:
-        if re.fullmatch(r"[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?", value):
-            return float(value)  # .9 and 5. are not TOML, but mean numbers
+        table = parse_toml(f"value = {value}")
+    except ConfigError as error:
         if value[0] in "\"'[{":
-            raise ConfigError(f"override {text!r}: the value is not valid TOML: {error}") from None
-        return value
+            raise ConfigError(f"override {shown(text)}: {error}") from None
+        try:
+            return parse_number(value)  # .9 and 5. are not TOML, but mean numbers
+        except ValueError:
+            return value
     return table["value"] if len(table) == 1 else value
 
 
@@ -161,8 +169,10 @@ def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> Table:
     pairs: Iterator[tuple[Key, Any]]
     if isinstance(overrides, Mapping):
         pairs = ((parse_key(str(name)), value) for name, value in overrides.items())
-    else:
+    elif isinstance(overrides, Sequence) and all(isinstance(text, str) for text in overrides):
         pairs = (parse_override(text) for text in overrides)
+    else:
+        raise ConfigError(f"overrides = {shown(overrides)} are neither a dict nor texts such as 'section.field=value'")
     layer: Table = {}
     for key, value in pairs:
         for leaf, leaf_value in _leaves(key, value):
@@ -177,9 +187,13 @@ def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:
     """The fields of a value that may be a section, a target or all targets as nested mappings."""
     if isinstance(value, Mapping) and len(key) < (3 if key[0] == "targets" else 2):
         for name, inner in value.items():
-            yield from _leaves((*key, int(name) if str(name).isdigit() else str(name)), inner)
+            yield from _leaves((*key, int(name) if _is_index(name) else str(name)), inner)
     else:
         yield key, value
+
+
+def _is_index(name: Any) -> bool:
+    return re.fullmatch(r"[0-9]{1,9}", str(name)) is not None
 
 
 def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
@@ -193,7 +207,9 @@ def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
     elif shape == (str, str) and key[0] != "targets" and isinstance(fields, dict):
         fields[key[1]] = value
     else:
-        raise ConfigError(f"override {key_text(key)!r} does not name a field; write section.field or targets[0].field")
+        raise ConfigError(
+            f"override {shown(key_text(key))} does not name a field; write section.field or targets[0].field"
+        )
 
 
 def key_text(key: Sequence[str | int]) -> str:

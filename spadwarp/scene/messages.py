@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from spadwarp.limits import Interval, shown
 from spadwarp.scene.load import Key, key_text
 
 # What people write for a field's name, beyond misspellings.
@@ -35,16 +36,20 @@ _KINDS = {
 }
 
 
+_MOST = 50  # lines
+
 _LIMITS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
 
 
 def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[str, Any]) -> list[str]:
     """One line for each field that `error` complains about; `overrides` is the layer set from outside the file."""
     lines: dict[Key, str] = {}
-    for problem in error.errors(include_url=False):
+    problems = error.errors(include_url=False)
+    for problem in problems[:_MOST]:
         key, info = _locate(model, problem["loc"])
         lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
-    return list(dict.fromkeys(lines.values()))  # a list that is too short misses each item
+    more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
+    return [*dict.fromkeys(lines.values()), *more]  # a list that is too short misses each item
 
 
 def _locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, FieldInfo | None]:
@@ -71,6 +76,7 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel], overridden: bool) -> str:
     name = key_text(key)
+    name = name if len(name) <= 200 else f"{name[:200]}..."
     kind, value = problem["type"], problem["input"]
     if kind == "extra_forbidden":
         siblings = _fields(model, key[:-1])
@@ -81,29 +87,29 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     cause = problem.get("ctx", {}).get("error")
     if kind in ("missing", "too_short", "too_long"):  # of a list
         name = key_text(key[: max(i for i, part in enumerate(key) if isinstance(part, str)) + 1])
-        return f"{name} = {_shown(value)} has the wrong number of values"
-    shown = f"{name} = {_shown(value)}" + (" (an override)" if overridden else "")
+        return f"{name} = {shown(value)} has the wrong number of values"
+    entry = f"{name} = {shown(value)}" + (" (an override)" if overridden else "")
     if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
         whole_table = isinstance(value, (Mapping, BaseModel))
         text = cause.args[0]
         if not key:  # of the scene as a whole
             return text
         if not whole_table:
-            return f"{shown} {text}"
+            return f"{entry} {text}"
         return f"{name} {text}" if text.startswith("needs") else f"{name}.{text}"
     choices = _choices(info, cause)
     if kind in _LIMITS and info is not None:
-        return f"{shown} is outside {_interval(info)}" + "".join(f" and not {word!r}" for word in choices)
+        return f"{entry} is outside {_interval(info)}" + "".join(f" and not {word!r}" for word in choices)
     if choices and kind in _KINDS and isinstance(value, str):
-        return f"{shown} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
+        return f"{entry} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
     if choices:
         others = [cause.args[2]] if cause is not None and len(cause.args) > 2 else []
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
-        return f"{shown} is not one of {listed}{_suggest(str(value), choices)}"
+        return f"{entry} is not one of {listed}{_suggest(str(value), choices)}"
     if kind in _KINDS:
-        return f"{shown} is not {_KINDS[kind]}"
+        return f"{entry} is not {_KINDS[kind]}"
     message = problem["msg"]
-    return f"{shown}: {message[0].lower()}{message[1:]}"
+    return f"{entry}: {message[0].lower()}{message[1:]}"
 
 
 def _fields(model: type[BaseModel], key: Key) -> list[str]:
@@ -115,15 +121,12 @@ def _fields(model: type[BaseModel], key: Key) -> list[str]:
 
 
 def _suggest(name: str, known: Sequence[str]) -> str:
+    if len(name) > 100:  # the time to compare words grows as the product of their lengths
+        return ""
     close = [_SYNONYMS[name]] if _SYNONYMS.get(name) in known else []
     close = close or [one for one in known if one.lower().startswith(name.lower())]
     close = close or difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {' or '.join(map(repr, close[:2]))}?" if close else ""
-
-
-def _shown(value: Any) -> str:
-    text = repr(list(value) if isinstance(value, tuple) else value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _choices(info: FieldInfo | None, cause: Any) -> tuple[str, ...]:
@@ -143,15 +146,15 @@ def _literals(annotation: Any) -> Iterator[str]:
 
 def _interval(info: FieldInfo) -> str:
     """The range of a numeric field, such as `(0, 1]`."""
-    low, high, left, right = -math.inf, math.inf, "(", ")"
+    interval = Interval(-math.inf, math.inf, False, False)
     for bound in _bounds(info):
-        for name, value in (("gt", "("), ("ge", "[")):
+        for name, includes in (("gt", False), ("ge", True)):
             if getattr(bound, name, None) is not None:
-                low, left = getattr(bound, name), value
-        for name, value in (("lt", ")"), ("le", "]")):
+                interval = interval._replace(low=getattr(bound, name), includes_low=includes)
+        for name, includes in (("lt", False), ("le", True)):
             if getattr(bound, name, None) is not None:
-                high, right = getattr(bound, name), value
-    return f"{left}{low}, {high}{right}"
+                interval = interval._replace(high=getattr(bound, name), includes_high=includes)
+    return str(interval)
 
 
 def _bounds(holder: Any) -> Iterator[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,14 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ConfigError
+from spadwarp.io.parsing import read_columns
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.preset import PHASE_TABLES
 from spadwarp.water import molecular_density
 
-__all__ = ["PhaseFunction", "phase_function", "read_phase_table"]
+__all__ = ["PHASE_COLUMNS", "PhaseFunction", "phase_function"]
 
 Floats = NDArray[np.float64]
+
+PHASE_COLUMNS = {"angle_deg": "[0, 180]", "value": "[0, 1e30]"}
+"""Columns of a phase table: scattering angle [°] and value of any scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +89,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
             if table in PHASE_TABLES
             else Path(table)
         )
-        angles, values = read_phase_table(path)
+        angles, values = read_columns(path, PHASE_COLUMNS).T
         try:
             density = sk.interpolated_density(np.radians(angles), values)
             first_angle = math.radians(float(angles[0]))
@@ -103,30 +106,3 @@ def phase_function(medium: Medium) -> PhaseFunction:
             return (1.0 - share) * of_particles(t) + share * molecular_density(t)
 
     return PhaseFunction(name, parameters, share, density, first_angle)
-
-
-def read_phase_table(path: str | Path) -> tuple[Floats, Floats]:
-    """Scattering angles [°] and values of any scale from a .csv file of two columns.
-
-    Lines that begin with # and one line of names are passed over. Raises `FileError`, `ConfigError` for a line that is
-    not two numbers.
-    """
-    rows: list[tuple[float, float]] = []
-    named = False
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            for number, row in enumerate(csv.reader(file), 1):
-                if not row or row[0].lstrip().startswith("#"):
-                    continue
-                try:
-                    angle, value = (float(cell) for cell in row)
-                except ValueError:
-                    if rows or named:
-                        problem = f"{path}, line {number}: {','.join(row)!r} is not angle_deg,value"
-                        raise ConfigError(problem) from None
-                    named = True
-                    continue
-                rows.append((angle, value))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'it is not text'}") from None
-    return np.array([angle for angle, _ in rows]), np.array([value for _, value in rows])

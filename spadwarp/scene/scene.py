@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.text import read_toml
+from spadwarp.io.parsing import read_toml
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.camera import Camera
@@ -171,7 +171,7 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     def absolute(fields: Any, name: str, ending: str = "") -> Any:
         value = fields.get(name) if isinstance(fields, Mapping) else None
         if isinstance(value, str) and value.lower().endswith(ending):
-            return {**fields, name: str(folder / Path(value).expanduser())}
+            return {**fields, name: str(folder / os.path.expanduser(value))}
         return fields
 
     changed = dict(tables)

@@ -143,11 +143,12 @@ def test_csv(tmp_path):
     ("text", "message"),
     [
         ("time_ps,value\n0,1\n1,x\n", "line 3"),
-        ("0,1\n1,-1\n", "not negative"),
+        ("0,1\n1,-1\n", r"line 2: value = -1 is outside \[0, 1e30\]"),
         ("0,1\n0,2\n", "ascending"),
         ("0,1\n", "two or more"),
         ("0,0\n1,0\n", "not all 0"),
-        ("0,1\n1,nan\n", "finite"),
+        ("0,1\n1,nan\n", "line 2"),
+        ("0,1\n1e300,1\n", "line 2: time_ps = 1e[+]300 is outside"),
     ],
 )
 def test_a_bad_csv_is_named(tmp_path, text, message):

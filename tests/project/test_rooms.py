@@ -24,6 +24,7 @@ LEVELS = (
     ("water",),
     ("parallel", "arrays"),
     ("io", "device"),
+    ("limits",),
     ("units", "errors"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -185,8 +185,15 @@ def test_a_calibration_file_becomes_fields(tmp_path, text):
         ('{"K": ' + "[" * 100_000, "not valid JSON"),
         ("K: [61.0, 0,\n", "not valid YAML: while parsing a flow"),
         ("K: &a [61.0]\nD: *a\n", "not valid YAML: an alias stands in line 2"),
-        (_ROS_YAML.replace("61.0", "abc"), "camera_matrix is neither a number nor a matrix"),
-        (_ROS_YAML.replace("width: 64", "width: [64, 48]"), "image_width = [64.0, 48.0] is not a number of pixels"),
+        (_ROS_YAML.replace("61.0", "abc"), "camera_matrix = 'abc' is not a number"),
+        (_ROS_YAML.replace("61.0", "nan"), "camera_matrix = 'nan' is not a number"),
+        (_ROS_YAML.replace("61.0", "inf"), "camera_matrix = inf is outside [-1e9, 1e9]"),
+        (_ROS_YAML.replace("61.0", "9" * 20_000), "is beyond the largest number"),
+        ('{"K": ' + "9" * 20_000 + "}", "not valid JSON: Exceeds the limit"),
+        ('{"K": {"rows": 3}}', "K = None is not a number"),
+        ('{"K": [[{}, 0, 1]]}', "K = {} is not a number"),
+        (_ROS_YAML.replace("width: 64", "width: [64, 48]"), "image_width = [64.0, 48.0] is not an integer"),
+        (_ROS_YAML.replace("width: 64", "width: 64.5"), "image_width = 64.5 is not an integer in [1, 16384]"),
     ],
 )
 def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
@@ -197,6 +204,13 @@ def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
     assert problem in str(caught.value) and str(path) in str(caught.value)
     with pytest.raises(FileError, match="No such file"):
         Camera(calibration=str(tmp_path / "none.yml"), aperture_diameter=0.01, width=64, height=48)
+
+
+def test_a_calibration_of_many_lines_is_refused_before_it_is_parsed(tmp_path):
+    path = tmp_path / "camera.yml"
+    path.write_text(_ROS_YAML + "\n" * 600_000)
+    with pytest.raises(FileError, match=r"camera\.yml: has more than 524288 bytes"):
+        Camera(calibration=str(path), aperture_diameter=0.01, width=64, height=48)
 
 
 def test_files_beside_a_scene_are_found_from_anywhere(tmp_path):

@@ -10,8 +10,9 @@ from helpers.scenes import scene
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp.errors import ConfigError, FileError
+from spadwarp.io.parsing import read_columns
 from spadwarp.scene import Medium
-from spadwarp.scene.phase import read_phase_table
+from spadwarp.scene.phase import PHASE_COLUMNS
 from spadwarp.scene.preset import PHASE_TABLES
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
@@ -96,7 +97,7 @@ def test_shipped_tables_are_sourced_and_offered(name):
 def test_a_table_may_have_comments_and_a_line_of_names(tmp_path):
     path = tmp_path / "vsf.csv"
     path.write_text("# where from\nangle_deg, value\n0,2\n\n90, 1\n180, 1\n")
-    angles, values = read_phase_table(path)
+    angles, values = read_columns(path, PHASE_COLUMNS).T
     np.testing.assert_array_equal(angles, [0, 90, 180])
     np.testing.assert_array_equal(values, [2, 1, 1])
 
@@ -106,10 +107,14 @@ def test_a_table_may_have_comments_and_a_line_of_names(tmp_path):
     [
         ("0,1\n90\n", "line 2: '90' is not angle_deg,value"),
         ("0,1\n90,x\n", "line 2"),
-        ("0,1,2\n0,1\n", "two or more"),
+        ("0,1\n", "two or more"),
         ("90,1\n0,1\n", "ascending"),
-        ("0,1\n190,1\n", "outside"),
-        ("0,1\n90,-1\n", "not negative"),
+        ("0,1\n190,1\n", r"line 2: angle_deg = 190 is outside \[0, 180\]"),
+        ("0,1\n90,-1\n", r"line 2: value = -1 is outside \[0, 1e30\]"),
+        ("0,1e308\n90,1e308\n", "line 1: value = 1e[+]308 is outside"),
+        ("0,1\n90,nan\n", "line 2"),
+        ("0,1\n90,inf\n", "line 2: value = inf is outside"),
+        ("0,1\n" + "9" * 140_000 + ",1\n", "line 2: field larger than field limit"),
     ],
 )
 def test_a_bad_table_is_named(text, error, tmp_path):

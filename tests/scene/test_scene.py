@@ -293,10 +293,12 @@ def test_a_missing_or_broken_file_is_named(tmp_path):
     with pytest.raises(FileError, match=r"nowhere\.toml: cannot be read: No such file"):
         load_scene(tmp_path / "nowhere.toml")
     broken = tmp_path / "broken.toml"
-    for content in (b"[medium\n", b"\xff\xfe"):
-        broken.write_bytes(content)
-        with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
-            load_scene(broken)
+    broken.write_bytes(b"[medium\n")
+    with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
+        load_scene(broken)
+    broken.write_bytes(b"\xff\xfe")
+    with pytest.raises(FileError, match=r"broken\.toml: not a text file"):
+        load_scene(broken)
 
 
 def test_models_are_frozen():

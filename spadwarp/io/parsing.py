@@ -1,0 +1,147 @@
+"""Text files read: TOML, JSON and columns of numbers, with limits to what a small file can cost."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.limits import Interval, parse_number, shown
+
+__all__ = ["file_problem", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml"]
+
+_LARGEST_TEXT = 4 << 20  # bytes; a table of 100 000 rows has 2 MiB
+_DEEPEST = 32  # tables and lists in each other; a recipe has 6
+# More parts than a key of ours has, in front of which no other part stands: the time to read one grows as their square.
+_LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){64}""")
+
+
+def file_problem(path: str | os.PathLike[str]) -> str | None:
+    """Why there is no file to read at a path: "no such file", "is not a file", …; None where there is one."""
+    try:
+        if Path(path).is_file():
+            return None
+        return "is not a file" if Path(path).exists() else "no such file"
+    except OSError as error:  # a name that is too long, a folder without permission
+        return f"cannot be read: {error.strerror}"
+
+
+def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> str:
+    """The text of a UTF-8 file of `largest` bytes at most; raises `FileError` if it cannot be read or is no text."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(largest + 1)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError:  # a NUL in the name
+        raise FileError(f"{str(path)!r} is no name of a file") from None
+    if len(content) > largest:
+        raise FileError(f"{path}: has more than {largest} bytes, the most that is read of such a file")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not a text file: {error}") from None
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The tables of a TOML file. Raises `FileError` if it cannot be read, `ConfigError` as `parse_toml` does."""
+    return parse_toml(read_text(path), source=str(path))
+
+
+def parse_toml(text: str, *, source: str | None = None) -> dict[str, Any]:
+    """The tables of a TOML text: numbers, words, lists and tables; `source` is its file, for errors.
+
+    Raises `ConfigError` for what is not TOML, nested too deeply, or of a kind that no field takes: dates, integers
+    beyond 64 bits, text with NUL.
+    """
+    try:
+        if (key := _LONG_KEY.search(text)) is not None:
+            raise ValueError(f"a key in line {text.count(chr(10), 0, key.start()) + 1} has 64 parts or more")
+        tables = tomllib.loads(text, parse_float=_parse_float)
+    except ValueError as error:
+        raise ConfigError(f"not valid TOML: {error}", source=source) from None
+    except RecursionError:
+        raise ConfigError("not valid TOML: lists or tables are nested too deeply", source=source) from None
+    if problems := list(_problems(tables)):
+        raise ConfigError(problems, source=source)
+    return tables
+
+
+def _parse_float(text: str) -> float:
+    """TOML's floats; NaN is left to the fields, which name themselves."""
+    if text.lstrip("+-") == "nan":
+        return math.nan
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise ValueError(f"{shown(text)} {error}") from None
+
+
+def _problems(tables: dict[str, Any]) -> Iterator[str]:
+    """Values that no field takes, each by its key."""
+    left: list[tuple[str, int, Any]] = [("", 0, tables)]
+    while left:
+        name, depth, value = left.pop()
+        if depth > _DEEPEST:
+            yield f"{name[:60]}... is nested more than {_DEEPEST} deep"
+        elif isinstance(value, dict):
+            left += [(f"{name}.{key}" if name else key, depth + 1, item) for key, item in reversed(value.items())]
+        elif isinstance(value, list):
+            left += [(f"{name}[{index}]", depth + 1, item) for index, item in reversed(list(enumerate(value)))]
+        elif isinstance(value, datetime.date | datetime.time):
+            yield f"{name} = {value} is a date or a time of day; text stands in quotes"
+        elif isinstance(value, int) and not -(2**63) <= value < 2**64:
+            yield f"{name} = {shown(value)} is outside [-2^63, 2^64)"
+        elif isinstance(value, str) and "\0" in value:
+            yield f"{name} = {shown(value)} holds a NUL character"
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text. Raises `ValueError` for what is not JSON, or nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("lists or tables are nested too deeply") from None
+
+
+def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> NDArray[np.float64]:
+    """The first columns of a .csv file, `[rows, columns]`; `columns`: name → range, such as "[0, 180]".
+
+    Lines that begin with # and one line of names are passed over. Raises `FileError` if it cannot be read,
+    `ConfigError` for a line that is not so many numbers in their ranges.
+    """
+    rows: list[list[float]] = []
+    named = False
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
+    try:
+        for cells in lines:
+            if not cells or cells[0].lstrip().startswith("#"):
+                continue
+            try:
+                row = [parse_number(cell) for cell, _ in zip(cells, columns, strict=False)]
+            except ValueError:
+                row = []
+            if len(row) < len(columns):
+                if rows or named:
+                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)}")
+                named = True
+                continue
+            for value, (name, within) in zip(row, columns.items(), strict=True):
+                if value not in Interval.read(within):
+                    raise ValueError(f"{name} = {value:g} is outside {within}")
+            rows.append(row)
+    except (ValueError, csv.Error) as error:  # the latter: a cell of more than 131 072 characters
+        raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
+    return np.array(rows, np.float64).reshape(-1, len(columns))

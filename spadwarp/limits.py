@@ -1,0 +1,126 @@
+"""Numbers that enter, as text or from Python: finite and within their range, or refused by name."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+import re
+import reprlib
+from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
+
+from spadwarp.errors import ArgumentError
+
+__all__ = ["Interval", "check_integer", "check_real", "parse_number", "shown"]
+
+_NUMBER = re.compile(
+    r"[+-]?(?:\d+(?:_\d+)*(?:\.(?:\d+(?:_\d+)*)?)?|\.\d+(?:_\d+)*)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE
+)
+_INTERVAL = re.compile(r"([\[(])(.+), (.+)([])])")
+_LONGEST = 60  # characters of a value in a message
+
+
+class Interval(NamedTuple):
+    """A range of numbers, written "(0, 1]": a bracket includes its end, a parenthesis does not."""
+
+    low: float
+    high: float
+    includes_low: bool
+    includes_high: bool
+
+    @classmethod
+    @functools.cache
+    def read(cls, text: str) -> Interval:
+        """From "(0, 1]"; only "inf]" includes infinity."""
+        match = _INTERVAL.fullmatch(text)
+        assert match is not None, text
+        low, high = (int(end) if end.lstrip("-").isdecimal() else float(end) for end in match.group(2, 3))
+        return cls(low, high, match[1] == "[", match[4] == "]")
+
+    def __contains__(self, value: object) -> bool:
+        """Whether a number lies in it; NaN does not."""
+        if not isinstance(value, int | float):
+            return False
+        above = value >= self.low if self.includes_low else value > self.low
+        return above and (value <= self.high if self.includes_high else value < self.high)
+
+    def __str__(self) -> str:
+        left, right = "[" if self.includes_low else "(", "]" if self.includes_high else ")"
+        return f"{left}{_end(self.low)}, {_end(self.high)}{right}"
+
+
+def _end(value: float) -> str:
+    """An end of an interval: integers in full, 1e9 rather than 1000000000.0."""
+    return str(value) if isinstance(value, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
+
+
+def check_real(name: str, value: Any, within: str = "(-inf, inf)") -> float:
+    """An argument as a float; infinite only where the range includes it, as "(0, inf]" does.
+
+    Raises `ArgumentError`, which names the argument, its value and the range, where it is no number or outside.
+    """
+    if not (_is_single(value) and isinstance(value, SupportsFloat | SupportsIndex)):
+        raise ArgumentError(f"{name} = {shown(value)} is not a number")
+    try:
+        number = float(value)
+    except OverflowError:  # an integer beyond 1.8e308
+        number = math.nan
+    if number not in Interval.read(within):
+        raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
+    return number
+
+
+def check_integer(name: str, value: Any, within: str) -> int:
+    """An argument as an int; a float without a fraction, such as 1e5, counts as one.
+
+    Raises `ArgumentError`, which names the argument, its value and the range, where it is no integer or outside.
+    """
+    if _is_single(value) and isinstance(value, SupportsIndex):
+        number = operator.index(value)
+    elif _is_single(value) and isinstance(value, SupportsFloat) and float(value).is_integer():
+        number = int(float(value))
+    else:
+        raise ArgumentError(f"{name} = {shown(value)} is not an integer in {within}")
+    if number not in Interval.read(within):
+        raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
+    return number
+
+
+def _is_single(value: Any) -> bool:
+    """Whether it is neither a truth value, Python's or NumPy's, nor an array."""
+    return type(value).__name__ not in ("bool", "bool_") and getattr(value, "ndim", 0) == 0
+
+
+def parse_number(text: str) -> float:
+    """The number that a text stands for: "2e9", ".5", "2_000_000"; "inf" and "-inf" too, but not "nan".
+
+    Raises `ValueError` whose text continues the text: "is not a number", or "is beyond the largest number, 1.8e308".
+    """
+    word = text.strip()
+    if word.lower().lstrip("+-") in ("inf", "infinity"):
+        return -math.inf if word.startswith("-") else math.inf
+    if not _NUMBER.fullmatch(word):
+        raise ValueError("is not a number")
+    number = float(word)
+    if math.isinf(number):
+        raise ValueError("is beyond the largest number, 1.8e308")
+    return number
+
+
+class _Short(reprlib.Repr):
+    """`repr` of what may be endless, deep or huge."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = 4 * _LONGEST
+        self.maxlist = self.maxtuple = self.maxdict = self.maxset = self.maxarray = _LONGEST
+        self.maxlevel = 10
+
+    def repr_int(self, x: int, level: int) -> str:
+        return repr(x) if x.bit_length() < 1000 else f"an integer of {x.bit_length()} bits"
+
+
+def shown(value: Any) -> str:
+    """A value as messages quote it, at most 60 characters."""
+    text = _Short().repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

@@ -1,0 +1,145 @@
+"""Numbers and text that enter: read whole, or refused with a sentence, whatever they cost."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.io.parsing import file_problem, parse_json, parse_toml, read_columns, read_text
+from spadwarp.limits import Interval, check_integer, check_real, parse_number, shown
+
+
+@given(st.floats(allow_nan=False))
+def test_a_number_is_what_it_is_written_as(value):
+    assert parse_number(repr(value)) == value
+    assert parse_number(f" {value!r}\n") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("2e9", 2e9), (".5", 0.5), ("5.", 5.0), ("2_000_000", 2e6), ("-INF", -math.inf), ("+3E-2", 0.03)],
+)
+def test_numbers_may_be_written_in_several_ways(text, value):
+    assert parse_number(text) == value
+
+
+@pytest.mark.parametrize("text", ["nan", "", "-", "1e", "²", "\u0663", "0x10", "1__0", "_1", "1_", "1,5", "1 2", "one"])
+def test_what_is_not_a_number_is_refused(text):
+    with pytest.raises(ValueError, match="is not a number"):
+        parse_number(text)
+
+
+@pytest.mark.parametrize("text", ["1e999", "9" * 5000, "-1e309"])
+def test_a_number_that_would_become_infinite_is_refused(text):
+    with pytest.raises(ValueError, match="beyond the largest number"):
+        parse_number(text)
+
+
+def test_intervals_read_and_print_alike():
+    for text in ("(0, 1]", "[-1e9, inf)", "[1, 18446744073709551615]", "(0, inf]", "[0.5, 1e-5)"):
+        assert str(Interval.read(text)) == text
+    assert 0 not in Interval.read("(0, 1]") and 1 in Interval.read("(0, 1]")
+    assert math.inf in Interval.read("(0, inf]") and math.inf not in Interval.read("(0, inf)")
+    assert math.nan not in Interval.read("[-inf, inf]")
+
+
+@pytest.mark.parametrize("value", [5, 5.0, 5e0, np.int64(5), np.float32(5), np.array(5), Fraction(5)])
+def test_integral_numbers_are_integers(value):
+    found = check_integer("photons", value, "[1, 10]")
+    assert found == 5 and type(found) is int
+
+
+def test_large_integers_keep_every_digit():
+    assert check_integer("seed", 2**64 - 1, "[0, 18446744073709551615]") == 2**64 - 1
+
+
+@pytest.mark.parametrize("value", [5.5, math.nan, math.inf, "5", None, True, np.True_, np.array([5]), [5], 1j])
+def test_what_is_not_an_integer_is_refused(value):
+    with pytest.raises(ArgumentError, match=r"^photons = .* is not an integer in \[1, 10\]$"):
+        check_integer("photons", value, "[1, 10]")
+
+
+@pytest.mark.parametrize(
+    "value", [0, 11, 10**400, -(10**5000), 1e300], ids=["low", "high", "digits", "more digits", "float"]
+)
+def test_an_integer_outside_its_range_is_refused(value):
+    with pytest.raises(ArgumentError, match=r"^photons = .{1,60} is outside \[1, 10\]$"):
+        check_integer("photons", value, "[1, 10]")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, 1.0])
+def test_a_real_argument_is_finite_and_in_range(value):
+    assert check_real("relative_error", np.float32(0.5), "(0, 1)") == 0.5
+    with pytest.raises(ArgumentError, match=r"^relative_error = .{1,60} is outside \(0, 1\)$"):
+        check_real("relative_error", value, "(0, 1)")
+
+
+@pytest.mark.parametrize("value", ["0.5", None, True, [0.5], {}])
+def test_a_real_argument_is_a_number(value):
+    with pytest.raises(ArgumentError, match=r"^relative_error = .* is not a number$"):
+        check_real("relative_error", value, "(0, 1)")
+
+
+def test_values_are_quoted_shortly():
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
+    for value in (deep, "x" * 10**6, 10**5000, list(range(10**6)), {"a": deep}):
+        assert len(shown(value)) <= 60
+    assert shown((1.0, "a")) == "[1.0, 'a']"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a = " + "[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("a = " + "{a = " * 5000 + "1" + "}" * 5000, "nested too deeply"),
+        ("a = " + "[" * 40 + "]" * 40, "is nested more than 32 deep"),
+        (".".join(["a"] * 50_000) + " = 1", "a key in line 1 has 64 parts or more"),
+        ("x = 1\n[" + " . ".join(['"a"'] * 50_000) + "]", "a key in line 2 has 64 parts or more"),
+        ("a.b = " + "9" * 5000, "Exceeds the limit"),
+        ("a.b = [0, 1e999]", "'1e999' is beyond the largest number"),
+        ("a.b = 99999999999999999999", r"a\.b = 99999999999999999999 is outside \[-2\^63, 2\^64\)"),
+        ("a.b = [07:32:00]", r"a\.b\[0\] = 07:32:00 is a date or a time of day"),
+        ("a = 1979-05-27", "a = 1979-05-27 is a date"),
+        ('a = "b\\u0000c"', "a = 'b.x00c' holds a NUL"),
+        ("a = 1\na = 2", "not valid TOML"),
+    ],
+)
+def test_what_no_field_takes_is_refused_with_its_key_and_file(text, problem):
+    with pytest.raises(ConfigError, match=problem) as caught:
+        parse_toml(text, source="scene.toml")
+    assert str(caught.value).startswith("scene.toml: ") and len(str(caught.value)) < 300
+
+
+def test_long_texts_are_no_keys():
+    text = "a.b = " + repr("x." * 60) + "\nc = [" + "1.5, " * 1000 + "]\n"
+    assert parse_toml(text)["c"][-1] == 1.5
+
+
+def test_json_that_is_nested_too_deeply_is_refused():
+    with pytest.raises(ValueError, match="nested too deeply"):
+        parse_json("[" * 100_000)
+
+
+def test_files_that_are_none_are_named(tmp_path):
+    assert file_problem(__file__) is None
+    assert file_problem(tmp_path) == "is not a file"
+    assert file_problem(tmp_path / "none") == "no such file"
+    assert file_problem("a\0b") == "no such file"
+    assert file_problem("x" * 300) == "cannot be read: File name too long"
+    for name, problem in ((tmp_path, "Is a directory"), ("x" * 300, "too long"), ("a\0b", "no name of a file")):
+        with pytest.raises(FileError, match=problem):
+            read_text(name)
+    with pytest.raises(FileError, match="/dev/zero: has more than 100 bytes"):
+        read_text("/dev/zero", largest=100)
+
+
+def test_columns_may_have_a_title_comments_and_more_columns(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("# from a paper\ntime,value,error\n0,1,0.1\n\n 1.5 ,2e0\n")
+    assert read_columns(path, {"time": "[0, 2]", "value": "[0, 2]"}).tolist() == [[0, 1], [1.5, 2]]
