@@ -26,7 +26,7 @@ class Transport(Section):
     weight_cutoff: float = Field(2e-4, ge=0, lt=1)
     """analog weight below which a photon ends; 0 is never"""
     max_collisions: Whole = Field(64, ge=1, le=2**31 - 1)
-    """events of one photon, surfaces included"""
+    """events of one photon at most, surfaces included; the light of the last one still counts"""
     max_path: float | None = Field(None, gt=0)
     """longest geometric path [m]; the gate's end if not given"""
     lateral_limit: float = Field(math.inf, gt=0, allow_inf_nan=True)

@@ -126,3 +126,80 @@ def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
         rays.append(sk.read_ledger(data)[1]["shadow_queries"])
     np.testing.assert_array_equal(*tallies)
     assert tallies[0].any() and rays[0] < rays[1]
+
+
+# The last event of a history
+
+VESSEL = {"builtin": "box", "size": [3.0, 2.0, 4.0], "translation": [0.0, 0.0, 1.5], "reflectance": 1.0}
+
+
+@pytest.mark.parametrize("events", [1, 2, 3, 5])
+def test_estimators_agree_under_a_cap_on_events(events, device):
+    """White vessel, lossless water: no light is lost but by the cap, so that the last allowed event is a fair part.
+
+    The water close to the lens is clear: next events from there have an infinite variance.
+    """
+    turbid = {"start": 0.8, "extinction": 0.5, "albedo": 1.0}
+    one = scene(
+        medium={"extinction": 1e-3, "albedo": 1.0, "anisotropy": 0.2, "layers": [turbid]},
+        camera={"aperture_diameter": 0.8},
+        gate={"bins": 6 * events + 4},
+        targets=[VESSEL],
+        transport={"max_collisions": events, "weight_cutoff": 0.0},
+    )
+    found = agreeing_cells(one, device, photons={"analog": 80_000, "next_event": 20_000, "guided": 20_000})
+    for name, values in found.items():
+        component = values.reshape(32, 3, -1).sum(axis=2)
+        mean, error = component.mean(axis=0), component.std(axis=0, ddof=1) / math.sqrt(32)
+        assert (mean[[0, 2]] > 0).all() and (mean[1] > 0) == (events > 1)
+        assert (error <= (0.025 if name == "analog" else 0.005) * mean).all()
+
+
+@pytest.mark.parametrize(
+    "end", [{"max_collisions": 3}, {"weight_cutoff": 0.5}, {"max_collisions": 4, "termination": "roulette"}]
+)
+def test_estimators_share_one_ledger(end, device):
+    """Without directed directions to the unit, seed by seed; guided in its mean over seeds."""
+    glossy = {"specular": 0.5, "roughness": 0.4, "reflectance": 0.3}
+    one = scene(
+        domain={"shape": "box", "lower": [-1.3, -0.9, -0.4], "upper": [1.2, 1.1, 3.4]},
+        targets=[{**PLATE, **glossy}, {**VESSEL, "size": [2.0, 4.0, 3.0], **glossy}],
+        transport={"max_collisions": 8, "weight_cutoff": 0.2, **end},
+    )
+
+    def ledger(estimator, photons=20_000, seed=0):
+        run = one.with_overrides({"transport.estimator": estimator})
+        result = spadwarp.simulate(run, photons=photons, seed=seed, device=device)
+        assert result.ledger_report()["exact"]
+        counts = {name: result.counters[name] for name in ("water_collisions", "surface_events")}
+        return {**result.ledger, **counts}
+
+    entry = next(iter(end))
+    analog = ledger("analog")
+    assert analog == ledger("next_event")
+    assert all(analog[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
+    means = [[ledger(name, 4000, seed)[entry] for seed in range(32)] for name in ("next_event", "guided")]
+    assert equal_means_p(*(np.array(values, float)[:, None] for values in means)) > 1e-3
+
+
+def test_records_of_a_capped_walk_have_no_more_events_than_allowed(device):
+    """The analog photon's record is of the end of the flight after its last event, the others' of that event."""
+    one = scene(transport={"max_collisions": 3, "weight_cutoff": 0.0})
+    mesh = build_mesh(one)
+    model = build_model(one, pick_device(device), mesh)
+    found = {}
+    for estimator in ("none", "analog"):
+        spec = transport_spec(one, mesh, estimator=estimator, records=True)
+        data = sk.make_data(model, record_count=20_000)
+        sk.launch_transport(spec, model, data, seed=3, first_id=0, photon_count=20_000)
+        found[estimator] = data.records
+    capped = found["none"].reason.numpy() == sk.LEDGER_ENTRIES.index("max_collisions")
+    assert capped.any()
+    for name in ("reason", "collisions", "weight"):
+        np.testing.assert_array_equal(*(getattr(records, name).numpy() for records in found.values()))
+    assert (found["analog"].collisions.numpy()[capped] == 3).all()
+    start, end = (records.position.numpy() for records in found.values())
+    flown = np.linalg.norm(end - start, axis=1)
+    assert (flown[capped] > 0).all() and not flown[~capped].any()
+    more = found["analog"].path.numpy() - found["none"].path.numpy()
+    np.testing.assert_allclose(more, flown, atol=2e-5)

@@ -25,7 +25,8 @@ class Limits:
         lateral: A history ends where |x| or |y| reaches this [m].
         max_path: Geometric path [m].
         weight_cutoff: A history ends after an event that leaves its analog weight below this.
-        max_collisions: A history ends after this many events, surfaces included.
+        max_collisions: A history has at most this many events, surfaces included. Every estimator scores the light of
+            the last event, also of one below the cut-off.
     """
 
     lower: wp.vec3

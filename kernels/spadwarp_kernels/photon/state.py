@@ -107,7 +107,7 @@ class PhotonState:
         weight, analog_weight: Weight; the product of albedos and reflectances alone, at which histories end.
         path: Geometric path [m].
         collisions, surface_count: Events so far, and those at surfaces.
-        reason: Ledger entry of the history's end; -1 while it goes on.
+        reason: Ledger entry of the history's end; -1 after an event that is not the last.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.

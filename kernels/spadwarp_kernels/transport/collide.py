@@ -29,7 +29,7 @@ class Collision:
         x: Where the photon is [m]; off the surface by a bound of its rounding error.
         distance: Length of the flight [m].
         albedo: Of the water there.
-        reason: Ledger entry of the limit that ended the history, else -1.
+        reason: Ledger entry of the limit that ended the history, or of its last event; else -1.
     """
 
     x: wp.vec3
@@ -39,8 +39,8 @@ class Collision:
 
 
 @functools.cache
-def make_collide(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, medium, layers, limits) -> Collision``."""
+def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
+    """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
     has_mesh, bounded = spec.mesh, spec.bounded
     local_albedo = spec.layered and not spec.random_albedo
     water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
@@ -65,6 +65,9 @@ def make_collide(spec: TransportSpec) -> wp.Function:
                 c.reason = EXIT + face_of_exit(limits, s.x, s.u)
                 c.distance = wp.min(c.distance, to_exit(limits, s.x, s.u))
         c.x = s.x + c.distance * s.u
+        if wp.static(flies_on):
+            if s.collisions > 0 and s.reason >= 0:
+                c.reason = s.reason
         if c.reason < 0:
             if wp.static(local_albedo):
                 c.albedo = water_at(medium, layers, c.x).albedo

@@ -64,7 +64,7 @@ from .collide import make_arrives, make_collide
 from .emit import make_emit
 from .finish import make_finish, make_flush
 from .flight import draw_albedo, make_fly
-from .scatter import make_scatter
+from .scatter import make_flies, make_scatter
 from .traverse import make_aim, make_begin_walk, make_look
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
@@ -102,8 +102,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     has_bvh = has_mesh and not brute_force
     queues = scores and cuda and not has_bvh
     ray_lanes = RAY_LANES if has_bvh else 32
-    emit, fly, collide = make_emit(spec), make_fly(spec, estimator.plan_flight), make_collide(spec)
-    arrives, scatter = make_arrives(flights), make_scatter(spec, estimator.direct)
+    emit, fly, collide = make_emit(spec), make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
+    arrives, flies = make_arrives(flights), make_flies(crosses)
+    scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(cuda)
     push, pop = make_queue(flights, queues)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores))
@@ -239,7 +240,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.absorbed_surface += new.absorbed_surface
                     s.directed += new.directed
                     s.reason = new.reason
-                    s.stage = wp.where(s.reason < 0, FLIGHT, END)
+                    s.stage = wp.where(flies(s.reason), FLIGHT, END)
 
                 # ---- The next photon for those that have ended
                 if count_lanes(s.stage >= START) >= START_LANES:

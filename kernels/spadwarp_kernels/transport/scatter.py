@@ -38,7 +38,7 @@ class Scattering:
         weight, analog_weight: See `PhotonState`.
         surface_count: Events at surfaces so far.
         absorbed_surface, directed: For the ledger, in its units.
-        reason: Ledger entry that ends the history, else -1.
+        reason: Ledger entry that ends the history here, or after the flight of its last event's light; else -1.
     """
 
     u: wp.vec3
@@ -115,11 +115,28 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
 
 
 @functools.cache
-def make_scatter(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
+def make_flies(flies_on: bool) -> wp.Function:
+    """The Warp function ``reason -> bool``: whether there is a flight after an event.
+
+    `flies_on`: the light of a history's last event is scored as it flies, to where the next event would be.
+    """
+
+    @wp.func
+    def flies(reason: int) -> bool:
+        return reason < 0 or (wp.static(flies_on) and reason != ROULETTE)
+
+    return flies
+
+
+@functools.cache
+def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread) ->
-    Scattering``."""
+    Scattering``.
+
+    `flies_on`: see `make_flies`.
+    """
     has_mesh, specular, roulette, directed = spec.mesh, spec.specular, spec.roulette, direct is not None
-    survive, turn = make_survive(spec), make_turn(spec, direct)
+    survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
 
     @wp.func
     def scatter(
@@ -163,7 +180,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None) -> wp.Function
                     add_to_ledger(ledger, thread, ROULETTE, new.weight.taken)
         if new.reason < 0 and s.collisions >= limits.max_collisions:
             new.reason = MAX_COLLISIONS
-        if new.reason >= 0:
+        if not flies(new.reason):
             return new
         reflected = s.u
         if wp.static(specular):
@@ -184,7 +201,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None) -> wp.Function
                 leaving = unshadowed(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], survival.lobe)
                 new.weight = reweigh(new.weight, leaving)
                 new.analog_weight *= leaving
-                new.absorbed_surface += new.weight.taken
+                if new.reason < 0:
+                    new.absorbed_surface += new.weight.taken
+                else:
+                    add_to_ledger(ledger, thread, new.reason, new.weight.taken)
                 if new.weight.value <= 0.0 and new.reason < 0:
                     new.reason = WEIGHT_CUTOFF
         return new
