@@ -52,7 +52,8 @@ def scene() -> str:
     """Sections and fields with kinds, ranges, defaults and units, and the presets."""
     parts = [
         MADE + "# Scene file\n\n"
-        "A scene is a TOML file of sections. Units are SI where the name carries none; the camera looks along +z, with "
+        "A scene is a TOML file of sections. Units are SI where the name carries none; a text with a unit is "
+        'converted, such as `pulse_energy = "150 nJ"` ([units](../planning.md#units)). The camera looks along +z, with '
         "+x right and +y down, from the origin unless it has a pose ([frames](../optics.md#frames)). A field that a "
         "file leaves out has its default, or the value of the section's `preset`; `--set SECTION.FIELD=VALUE` lies "
         "over both. What is not valid is refused with the field, its value and its range; `spadwarp check FILE` does "
@@ -116,7 +117,7 @@ def _table(fields: Mapping[str, FieldInfo]) -> str:
     for field, info in fields.items():
         about = " ".join((info.description or "").split()).replace("|", "\\|")
         # Of the coefficients of water two are given, and the others follow.
-        default = "" if field in COEFFICIENTS else _default(info)
+        default = "" if field in (*COEFFICIENTS, "average_power", "peak_power") else _default(info)
         lines.append(f"| {' | '.join((f'`{field}`', _kind(info), _range(info), default, about))} |")
     return "\n".join(lines) + "\n"
 

@@ -14,6 +14,7 @@ from typing import Any
 __all__ = [
     "PLANCK",
     "SPEED_OF_LIGHT",
+    "UNITS",
     "path_from_time",
     "pulse_speed",
     "quantity",
@@ -95,7 +96,8 @@ def _unit_table() -> dict[str, tuple[str, str, Fraction]]:
     return table
 
 
-_UNITS = _unit_table()
+UNITS = _unit_table()
+"""Units that `quantity` reads: their kind, an example, and the factor to the unit of the kind."""
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", re.DOTALL)
 
 
@@ -106,18 +108,22 @@ def quantity(text: str, unit: str) -> float:
     1/km, mg/m³, g/kg, °C, %. Raises `ValueError` for text without a number or unit, an unknown unit (capitals
     count: "mJ" and "MJ" differ), and a unit of another kind; its text begins with a verb, to be put behind the value.
     """
-    kind, example, factor = _UNITS[unit]
+    kind, example, factor = UNITS[unit]
+    if factor not in (1, UNITS[example.partition(" ")[2]][2]):
+        example = f"50 {unit}"
     found = _NUMBER.fullmatch(text)
     if found is None:
         raise ValueError(f"is not {kind}, such as {example!r}")
     number, given = found.groups()
     if not given:
         raise ValueError(f"has no unit; write {number} without quotes for {unit}, or {example!r}")
-    if given not in _UNITS:
-        close = [one for one in _UNITS if one.casefold() == given.casefold()]
-        hint = f"did you mean {' or '.join(repr(f'{number} {one}') for one in close)}" if close else f"e.g. {example!r}"
+    if given not in UNITS:
+        close = [one for one in UNITS if one.casefold() == given.casefold()]
+        hint = (
+            f"did you mean {' or '.join(repr(f'{number} {one}') for one in close)}?" if close else f"e.g. {example!r}"
+        )
         raise ValueError(f"has the unit {given!r}, which is not known; {hint}")
-    other, _, given_factor = _UNITS[given]
+    other, _, given_factor = UNITS[given]
     if other != kind:
         raise ValueError(f"is {other}; {kind} is needed, such as {example!r}")
     return float(Fraction(number) * given_factor / factor)

@@ -6,6 +6,7 @@ import contextlib
 import enum
 import shutil
 import tempfile
+from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,24 +34,22 @@ def whole_number(text: str | int) -> int:
     return int(value)
 
 
-def _quantity(text: str | float, unit: str) -> float:
-    """A number in the unit, bare or with a unit of its own: `0.01`, `1cm`."""
-    with contextlib.suppress(ValueError):
-        return float(text)
-    try:
-        return quantity(str(text), unit)
-    except ValueError as error:
-        raise typer.BadParameter(f"{text!r} {error}") from None
+def in_unit(unit: str) -> Callable[[str | float], float]:
+    """A parser for a number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
+
+    def parse(text: str | float) -> float:
+        with contextlib.suppress(ValueError):
+            return float(text)
+        try:
+            return quantity(str(text), unit)
+        except ValueError as error:
+            raise typer.BadParameter(f"{text!r} {error}") from None
+
+    parse.__name__ = unit
+    return parse
 
 
-def length(text: str | float) -> float:
-    """Metres from `0.01` or `1cm`."""
-    return _quantity(text, "m")
-
-
-def duration(text: str | float) -> float:
-    """Seconds from `0.1` or `100ms`."""
-    return _quantity(text, "s")
+length, duration = in_unit("m"), in_unit("s")
 
 
 def two_lengths(text: str, option: str) -> tuple[float, float]:

@@ -47,17 +47,26 @@ def denoise(
     scale: Annotated[float, typer.Option(metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")] = 1.0,
     variable: Annotated[str | None, typer.Option(metavar="NAME", help="Array in a .mat file.")] = None,
     bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of a bin; for measured histograms other than .ptu.")
+        float | None,
+        typer.Option(
+            parser=opt.in_unit("ps"), metavar="PS", help="Width of a bin; for measured histograms other than .ptu."
+        ),
     ] = None,
     gate_start_ns: Annotated[
-        float | None, typer.Option(metavar="NS", help="Time of flight at the start of bin 0 of measured histograms.")
+        float | None,
+        typer.Option(
+            parser=opt.in_unit("ns"), metavar="NS", help="Time of flight at the start of bin 0 of measured histograms."
+        ),
     ] = None,
     group_index: Annotated[
         float | None,
         typer.Option(metavar="N", help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; for measured histograms."),
     ] = None,
     irf_fwhm_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of the instrument response of measured histograms.")
+        float | None,
+        typer.Option(
+            parser=opt.in_unit("ps"), metavar="PS", help="Width of the instrument response of measured histograms."
+        ),
     ] = None,
     device: opt.TorchDevice = None,
     overwrite: opt.Overwrite = False,

@@ -32,11 +32,18 @@ def depth(
     out: opt.Out,
     method: Annotated[opt.Estimator, typer.Option(help="Estimator of the arrival time.")] = opt.Estimator.centroid,
     bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of a bin; for measured histograms other than .ptu.")
+        float | None,
+        typer.Option(
+            parser=opt.in_unit("ps"), metavar="PS", help="Width of a bin; for measured histograms other than .ptu."
+        ),
     ] = None,
     gate_start_ns: Annotated[
         float | None,
-        typer.Option(metavar="NS", help="Time of flight at the start of bin 0. By default that of the file, or 0."),
+        typer.Option(
+            parser=opt.in_unit("ns"),
+            metavar="NS",
+            help="Time of flight at the start of bin 0. By default that of the file, or 0.",
+        ),
     ] = None,
     group_index: Annotated[
         float | None,
@@ -44,10 +51,15 @@ def depth(
     ] = None,
     horizontal_fov_deg: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Field of view of a measuring camera, for planar depth and --ply."),
+        typer.Option(
+            parser=opt.in_unit("°"),
+            metavar="DEG",
+            help="Field of view of a measuring camera, for planar depth and --ply.",
+        ),
     ] = None,
     irf_fwhm_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Width of a Gaussian instrument response.")
+        float | None,
+        typer.Option(parser=opt.in_unit("ps"), metavar="PS", help="Width of a Gaussian instrument response."),
     ] = None,
     irf: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Measured instrument response: .csv of time_ps, value.")

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from spadwarp.frames import Recording
 
 # What a detector sees of a scene; the rest has decided which photons came.
-_DETECTOR_FIELDS = ("detector", "laser.pulse_energy", "laser.repetition_rate", "laser.pulse_fwhm_ps")
+_DETECTOR_FIELDS = (
+    "detector",
+    *(f"laser.{name}" for name in ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps")),
+)
 
 
 @app.command()
@@ -54,7 +57,7 @@ def detect(
     """Frames of counts that the camera would record.
 
     Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
-    takes fields of the detector, and pulse_energy, repetition_rate and pulse_fwhm_ps of the laser.
+    takes fields of the detector, and of the laser its energy or power, repetition_rate and pulse_fwhm_ps.
 
     \b
     Example:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from spadwarp.scene.load import ENERGIES
 from spadwarp.scene.sections import Section, Vector
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
+
+_GAUSSIAN_AREA = math.sqrt(math.pi / (4.0 * math.log(2.0)))  # of a Gaussian of unit height, over its FWHM
 
 
 class Laser(Section):
@@ -35,6 +38,10 @@ class Laser(Section):
     """vacuum wavelength [nm]"""
     pulse_energy: float = Field(37.5e-9, gt=0)
     """energy of one pulse [J]"""
+    average_power: float = Field(0.0, gt=0)
+    """mean power, in place of pulse_energy: pulse_energy times repetition_rate [W]"""
+    peak_power: float = Field(0.0, gt=0)
+    """power at the peak of the pulse, in place of pulse_energy: for a Gaussian pulse pulse_energy/(1.0645 FWHM) [W]"""
     repetition_rate: float = Field(20e6, gt=0)
     """pulses per second [Hz]"""
     pulse_fwhm_ps: float = Field(85.0, ge=0)
@@ -51,6 +58,34 @@ class Laser(Section):
         if (self.profile == "measured") != (self.profile_image is not None):
             raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
         return self
+
+    @model_validator(mode="after")
+    def _has_one_energy(self) -> Self:
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        if len(self.given) > 1:
+            raise ValueError(f"needs one of {', '.join(ENERGIES)}; given: {', '.join(self.given)}")
+        duration, rate = _GAUSSIAN_AREA * self.pulse_fwhm_ps * 1e-12, self.repetition_rate
+        if "peak_power" in self.given and duration == 0.0:
+            raise ValueError(f"peak_power = {self.peak_power} needs pulse_fwhm_ps > 0, from which the energy follows")
+        energy = self.pulse_energy
+        if "average_power" in self.given:
+            energy = self.average_power / rate
+        elif "peak_power" in self.given:
+            energy = self.peak_power * duration
+        powers = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
+        derived = {"pulse_energy": energy} | powers
+        self.__dict__.update({name: value for name, value in derived.items() if name not in self.given})
+        return self
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Which of pulse_energy, average_power and peak_power was given; the others follow from it."""
+        return tuple(name for name in ENERGIES if name in self.model_fields_set)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that make an equal section again: of energy and powers the given one."""
+        hidden = set(ENERGIES) - set(self.given or ("pulse_energy",))
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
 
     @property
     def half_angle(self) -> float:

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.load import merge_section
+from spadwarp.scene.quantities import with_units
 from spadwarp.scene.sections import Section
 
 
@@ -67,6 +68,6 @@ class Layer(Water):
     def _expand_preset(cls, fields: Any) -> Any:
         if not isinstance(fields, Mapping):
             return fields
-        whole = merge_section(cls.section, {}, fields)
+        whole = merge_section(cls.section, {}, with_units(cls, fields))
         # A preset has indices, but one pair of them holds for all layers: the medium's.
         return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}

@@ -24,6 +24,9 @@ Key = tuple[str | int, ...]
 # Overriding one coefficient of a complete medium keeps this other one.
 _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
 
+# How the energy of a pulse is given.
+ENERGIES = ("pulse_energy", "average_power", "peak_power")
+
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
 # Setting a field in a later layer drops these fields of the earlier ones.
@@ -43,6 +46,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     },
+    "laser": {name: tuple(other for other in ENERGIES if other != name) for name in ENERGIES},
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
 }
 

@@ -22,6 +22,7 @@ from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
 from spadwarp.scene.output import Output
 from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
+from spadwarp.scene.quantities import with_units
 from spadwarp.scene.scan import Scan
 from spadwarp.scene.sections import listed
 from spadwarp.scene.targets import Target
@@ -155,7 +156,7 @@ def _build(
             tables = _with_paths(tables, Path(source).absolute().parent)
         if overrides:
             layer = load.override_layer(overrides)
-            tables = load.merge_scene(tables, _with_paths(layer, Path.cwd()))
+            tables = load.merge_scene(_with_units(tables), _with_paths(_with_units(layer), Path.cwd()))
         scene = Scene.model_validate(tables)
     except ConfigError as error:
         raise ConfigError(error.problems, source=name) from None
@@ -163,6 +164,15 @@ def _build(
         raise ConfigError(describe(error, Scene, layer), source=name) from None
     scene._source = None if source is None else Path(source)
     return scene
+
+
+def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers with a unit in the water and the laser as numbers: merging completes what they define."""
+    changed = dict(tables)
+    for name, model in (("medium", Medium), ("laser", Laser)):
+        if isinstance(fields := tables.get(name), Mapping):
+            changed[name] = with_units(model, fields)
+    return changed
 
 
 def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:

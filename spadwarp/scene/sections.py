@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from spadwarp.scene.load import merge_section
 from spadwarp.scene.preset import PRESETS
+from spadwarp.scene.quantities import in_field_unit, with_units
 
 
 def _whole(value: Any) -> Any:
@@ -63,7 +64,12 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _expand_preset(cls, fields: Any) -> Any:
-        return merge_section(cls.section, {}, fields) if isinstance(fields, Mapping) else fields
+        return merge_section(cls.section, {}, with_units(cls, fields)) if isinstance(fields, Mapping) else fields
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _with_unit(cls, value: Any, info: ValidationInfo) -> Any:
+        return in_field_unit(value, cls.model_fields[info.field_name or ""])
 
     @field_validator("preset", check_fields=False)
     @classmethod

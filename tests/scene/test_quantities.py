@@ -1,0 +1,167 @@
+"""Numbers with a unit, and what a laser's energy is given by."""
+
+import math
+import re
+import typing
+
+import pytest
+
+import spadwarp
+from helpers.scenes import scene as make_scene
+from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
+from spadwarp.scene.quantities import field_unit
+from spadwarp.units import quantity, with_prefix
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("150 nJ", "J", 150e-9),
+        ("37.5nJ", "J", 37.5e-9),
+        ("50 ps", "ps", 50.0),
+        ("0.085 ns", "ps", 85.0),
+        ("1e-3 m", "µm", 1000.0),
+        ("5 um", "µm", 5.0),
+        ("5 µm", "µm", 5.0),  # the micro sign; the next is the Greek letter
+        ("5 μm", "µm", 5.0),
+        ("20 MHz", "Hz", 20e6),
+        ("2 kcps", "1/s", 2000.0),
+        ("180 deg", "°", 180.0),
+        (f"{math.pi} rad", "°", 180.0),
+        (".3 /m", "1/m", 0.3),
+        ("0.003 1/cm", "1/m", 0.3),
+        ("20 %", "1", 0.2),
+        ("-5 cm", "m", -0.05),
+        ("2 min", "s", 120.0),
+    ],
+)
+def test_texts_become_numbers_correctly_rounded(text, unit, value):
+    assert quantity(text, unit) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "words"),
+    [
+        ("150 ns", "J", "is a time; an energy is needed, such as '150 nJ'"),
+        ("5 mj", "J", "did you mean '5 mJ' or '5 MJ'?"),
+        ("20 mHz", "Hz", "did you mean '20 MHz'?"),
+        ("5", "ns", "has no unit; write 5 without quotes for ns"),
+        ("1,5 nJ", "J", "',5 nJ', which is not known"),
+        ("nJ", "J", "is not an energy"),
+        ("5 furlongs", "m", "'furlongs', which is not known"),
+        ("532 ps", "nm", "a length is needed, such as '50 nm'"),
+    ],
+)
+def test_what_is_not_a_quantity_is_said(text, unit, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        quantity(text, unit)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (1.5e-7, "J", "150 nJ"),
+        (0.9999e-6, "J", "1 µJ"),
+        (11.2487e6, "Hz", "11.2 MHz"),
+        (0.0, "m", "0 m"),
+        (math.inf, "m", "inf m"),
+        (0.01, "m", "10 mm"),
+    ],
+)
+def test_numbers_with_a_prefix(value, unit, text):
+    assert with_prefix(value, unit) == text
+
+
+def test_fields_convert_to_their_own_unit():
+    assert Gate(bin_width_ps="0.05 ns", start_ns="2 µs", bins=3) == Gate(bin_width_ps=50.0, start_ns=2000.0, bins=3)
+    camera = {"width": 4, "height": 4, "horizontal_fov_deg": "0.5 rad", "aperture_diameter": "2 cm"}
+    assert Camera(**camera).horizontal_fov_deg == pytest.approx(math.degrees(0.5))
+    assert Laser(position=["-10 cm", 0, "5 mm"]).position == (-0.1, 0.0, 0.005)
+    assert Medium(extinction="0.4 1/m", albedo="80 %").scattering == pytest.approx(0.32)
+    assert Medium(extinction=0.4, albedo="lu2024").albedo == "lu2024"  # words stay words
+
+
+def test_files_and_overrides_take_units(tmp_path):
+    path = tmp_path / "scene.toml"
+    text = make_scene().to_toml().replace("half_angle_deg = 20.0", 'half_angle_deg = "20 deg"')
+    assert '"20 deg"' in text
+    path.write_text(text)
+    assert spadwarp.load_scene(path) == make_scene()
+    changed = spadwarp.load_scene(path, ["medium.extinction=0.5 1/m", "targets[0].translation=[0, '20 cm', 4]"])
+    assert changed.medium.extinction == 0.5 and changed.targets[0].translation == (0.0, 0.2, 4.0)
+    assert changed.medium.albedo == make_scene().medium.albedo  # the override keeps it, as with a number
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("laser.pulse_energy=150 ns", "laser.pulse_energy = '150 ns' (an override) is a time; an energy is needed"),
+        ("gate.bin_width_ps=5 mm", "gate.bin_width_ps = '5 mm' (an override) is a length; a time is needed"),
+        ("targets[0].translation=[0, '2 ps', 4]", "targets[0].translation = [0, '2 ps', 4] (an override) holds '2 ps'"),
+        ("detector.pdp=3 x", "detector.pdp = '3 x' (an override) is text; a number without quotes"),
+        ("gate.bins=5 ns", "gate.bins = '5 ns' (an override) is not an integer"),
+        ("medium.albedo=fast", "is neither a number nor 'lu2024'"),
+    ],
+)
+def test_wrong_kinds_are_refused_by_name(override, words):
+    with pytest.raises(spadwarp.ConfigError) as error:
+        make_scene().with_overrides([override])
+    assert words in str(error.value)
+
+
+def test_every_field_with_a_suffix_has_that_unit():
+    """The docstring's unit is the one that converts; a wrong one would be a wrong number."""
+    suffixes = {"ps": "ps", "ns": "ns", "um": "µm", "nm": "nm", "deg": "°"}
+    found = 0
+    for section in Scene.model_fields.values():
+        for model in _models(section.annotation):
+            for name, info in model.model_fields.items():
+                suffix = name.rsplit("_", 1)[-1]
+                if suffix in suffixes:
+                    assert field_unit(info) == suffixes[suffix], name
+                    found += 1
+    assert found > 12
+
+
+def _models(annotation):
+    if isinstance(annotation, type) and hasattr(annotation, "model_fields"):
+        yield annotation
+    for inner in typing.get_args(annotation):
+        yield from _models(inner)
+
+
+# The laser's energy
+
+
+def test_energy_follows_from_either_power():
+    average = Laser(average_power="20 mW", repetition_rate="100 kHz")
+    assert average.pulse_energy == pytest.approx(200e-9) and average.given == ("average_power",)
+    peak = Laser(peak_power="1 kW", pulse_fwhm_ps=500.0)
+    assert peak.pulse_energy == pytest.approx(1.064467 * 1e3 * 500e-12)
+    assert peak.average_power == pytest.approx(peak.pulse_energy * 20e6)
+    assert Laser().peak_power == pytest.approx(37.5e-9 / (1.064467 * 85e-12))
+    for laser in (average, peak, Laser(), Laser(preset="picoquant-visuv-532", average_power=0.01)):
+        assert Laser(**laser.to_dict()) == laser
+
+
+def test_average_power_stays_where_the_rate_changes():
+    scene = make_scene(laser={"average_power": "1 W", "repetition_rate": 1e6})
+    faster = scene.with_overrides(laser={"repetition_rate": 2e6})
+    assert faster.laser.average_power == 1.0 and faster.laser.pulse_energy == 0.5e-6
+    replaced = faster.with_overrides(laser={"pulse_energy": "1 nJ"})
+    assert replaced.laser.given == ("pulse_energy",) and replaced.laser.average_power == pytest.approx(2e-3)
+    assert Scene.from_dict(replaced.to_dict()) == replaced
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"pulse_energy": 1.0, "average_power": 2.0}, "laser needs one of pulse_energy, average_power, peak_power"),
+        ({"peak_power": 1.0, "pulse_fwhm_ps": 0.0}, "laser.peak_power = 1.0 needs pulse_fwhm_ps > 0"),
+        ({"average_power": 0.0}, "laser.average_power = 0.0 is outside (0.0, inf)"),
+    ],
+)
+def test_one_energy_is_given(fields, words):
+    with pytest.raises(spadwarp.ConfigError) as error:
+        Scene.from_dict({**make_scene().to_dict(), "laser": fields})
+    assert words.replace("(0.0", "(0") in str(error.value).replace("(0.0", "(0")
