@@ -8,6 +8,7 @@ from typing import Any
 from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
 from spadwarp.checks.optics import check_focus, check_scan
+from spadwarp.checks.plausible import check_plausible
 from spadwarp.checks.statistics import check_statistics
 from spadwarp.checks.survey import Survey
 from spadwarp.checks.targets import check_targets
@@ -17,7 +18,7 @@ from spadwarp.scene import Scene
 
 __all__ = ["check", "summary"]
 
-_CHECKS = (check_targets, check_focus, check_scan, check_timing, check_medium, check_statistics)
+_CHECKS = (check_plausible, check_targets, check_focus, check_scan, check_timing, check_medium, check_statistics)
 
 
 def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
@@ -36,8 +37,10 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
 
     `attenuation_length` and `albedo` are those of the water before the first layer; `layers` has those of each layer,
     with its start. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected number
-    of unscattered target photons that one pixel on the beam's axis detects from a pulse; `samples_per_pixel` how many
-    of the traced photons reach a pixel's part of the target unscattered. `histogram_bytes` is one set of tallies.
+    of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how many
+    it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered.
+    `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
+    [W/m²]. `histogram_bytes` is one set of tallies.
     Raises `MeshError`.
     """
     survey = Survey(scene, mesh)
@@ -61,7 +64,11 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
         "vertical_fov_deg": math.degrees(camera.vertical_fov),
         "aperture_area": camera.aperture_area,
         "photons_per_pulse": laser.photons_per_pulse,
+        "average_power": laser.average_power,
+        "peak_power": laser.peak_power,
+        "irradiance": survey.irradiance,
         "pde": scene.detector.pde,
+        "photons_per_pixel": survey.photons_per_pixel,
         "signal_per_pulse": survey.signal_per_pulse,
         "samples_per_pixel": survey.samples_per_pixel,
         "histogram_bytes": survey.histogram_bytes,

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.analytic import axis_fluence
 from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.scene import Scene
 from spadwarp.scene.beam_profile import profile_extent
@@ -119,12 +120,27 @@ class Survey:
         return self.scene.transport.photons / self.scene.scan_positions * self.ballistic_share
 
     @property
-    def signal_per_pulse(self) -> float | None:
-        """Unscattered photons from the target that a pixel on the beam's axis detects from a pulse."""
+    def irradiance(self) -> float | None:
+        """Unscattered light on the beam's axis at the range of the nearest point, mean over time [W/m²]."""
+        if self.distance is None or self.optical_depth is None:
+            return None
+        return (
+            axis_fluence(self.scene.laser, self.distance)
+            * math.exp(-self.optical_depth)
+            * self.scene.laser.average_power
+        )
+
+    @property
+    def photons_per_pixel(self) -> float | None:
+        """Unscattered photons from the target that a pixel on the beam's axis receives from a pulse."""
         if self.ballistic_share is None or self.distance is None or self.optical_depth is None:
             return None
-        scene = self.scene
         # Lambertian, towards the lens
-        collected = float(self.reflectance.max()) / math.pi * scene.camera.aperture_area / self.distance**2
-        fraction = self.ballistic_share * math.exp(-self.optical_depth) * collected
-        return fraction * scene.laser.photons_per_pulse * scene.detector.pde
+        collected = float(self.reflectance.max()) / math.pi * self.scene.camera.aperture_area / self.distance**2
+        share = self.ballistic_share * math.exp(-self.optical_depth)
+        return share * collected * self.scene.laser.photons_per_pulse
+
+    @property
+    def signal_per_pulse(self) -> float | None:
+        """Unscattered photons from the target that a pixel on the beam's axis detects from a pulse."""
+        return None if self.photons_per_pixel is None else self.photons_per_pixel * self.scene.detector.pde

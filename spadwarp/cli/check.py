@@ -9,6 +9,7 @@ from typing import Any
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
+from spadwarp.units import with_prefix
 
 
 @app.command()
@@ -67,7 +68,11 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
         "gate": f"{between(numbers['gate_range'], 'm')}, a bin {1000 * numbers['bin_range']:.3g} mm",
         "unambiguous": f"to {numbers['unambiguous_range']:.4g} m",
         "view": f"{numbers['horizontal_fov_deg']:.3g} x {numbers['vertical_fov_deg']:.3g} degrees",
-        "pulse": f"{numbers['photons_per_pulse']:.3g} photons, detected with {100 * numbers['pde']:.3g} % efficiency",
+        "laser": f"{numbers['photons_per_pulse']:.3g} photons a pulse, {with_prefix(numbers['average_power'], 'W')} on "
+        f"average, {with_prefix(numbers['peak_power'], 'W')} at the peak",
+        "irradiance": about(numbers["irradiance"], "{:.3g} W/m² unscattered at the target, mean over time"),
+        "photons": about(numbers["photons_per_pixel"], "{:.3g} unscattered ones a pulse arrive in a pixel; ")
+        + f"detection efficiency {100 * numbers['pde']:.3g} %",
         "signal": about(numbers["signal_per_pulse"], "{:.3g} unscattered detections a pulse in a pixel"),
         "sampling": about(numbers["samples_per_pixel"], "{:.3g} traced photons on what a pixel sees, unscattered"),
         "histograms": opt.in_bytes(numbers["histogram_bytes"]),

@@ -1,7 +1,8 @@
-"""`spadwarp targets`: the built-in targets."""
+"""`spadwarp targets`: the built-in targets, and mesh files before they stand in a scene."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,31 +12,40 @@ from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 
 if TYPE_CHECKING:
-    pass
+    from spadwarp.mesh import MeshSummary
 
 
 @app.command()
 def targets(
+    meshes: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE]...", help="Mesh files (STL, OBJ, PLY, OFF, GLB) to look at instead."),
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Directory for targets.png, a sheet of all of them.")
+        Path | None, typer.Option(metavar="DIR", help="Directory for pictures: targets.png, or NAME.png of each mesh.")
     ] = None,
     device: opt.Device = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """The built-in targets; with --out a sheet with a picture of each.
+    """The built-in targets, or what mesh files hold: size, unit, orientation, closedness.
 
-    A scene selects one by `builtin = "NAME"` in [[targets]].
+    A scene selects a built-in target by `builtin = "NAME"` in [[targets]], a file by `mesh = "FILE"`. With --out also
+    pictures.
 
     \b
-    Example:
+    Examples:
       spadwarp targets --out pictures/
+      spadwarp targets bust.stl --out pictures/
     """
-    from spadwarp.viz import describe_targets, draw_targets
-
     if out is not None:
         opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
+    if meshes:
+        _show_meshes(meshes, out, device, quiet, json_path)
+        return
+    from spadwarp.viz import describe_targets, draw_targets
+
     found = describe_targets()
     sheet = None if out is None else draw_targets(out / "targets.png", device=device)
     if not quiet:
@@ -45,3 +55,32 @@ def targets(
         if sheet is not None:
             say(f"written: {sheet}")
     opt.write_json({"targets": found, "files": [] if sheet is None else [sheet]}, json_path)
+
+
+def _show_meshes(meshes: list[Path], out: Path | None, device: str | None, quiet: bool, json_path: Path | None) -> None:
+    from spadwarp.mesh import describe_mesh
+    from spadwarp.viz import draw_mesh
+
+    found = [describe_mesh(path) for path in meshes]
+    pictures = [] if out is None else [draw_mesh(one, out / f"{one.path.stem}.png", device=device) for one in found]
+    if not quiet:
+        for one in found:
+            say(opt.rows(_lines(one)))
+        for picture in pictures:
+            say(f"written: {picture}")
+    summary = [{**dataclasses.asdict(one), "hints": one.hints} for one in found]
+    opt.write_json({"meshes": summary, "files": pictures}, json_path)
+
+
+def _lines(mesh: MeshSummary) -> dict[str, str]:
+    unit = f"probably {mesh.unit}" if mesh.unit else "unknown"
+    surface = "closed" if mesh.is_watertight else "not closed"
+    surface += ", wound inwards (which makes no difference here)" if mesh.is_inside_out else ""
+    parts = f", {mesh.bodies} parts" if mesh.bodies > 1 else ""
+    return {
+        str(mesh.path): f"{opt.count(mesh.faces)} faces{parts}, {surface}",
+        "  size": " x ".join(f"{side:.4g}" for side in mesh.extent) + " along x (right), y (down), z (away)",
+        "  unit": f"{unit}; a scene takes metres: scale = {mesh.scale:g}",
+        "  centre": ", ".join(f"{place:.4g}" for place in mesh.centre),
+        **{f"  {number})": hint for number, hint in enumerate(mesh.hints, 1)},
+    }

@@ -6,11 +6,19 @@ from spadwarp.viz.depth import draw_denoised, draw_depth
 from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.learning_curves import draw_learning_curves
 from spadwarp.viz.result import draw_result
-from spadwarp.viz.targets import describe_targets, draw_targets
+from spadwarp.viz.targets import describe_targets, draw_mesh, draw_targets
 from spadwarp.viz.transient_video import video
 from spadwarp.viz.validation import draw_validation
 from spadwarp.viz.viewer import view
 
 __all__ = ["describe_targets", "draw_analytic", "draw_budget", "draw_dataset", "draw_denoised", "draw_depth"]
-__all__ += ["draw_learning_curves", "draw_recording", "draw_result", "draw_sweep", "draw_targets", "draw_validation"]
+__all__ += [
+    "draw_learning_curves",
+    "draw_mesh",
+    "draw_recording",
+    "draw_result",
+    "draw_sweep",
+    "draw_targets",
+    "draw_validation",
+]
 __all__ += ["video", "view"]

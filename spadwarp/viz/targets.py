@@ -10,23 +10,29 @@ import numpy as np
 from matplotlib.colors import Normalize, to_rgb
 from numpy.typing import NDArray
 
-from spadwarp.mesh import SIZED_BUILTINS, builtin_names, load_target
+from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, builtin_names, load_target
 from spadwarp.scene import Scene, Target
+from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
 from spadwarp.viz.panels import coloured_depth, depth_bar, strips
 from spadwarp.viz.style import BACKGROUND, save
 
-__all__ = ["DISTANCE", "describe_targets", "draw_targets", "target_scene"]
+__all__ = ["DISTANCE", "describe_targets", "draw_mesh", "draw_targets", "target_scene"]
 
 DISTANCE = 15.0  # [m]
 FIELD_OF_VIEW = 17.0  # [°]
 _SIDE = 3.5  # [m] of targets that have no size of their own
+_VIEWS = ((0.0, 0.0, 0.0), (0.0, 90.0, 0.0), (90.0, 0.0, 0.0))  # rotations [°]
 _LIGHT = np.array([-0.35, -0.5, -0.79])  # direction to a lamp on the upper left of the camera
 
 
 def target_scene(name: str, *, pixels: int = 192) -> Scene:
     """The target `name` at 15 m before a camera of 17° and `pixels` × `pixels`."""
     size = {"size": [_SIDE] * (2 if name == "plane" else 3)} if name in SIZED_BUILTINS else {}
+    return _scene({"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}, pixels)
+
+
+def _scene(target: dict[str, Any], pixels: int) -> Scene:
     return Scene.from_dict(
         {
             "medium": {"extinction": 0.1, "albedo": 0.8},
@@ -37,7 +43,7 @@ def target_scene(name: str, *, pixels: int = 192) -> Scene:
                 "aperture_diameter": 0.01,
             },
             "gate": {"bin_width_ps": 100.0, "bins": 1},
-            "targets": [{"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}],
+            "targets": [target],
         }
     )
 
@@ -75,6 +81,36 @@ def draw_targets(
         axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
         axis.set_title(name, fontsize=11, pad=3)
     depth_bar(figure, axes, scale, "depth z [m]", fontsize=10)
+    return save(figure, path)
+
+
+def draw_mesh(mesh: MeshSummary, path: str | Path, *, pixels: int = 256, device: str | None = None) -> Path:
+    """Draws a mesh file as the camera sees it, from its side and from above, shaded, with its depth; returns the path.
+
+    Args:
+        mesh: From `spadwarp.mesh.describe_mesh`.
+        path: The picture.
+        pixels: Width and height of each view, > 0.
+        device: Warp device for the rays.
+
+    Raises:
+        MeshError: The file of the mesh is gone.
+        FileError: The picture cannot be written.
+    """
+    shown = _SIDE / max(mesh.extent)  # scale that fills the view
+    metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
+    figure, axes = strips(len(_VIEWS), columns=len(_VIEWS), size=(3.5, 2.3), spare=0.6, pads=(0.05, 0.03))
+    scale = Normalize(DISTANCE - 0.5 * _SIDE, DISTANCE + 0.5 * _SIDE)
+    for axis, rotation in zip(axes, _VIEWS, strict=False):
+        centre = rotation_matrix(rotation) @ (shown * np.array(mesh.centre))
+        target = {"mesh": str(mesh.path), "scale": shown, "rotation_deg": list(rotation)}
+        target["translation"] = [float(x) for x in np.array([0.0, 0.0, DISTANCE]) - centre]
+        truth = truth_maps(_scene(target, 2 * pixels), device=device)
+        views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
+        axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
+        axis.set_title(f"rotation_deg = {[round(angle) for angle in rotation]}", fontsize=10, pad=3)
+    depth_bar(figure, axes, Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest), "depth from the centre [m]", fontsize=9)
+    figure.suptitle(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}", fontsize=11)
     return save(figure, path)
 
 

@@ -226,3 +226,55 @@ def test_every_shipped_scene_is_free_of_warnings(path):
 def test_a_specular_lobe_is_said_to_be_left_out_of_budgets():
     shiny = BASE.with_overrides({"targets[0].specular": 0.3})
     assert find(check(shiny, plate(5.0)), "targets[0].specular", "note").values == {"specular": 0.3}
+
+
+# Plausible values
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("laser.pulse_energy", 15.0, 'did you mean "15 nJ" (1.5e-08 J) or "15 µJ"'),
+        ("laser.repetition_rate", 2.0, '"2 MHz" (2e+06 Hz)'),
+        ("laser.wavelength_nm", 532e-9, '"5.32e-07 m" (532 nm)'),
+        ("detector.jitter_fwhm_ps", 50e-12, '"5e-11 s" (50 ps)'),
+        ("camera.aperture_diameter", 25.0, '"25 mm" (0.025 m)'),
+        ("gate.bin_width_ps", 0.05, '"0.05 ns" (50 ps)'),
+    ],
+)
+def test_a_value_in_the_wrong_unit_is_told_with_the_likely_one(field, value, words):
+    message = find(check(BASE.with_overrides({field: value}), plate(5.0)), field)
+    assert words in message.text and message.values["value"] == value
+    section, name = field.split(".")
+    right = words.split('"')[1]  # what it suggests is plausible
+    found = check(BASE.with_overrides({section: {name: right}}), plate(5.0))
+    assert not any("plausible" in one.text for one in found if one.field == field)
+
+
+def test_powers_and_places_that_nobody_has_are_told():
+    strong = BASE.with_overrides(laser={"pulse_energy": 1e-3})
+    assert "20 kW on average" in find(check(strong, plate(5.0)), "laser.pulse_energy").text
+    far = BASE.with_overrides({"targets[0].translation": [0, 0, 5000.0]})
+    assert "in mm it would be [0.0, 0.0, 5.0] m" in find(check(far, plate(5.0)), "targets[0].translation").text
+
+
+def test_a_mesh_in_millimetres_is_told_with_its_scale(tmp_path):
+    import trimesh
+
+    trimesh.creation.box((400, 300, 2000)).export(tmp_path / "box.stl")
+    scene = BASE.with_overrides(targets=[{"mesh": str(tmp_path / "box.stl"), "translation": [0, 0, 5000.0]}])
+    text = find(check(scene), "targets[0].scale").text
+    assert "unit is mm, scale = 0.001 makes it 0.4 x 0.3 x 2 m" in text
+
+
+def test_the_light_at_the_target_and_in_a_pixel():
+    numbers = summary(BASE, plate(5.0))
+    cone = 2 * math.pi * (1 - math.cos(math.radians(15))) * 5.0**2
+    assert numbers["irradiance"] == pytest.approx(0.75 / cone * math.exp(-1.5), rel=1e-3)
+    assert numbers["average_power"] == 0.75
+    assert numbers["photons_per_pixel"] == pytest.approx(numbers["signal_per_pulse"] / numbers["pde"])
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_scenes_that_come_with_the_package_are_plausible(path):
+    assert not [str(one) for one in check(load_scene(path)) if "plausible" in one.text]

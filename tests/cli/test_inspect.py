@@ -120,3 +120,16 @@ def test_exit_code_of_a_process_that_was_used_wrongly(scene):
     _, complaints = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "Traceback" not in complaints
+
+
+def test_targets_looks_at_mesh_files(tmp_path):
+    import trimesh
+
+    trimesh.creation.box((400, 300, 200)).export(tmp_path / "box.stl")
+    summary = tmp_path / "printed.json"
+    printed = run("targets", tmp_path / "box.stl", "--out", tmp_path / "pictures", "--json", summary, *DEVICE).stdout
+    assert "probably mm" in printed and "12 faces, closed" in printed and "400 x 300 x 200" in printed
+    (found,) = tables(summary)["meshes"]
+    assert found["scale"] == 0.001 and found["hints"]
+    assert (tmp_path / "pictures" / "box.png").stat().st_size > 5000
+    assert "no such file" in run("targets", tmp_path / "nothing.stl", code=1).stderr

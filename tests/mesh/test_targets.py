@@ -10,7 +10,7 @@ import trimesh
 
 from helpers.synthetic_result import cast_truth, make_scene
 from spadwarp.errors import MeshError
-from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, load_target
+from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, describe_mesh, load_target
 from spadwarp.scene import Scene, Target
 
 FORMATS = ("stl", "obj", "ply", "off", "glb")
@@ -319,3 +319,34 @@ def test_too_many_subdivisions_are_refused_before_they_are_made() -> None:
     assert "targets[1].subdivisions = 12 makes 2684354560 faces of 160" in error_of(
         {"builtin": "staircase", "subdivisions": 12}
     )
+
+
+# Mesh files before they stand in a scene
+
+
+@pytest.mark.parametrize(("metres", "unit"), [(1.0, "m"), (1e-3, "mm"), (1e-6, "µm")])
+def test_a_mesh_file_is_described_with_its_likely_unit(tmp_path, metres, unit):
+    mesh = trimesh.creation.box((0.4 / metres, 0.3 / metres, 2.0 / metres))
+    mesh.apply_translation([0, 0, 5.0 / metres])
+    mesh.export(tmp_path / "box.stl")
+    found = describe_mesh(tmp_path / "box.stl")
+    assert (found.unit, found.scale, found.is_watertight, found.bodies) == (unit, metres, True, 1)
+    assert np.allclose(np.array(found.extent) * metres, [0.4, 0.3, 2.0]) and found.longest == pytest.approx(2.0)
+    assert ("scale = 0.001" in " ".join(found.hints)) == (unit == "mm")
+    assert any("translation" in hint for hint in found.hints) and any("[90, 0, 0]" in hint for hint in found.hints)
+    built = build_mesh(scene_of({"mesh": str(tmp_path / "box.stl"), "scale": found.scale}))
+    assert np.ptp(built.bounds, axis=0)[2] == pytest.approx(2.0, rel=1e-5)
+
+
+def test_an_open_mesh_and_one_of_no_likely_unit_are_told(tmp_path):
+    sphere = trimesh.creation.icosphere()
+    sphere.update_faces(np.arange(len(sphere.faces)) > 20)
+    sphere.export(tmp_path / "open.ply")
+    found = describe_mesh(tmp_path / "open.ply")
+    assert not found.is_watertight and any("not closed" in hint for hint in found.hints)
+    tiny = trimesh.creation.icosphere(radius=1e-3)
+    tiny.export(tmp_path / "tiny.ply")
+    found = describe_mesh(tmp_path / "tiny.ply")
+    assert found.unit is None and found.scale == 1.0 and any("neither" in hint for hint in found.hints)
+    with pytest.raises(MeshError, match="no such file"):
+        describe_mesh(tmp_path / "nothing.stl")

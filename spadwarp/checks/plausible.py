@@ -1,0 +1,116 @@
+"""Values that are valid but far from what a SPAD camera, its laser, water and targets have: mostly a wrong unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from spadwarp.checks.message import CheckMessage, warning
+from spadwarp.checks.survey import Survey
+from spadwarp.mesh import guess_unit
+from spadwarp.scene.quantities import field_unit
+from spadwarp.units import quantity, with_prefix
+
+# Section → field → lowest and highest plausible value in the field's own unit, and units that people take it for.
+# 0 is always allowed: it leaves something out. Lasers from femtosecond oscillators to Q-switched, cameras from
+# endoscopes to telescopes, water from pure to milk.
+_PLAUSIBLE: dict[str, dict[str, tuple[float, float, tuple[str, ...]]]] = {
+    "laser": {
+        "pulse_energy": (1e-14, 0.1, ("nJ", "µJ")),
+        "repetition_rate": (5.0, 1e10, ("kHz", "MHz")),
+        "pulse_fwhm_ps": (0.01, 1e5, ("s", "ns")),
+        "wavelength_nm": (200.0, 2000.0, ("m", "µm")),
+        "half_angle_deg": (1e-3, 180.0, ()),
+        "beam_radius": (1e-5, 2.0, ("mm",)),
+    },
+    "camera": {
+        "focal_length": (1e-4, 5.0, ("mm",)),
+        "pixel_pitch_um": (0.5, 2000.0, ("m", "mm")),
+        "aperture_diameter": (1e-5, 5.0, ("mm",)),
+        "f_number": (0.3, 200.0, ()),
+    },
+    "detector": {
+        "jitter_fwhm_ps": (0.5, 1e5, ("s", "ns")),
+        "irf_tail_ps": (0.1, 1e6, ("s", "ns")),
+        "dark_count_rate": (1e-4, 1e9, ()),
+        "dead_time_ns": (0.1, 1e6, ("s", "µs")),
+        "afterpulsing_time_constant_ns": (0.1, 1e6, ("s", "µs")),
+    },
+    "gate": {
+        "start_ns": (1e-3, 1e5, ("s", "µs", "ps")),
+        "bin_width_ps": (0.1, 1e6, ("s", "ns")),
+    },
+    "medium": {
+        "absorption": (1e-6, 1e3, ()),
+        "scattering": (1e-6, 1e4, ()),
+        "extinction": (1e-5, 1e4, ()),
+    },
+}
+_MOST_POWER = 100.0  # [W]
+_FARTHEST = 1000.0  # [m] of a laser, a camera or a target
+_MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
+
+
+def check_plausible(survey: Survey) -> Iterator[CheckMessage]:
+    """Values of the scene outside what is plausible, with the unit that was probably meant."""
+    scene = survey.scene
+    found = list(_check_fields(survey))
+    yield from found
+    laser = scene.laser
+    if laser.average_power > _MOST_POWER and not any(message.field.startswith("laser.") for message in found):
+        text = (
+            f"{with_prefix(laser.pulse_energy, 'J')} at {with_prefix(laser.repetition_rate, 'Hz')} are "
+            f"{with_prefix(laser.average_power, 'W')} on average"
+        )
+        yield warning("laser.pulse_energy", text, average_power=laser.average_power)
+    places = {"laser.position": laser.position, "camera.position": scene.camera.position}
+    places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
+    for field, place in places.items():
+        if (farthest := max(map(abs, place))) > _FARTHEST:
+            text = f"{list(place)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in place]} m"
+            yield warning(field, text, farthest=farthest)
+    yield from _check_meshes(survey)
+
+
+def _check_fields(survey: Survey) -> Iterator[CheckMessage]:
+    for section, fields in _PLAUSIBLE.items():
+        model = getattr(survey.scene, section)
+        for name, (low, high, units) in fields.items():
+            value = getattr(model, name)
+            if isinstance(value, float) and value != 0.0 and not low <= value <= high:
+                yield _message(f"{section}.{name}", value, type(model).model_fields[name], (low, high), units)
+
+
+def _message(field: str, value: float, info: Any, span: tuple[float, float], units: tuple[str, ...]) -> CheckMessage:
+    own = field_unit(info) or "1"
+    unit = "" if own == "1" else f" {own}"
+    text = f"{value:g}{unit} is not plausible ({span[0]:g} to {span[1]:g}{unit} is)"
+    meant = {one: quantity(f"{value!r} {one}", own) for one in units}
+    good = {one: number for one, number in meant.items() if span[0] <= number <= span[1]}
+    if good:
+        text += "; did you mean " + " or ".join(f'"{value:g} {one}" ({number:g}{unit})' for one, number in good.items())
+        text += "?"
+    return warning(field, text, value=value, **{f"in_{one}": number for one, number in good.items()})
+
+
+def _check_meshes(survey: Survey) -> Iterator[CheckMessage]:
+    """The size of targets from files, whose unit most formats do not state."""
+    for index, target in enumerate(survey.scene.targets):
+        corners = survey.triangles[survey.target == index].reshape(-1, 3)
+        if target.mesh is None or not len(corners):
+            continue
+        extent = np.ptp(corners, axis=0)
+        longest = float(extent.max())
+        if _MESH_SIDES[0] <= longest <= _MESH_SIDES[1]:
+            continue
+        sides = " x ".join(f"{side:.4g}" for side in extent)
+        text = f"the mesh is {sides} m"
+        guess = guess_unit(longest)
+        if guess is not None and guess[0] != "m":
+            scale = [guess[1] * factor for factor in target.scale]
+            shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{one:g}') for one in scale]}"
+            smaller = " x ".join(f"{side * guess[1]:.4g}" for side in extent)
+            text += f"; if its unit is {guess[0]}, scale = {shown} makes it {smaller} m"
+        yield warning(f"targets[{index}].scale", text, longest=longest)
