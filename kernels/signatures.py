@@ -23,6 +23,8 @@ def signatures() -> str:
 
 
 def _lines(name, thing):
+    if isinstance(thing, type) and issubclass(thing, Exception):
+        return [f"class {name}({thing.__base__.__name__})"]
     if isinstance(thing, wp.Kernel):
         return [f"kernel {name}{_arguments(inspect.signature(thing.func))}"]
     if isinstance(thing, wp.Function):

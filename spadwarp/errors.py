@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 __all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"]
 
@@ -41,3 +42,15 @@ class FileError(SpadwarpError):
 
 class DeviceError(SpadwarpError):
     """A device that does not exist, or has too little memory for what was asked."""
+
+
+@contextmanager
+def kernel_errors() -> Iterator[None]:
+    """Turns what the kernel library refuses into an `ArgumentError` of spadwarp: numbers that pass one by one, but
+    together leave the range of what is computed with."""
+    import spadwarp_kernels as sk
+
+    try:
+        yield
+    except sk.ArgumentError as error:
+        raise ArgumentError(str(error)) from error

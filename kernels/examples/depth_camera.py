@@ -120,6 +120,10 @@ class SpadCamera:
             normal: vec3 `[H, W]`, unit, in the camera frame (+x right, +y down, +z forward), either side.
             reflectance: A number.
         """
+        if depth.shape != self.shape or normal.shape != self.shape:
+            raise sk.ArgumentError(
+                f"depth {depth.shape} and normal {normal.shape} are not images of {self.shape}; a call for each world"
+            )
         count = self.view.size
         distance, bright = (wp.empty(count, dtype=wp.float64, device=self.device) for _ in range(2))
         facing = wp.empty(count, dtype=wp.vec3d, device=self.device)

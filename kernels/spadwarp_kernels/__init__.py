@@ -13,6 +13,7 @@ from .analytic import (
     single_scatter_table,
     statistics_maps,
 )
+from .arguments import ArgumentError
 from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
 from .estimators import ESTIMATORS, Estimator, next_event_value
 from .intersect import segment_meets_box
@@ -109,6 +110,7 @@ __all__ = [
     "LEDGER_UNIT",
     "PINHOLE",
     "TABULATED",
+    "ArgumentError",
     "Batches",
     "Camera",
     "Data",

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import phase_function
 from spadwarp.scene.geometry import depth_per_time
@@ -37,6 +37,7 @@ class BackscatterTable(NamedTuple):
     cumulative: NDArray[np.float32]
 
 
+@kernel_errors()
 def pixel_maps(
     scene: Scene,
     *,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.model import BackscatterTable, Map
 from spadwarp.device import pick_device
+from spadwarp.errors import kernel_errors
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
@@ -67,6 +68,7 @@ class AnalyticResult:
     _flat_share: NDArray[np.float32] = field(repr=False)
     _table: BackscatterTable = field(repr=False)
 
+    @kernel_errors()
     def sample(
         self, frames: int, *, first: int = 0, seed: int | None = None, device: Any = None
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -12,6 +12,7 @@ from spadwarp.analytic.model import pixel_maps
 from spadwarp.dataset.rendered import RenderedScene, StoredFrames, backscatter_profile, intensity_step, with_exposure
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.device import pick_device
+from spadwarp.errors import kernel_errors
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
@@ -68,6 +69,7 @@ def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rende
     )
 
 
+@kernel_errors()
 def _draw_frames(
     plan: Plan,
     draw: SceneDraw,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ __all__ = ["crlb", "crlb_from_histogram"]
 Map = NDArray[np.float64]
 
 
+@kernel_errors()
 def crlb_from_histogram(
     signal_cube: ArrayLike,
     background_cube: ArrayLike,

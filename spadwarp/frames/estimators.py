@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, kernel_errors
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 
+@kernel_errors()
 def arrival_time(
     histogram: Any,
     *,

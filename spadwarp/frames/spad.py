@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, output_tensor, tensor_of
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.response import InstrumentResponse, detector_response, response_matrix
 from spadwarp.frames.window import Window, detector_window, missing_light
@@ -22,6 +22,7 @@ from spadwarp.scene import Detector, Laser
 __all__ = ["detect"]
 
 
+@kernel_errors()
 def detect(
     source: Any,
     *,

@@ -12,7 +12,7 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
-from spadwarp.errors import DeviceError
+from spadwarp.errors import DeviceError, kernel_errors
 from spadwarp.result import COMPONENTS, Tallies
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
 
@@ -158,9 +158,11 @@ def _added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
 
 @contextmanager
 def device_errors(device: wp.Device) -> Iterator[None]:
-    """Turns an error of Warp into a `DeviceError` that names the device."""
+    """Turns an error of Warp into a `DeviceError` that names the device, and what kernels refuse into an
+    `ArgumentError`."""
     try:
-        yield
+        with kernel_errors():
+            yield
     except RuntimeError as error:
         short = "allocate" in str(error) or "out of memory" in str(error)
         problem = "has too little memory left" if short else "failed"

@@ -50,6 +50,8 @@ def build_model(
         DeviceError: The device has too little memory.
     """
     _check_domain(scene, camera)
+    if camera:
+        _check_gate(scene)
     lens, limits = _camera(scene), _limits(scene, camera)
     device_mesh, surfaces = _surfaces(mesh, lens if camera else None, device)
     model = sk.Model(
@@ -255,6 +257,14 @@ def _check_domain(scene: Scene, camera: bool) -> None:
         for axis, value, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
             if not low <= value <= high:
                 raise _config_error(scene, f"{name}: {axis} = {value} is outside [{low}, {high}], the domain")
+
+
+def _check_gate(scene: Scene) -> None:
+    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
+    if max_path is not None and max_path <= begin:
+        raise _config_error(
+            scene, f"transport.max_path = {max_path} m is outside ({begin:g}, inf), the path at which the gate begins"
+        )
 
 
 def _check_size(scene: Scene, model: sk.Model, copies: float) -> None:

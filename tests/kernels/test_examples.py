@@ -77,6 +77,13 @@ def test_depth_camera(depth_camera):
     assert np.mean((mean[clean] / spread[clean] * np.sqrt(60)) ** 2) == pytest.approx(1.0, abs=0.7)
 
 
+def test_depth_camera_refuses_images_of_another_size(depth_camera):
+    _, camera, depth, normal = depth_camera
+    worlds = wp.zeros((4, *depth.shape), dtype=float, device="cpu")
+    with pytest.raises(sk.ArgumentError, match=r"depth \(4, 18, 24\) .* are not images of \(18, 24\)"):
+        camera.frame(worlds, normal)
+
+
 def test_depth_camera_takes_torch(depth_camera):
     torch = pytest.importorskip("torch")
     module, _, depth, normal = depth_camera

@@ -12,6 +12,7 @@ ROOT = Path(sk.__file__).parent
 
 # A room imports those before it.
 ROOMS = (
+    "arguments",
     "math",
     "random",
     "medium",

@@ -7,10 +7,11 @@ from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_array, check_integer, check_number
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
 from spadwarp_kernels.pixels import launch_pixels
 
-from .lidar import Lidar, beam_direction, beam_fluence, beam_path, range_of_path
+from .lidar import Lidar, beam_direction, beam_fluence, beam_path, check_lidar, range_of_path
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -171,6 +172,12 @@ def background_rate(
     return lidar.dark + value / lidar.bin_width
 
 
+def check_phase(phase: Any, device: wp.Device) -> None:
+    """A table of a phase function over the scattering angle."""
+    check_array("phase", phase, wp.float64, (None,), device)
+    check_integer("entries of phase", phase.size, 2)
+
+
 def single_scatter_table(
     lidar: Any, phase: wp.array, view: wp.array, distance: wp.array
 ) -> tuple[wp.array, wp.array, wp.array]:
@@ -184,8 +191,16 @@ def single_scatter_table(
     Returns:
         Edges in path float32 `[pixel, TABLE_EDGES]` [m], cumulative distribution of the same shape, and the total
         detections per pulse float64 `[pixel]`.
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
     """
+    check_lidar(lidar)
+    check_number("lidar.nearest", lidar.nearest, "(0, inf)")
+    check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
+    check_phase(phase, device)
+    check_array("distance", distance, wp.float64, (count,), device)
     paths = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     cumulative = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     total = wp.empty(count, dtype=wp.float64, device=device)

@@ -8,11 +8,12 @@ from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_number
 from spadwarp_kernels.math.float64 import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 from spadwarp_kernels.pixels import launch_pixels
 
-from .backscatter import background_rate
-from .lidar import Lidar
+from .backscatter import background_rate, check_phase
+from .lidar import Lidar, check_lidar
 from .outliers import outlier_probability
 
 # Unrolled loops would make the compilation for a GPU take a minute.
@@ -244,10 +245,28 @@ def statistics_maps(
         outliers: Whether their probability is wanted, which takes most of the time; else it is NaN.
 
     Where no signal falls into the gate, F is 0, and σ* and the outlier probability are NaN.
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
     """
+    check_lidar(lidar)
+    check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
+    check_phase(phase, device)
+    check_array("profile", profile, wp.float32, (None, None), device)
+    check_integer("entries of profile", profile.size, 1)
+    for name, array in {"signal": signal, "arrival": arrival, "backscatter": backscatter}.items():
+        check_array(name, array, wp.float64, (count,), device)
+    check_choice("count_law", count_law, COUNT_LAWS)
+    check_number("acquisitions", acquisitions, "(0, inf)")
+    check_number("pulses_per_frame", pulses_per_frame, "(0, inf)")
     out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
-    counting = [COUNT_LAWS.index(count_law), wp.float64(acquisitions), wp.float64(pulses_per_frame), int(outliers)]
+    counting = [
+        COUNT_LAWS.index(count_law),
+        wp.float64(acquisitions),
+        wp.float64(pulses_per_frame),
+        int(bool(outliers)),
+    ]
     inputs = [lidar, phase, profile, view, signal, arrival, backscatter, *counting, *out]
     launch_pixels(_statistics, count, inputs, device=device)
     return out
@@ -268,8 +287,19 @@ def histogram_information(
         background: float32 `[1 or pixel, 1 or bin]`.
         taps, slope_taps: float64, odd lengths: response per bin and its derivative with respect to the delay in bins.
         first_photon: Whether at most the first photon of a pulse is recorded.
+
+    Raises:
+        ArgumentError: Arrays that do not fit each other.
     """
+    check_array("signal", signal, wp.float32, (None, None))
+    check_array("background", background, wp.float32, (None, None), signal.device)
+    if background.shape[0] < 1 or background.shape[1] not in (1, signal.shape[1]):
+        raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {signal.shape[1]}) is needed")
+    for name, array in {"taps": taps, "slope_taps": slope_taps}.items():
+        check_array(name, array, wp.float64, (None,), signal.device)
+        if array.size % 2 == 0:
+            raise ArgumentError(f"{name} has {array.size} entries; an odd number is needed")
     out = wp.empty(signal.shape[0], dtype=wp.float64, device=signal.device)
-    inputs = [signal, background, taps, slope_taps, int(first_photon)]
+    inputs = [signal, background, taps, slope_taps, int(bool(first_photon))]
     launch_pixels(_histogram_information, signal.shape[0], [*inputs, out], device=signal.device)
     return out

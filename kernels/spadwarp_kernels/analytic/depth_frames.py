@@ -1,9 +1,11 @@
 """Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_number, check_seed, check_vector
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_ANALYTIC, random_block, u01, u01_open
 
@@ -113,6 +115,24 @@ def _frames(
             labels[frame, pixel] = reports_background
 
 
+def check_pixel_maps(maps: Mapping[str, Any], paths: Any, cumulative: Any, pixels: int, device: wp.Device) -> None:
+    """float32 maps `[pixel]`, and the two tables of backscatter over path."""
+    for name, array in maps.items():
+        check_array(name, array, wp.float32, (pixels,), device)
+    for name, array in {"paths": paths, "cumulative": cumulative}.items():
+        check_array(name, array, wp.float32, (None, None), device)
+        check_integer(f"rows of {name}", array.shape[0], 1)
+        check_integer(f"columns of {name}", array.shape[1], 2)
+    if paths.shape[1] != cumulative.shape[1]:
+        raise ArgumentError(f"paths {paths.shape} and cumulative {cumulative.shape} have not as many columns")
+
+
+def check_gate_paths(gate_paths: Sequence[float]) -> None:
+    """Two rising path lengths [m]."""
+    check_vector("gate_paths", gate_paths, size=2)
+    check_number("gate_paths[1]", gate_paths[1], f"[{float(gate_paths[0])}, inf)")
+
+
 def sample_frames(
     view: wp.array,
     depth: wp.array,
@@ -144,15 +164,29 @@ def sample_frames(
         first_frame, frames: The range of frames.
         seed: 64-bit.
         out: Arrays to write into.
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
     """
+    check_array("view", view, wp.vec3, (None,))
     pixels, device = view.shape[0], view.device
+    maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
+    check_pixel_maps(maps, paths, cumulative, pixels, device)
+    check_vector("laser", laser)
+    check_gate_paths(gate_paths)
+    frames = check_integer("frames", frames, 0)
+    first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
     if out is None:
         out = (
             wp.empty((frames, pixels), dtype=float, device=device),
             wp.empty((frames, pixels), dtype=wp.bool, device=device),
         )
+    if not (isinstance(out, tuple) and len(out) == 2):
+        raise ArgumentError("out is not a pair of arrays, of depth and of labels")
+    check_array("out[0]", out[0], wp.float32, (frames, pixels), device)
+    check_array("out[1]", out[1], wp.bool, (frames, pixels), device)
     # wp.tid() is a 32-bit integer, and a thread draws two frames.
-    step = 2 * max((1 << 30) // pixels, 1)
+    step = 2 * max((1 << 30) // max(pixels, 1), 1)
     for start in range(0, frames, step):
         stop = min(start + step, frames)
         sampler = Sampler()

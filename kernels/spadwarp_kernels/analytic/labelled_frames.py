@@ -5,14 +5,23 @@ their pixels that reports background, with the number of recorded photons beside
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_array,
+    check_integer,
+    check_number,
+    check_struct,
+    check_vector,
+)
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
 from spadwarp_kernels.random.quantiles import count_quantile
 
-from .depth_frames import depth_of_path, path_at_share
+from .depth_frames import check_gate_paths, check_pixel_maps, depth_of_path, path_at_share
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -104,6 +113,19 @@ def _frames(
     label_bytes[frame, byte] = wp.uint8(bits)
 
 
+def _check_coding(coding: Any) -> None:
+    check_struct("coding", coding, FrameCoding)
+    check_vector("coding.laser", coding.laser)
+    check_gate_paths((coding.nearest, coding.farthest))
+    width = check_integer("coding.width", coding.width, 1)
+    if check_integer("coding.pixels", coding.pixels, 1) % width:
+        raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
+    check_number("coding.depth_offset", coding.depth_offset)
+    for name in ("depth_step", "intensity_step"):
+        check_number(f"coding.{name}", getattr(coding, name), "(0, inf)")
+    check_number("coding.pulses", coding.pulses, "[0, inf)")
+
+
 def draw_frames(
     coding: FrameCoding,
     view: wp.array,
@@ -133,7 +155,15 @@ def draw_frames(
     Returns:
         Depth codes uint16 `[frame, pixel]`, intensity codes uint8 `[frame, pixel]`, labels uint8 `[frame, byte]`: rows
         of (width + 7)/8 bytes, the first pixel in the highest bit, as `np.packbits` has them.
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
     """
+    _check_coding(coding)
+    check_array("view", view, wp.vec3, (coding.pixels,))
+    maps = {"depth": depth, "sigma_depth": sigma_depth, "alpha": alpha, "probability": probability}
+    check_pixel_maps(maps | {"flat_share": flat_share}, paths, cumulative, coding.pixels, view.device)
+    check_array("fraction", fraction, wp.float32, (None,), view.device)
     device, frames = view.device, fraction.size
     row_bytes = (coding.width + 7) // 8
     label_count = coding.pixels // coding.width * row_bytes

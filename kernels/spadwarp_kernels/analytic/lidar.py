@@ -3,8 +3,11 @@
 In float64; times are from the emission of the pulse.
 """
 
+from typing import Any
+
 import warp as wp
 
+from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
 from spadwarp_kernels.math.float64 import ONE, PI, TWO, ZERO
 
 # Unrolled loops would make the compilation for a GPU take a minute.
@@ -62,6 +65,40 @@ class Lidar:
     constant: wp.float64
     nearest: wp.float64
     bin_width: wp.float64
+
+
+_RANGES = {
+    "photons": "[0, inf)",
+    "pde": "[0, 1]",
+    "extinction": "[0, inf)",
+    "scattering": "[0, inf)",
+    "speed": "(0, inf)",
+    "pixel_tangent": "(0, inf)",
+    "aperture_area": "(0, inf)",
+    "start": "[0, inf)",
+    "sigma": "(0, inf)",
+    "dark": "[0, inf)",
+    "constant": "[0, inf)",
+    "nearest": "[0, inf)",
+}
+# What each laser profile reads.
+_BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
+
+
+def check_lidar(lidar: Any) -> None:
+    """A `Lidar` whose numbers are in range; raises `ArgumentError`."""
+    check_struct("lidar", lidar, Lidar)
+    check_integer("lidar.lu2024", lidar.lu2024, 0, 1)
+    check_fields("lidar", lidar, _RANGES)
+    check_number("lidar.stop", lidar.stop, f"({float(lidar.start)}, inf)")
+    check_vector("lidar.laser", lidar.laser)
+    check_vector("lidar.axis", lidar.axis, unit=True)
+    check_fields("lidar", lidar, _BEAM[check_integer("lidar.profile", lidar.profile, 0, len(_BEAM) - 1)])
+    source = check_integer("lidar.source", lidar.source, 0, len(BACKSCATTER_SOURCES) - 1)
+    if lidar.lu2024:
+        check_number("lidar.tan2", lidar.tan2, "(0, inf)")
+    if BACKSCATTER_SOURCES[source] == "monte_carlo":
+        check_number("lidar.bin_width", lidar.bin_width, "(0, inf)")
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_array
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, one_minus_exp
 from spadwarp_kernels.pixels import launch_pixels
 
@@ -103,6 +104,9 @@ def _outliers(
 
 def outlier_probabilities(signal_count: wp.array, level: wp.array, window: wp.array) -> wp.array:
     """`outlier_probability` of every element: float64 arrays of one length in and out."""
+    check_array("signal_count", signal_count, wp.float64, (None,))
+    for name, array in {"level": level, "window": window}.items():
+        check_array(name, array, wp.float64, signal_count.shape, signal_count.device)
     out = wp.empty(signal_count.shape[0], dtype=wp.float64, device=signal_count.device)
     launch_pixels(_outliers, signal_count.shape[0], [signal_count, level, window, out], device=signal_count.device)
     return out

@@ -8,10 +8,11 @@ from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_array
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
 from spadwarp_kernels.pixels import launch_pixels
 
-from .lidar import Lidar, beam_direction, beam_fluence, beam_path
+from .lidar import Lidar, beam_direction, beam_fluence, beam_path, check_lidar
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -194,8 +195,16 @@ def signal_map(
 
     Returns:
         Signal float64 `[pixel]` (0 without a target) and arrival time float64 `[pixel]` [s] (NaN without a target).
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
     """
+    check_lidar(lidar)
+    check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
+    check_array("distance", distance, wp.float64, (count,), device)
+    check_array("normal", normal, wp.vec3d, (count,), device)
+    check_array("reflectance", reflectance, wp.float64, (count,), device)
     signal = wp.empty(count, dtype=wp.float64, device=device)
     arrival = wp.empty(count, dtype=wp.float64, device=device)
     launch_pixels(_signal, count, [lidar, view, distance, normal, reflectance, signal, arrival], device=device)

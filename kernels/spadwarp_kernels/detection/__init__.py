@@ -1,6 +1,6 @@
 """SPAD and TCSPC: counts from expected detections, and arrival times from histograms."""
 
-from .arrival_time import PHASES, arrival_bins, first_invalid_row
+from .arrival_time import PHASES, arrival_bins
 from .events import EVENT_LIMIT, event_counts
 from .expected import (
     add_crosstalk,
@@ -11,6 +11,7 @@ from .expected import (
     free_running_probabilities,
 )
 from .first_photon import first_photon_counts
+from .rates import first_invalid_row
 
 __all__ = [
     "EVENT_LIMIT",

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
 from spadwarp_kernels.pixels import launch_pixels
+
+from .rates import RATES
 
 wp.set_module_options({"enable_backward": False})
 
@@ -263,30 +266,6 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
     return likelihood
 
 
-@cache
-def _invalid_kernel(dtype: Any) -> wp.Kernel:
-    @wp.kernel(enable_backward=False, module="unique")
-    def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):
-        pixel = first_pixel + wp.tid()
-        for k in range(values.shape[1]):
-            value = float(values[pixel, k])
-            if value < 0.0 or not wp.isfinite(value):
-                wp.atomic_min(worst, 0, pixel)
-                return
-
-    return invalid
-
-
-def first_invalid_row(values: wp.array) -> int | None:
-    """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
-    if values.shape[0] == 0:
-        return None
-    worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
-    launch_pixels(_invalid_kernel(values.dtype), values.shape[0], [values, worst], device=values.device)
-    row = int(worst.numpy()[0])
-    return None if row == 2**31 - 1 else row
-
-
 def arrival_bins(
     histogram: wp.array,
     *,
@@ -316,23 +295,37 @@ def arrival_bins(
 
     Returns:
         float32 `[pixel]` on the histogram's device. NaN: nothing returned (no counts, or none above the background).
+
+    Raises:
+        ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
+    check_array("histogram", histogram, RATES, (None, None))
+    check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
     device = histogram.device
     pixels, bins = histogram.shape
-    stop = bins if stop is None else stop
+    first = check_integer("first", first, 0, bins)
+    stop = bins if stop is None else check_integer("stop", stop, first, bins)
+    half_width = check_integer("half_width", half_width, 0, 2**24)
+    lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
     arrival = wp.empty(pixels, dtype=float, device=device)
     if background is None:
         background = wp.zeros((1, 1), dtype=float, device=device)
+    check_array("background", background, wp.float32, (None, None), device)
+    if background.shape[0] < 1 or background.shape[1] not in (1, bins):
+        raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
     if method in ("peak", "centroid"):
         kernel = _peak_kernel(histogram.dtype, method == "centroid")
         launch_pixels(kernel, pixels, [histogram, background, first, stop, half_width, arrival], device=device)
         return arrival
-    if method not in ("matched", "likelihood"):
-        raise ValueError(f"method = {method!r} is not one of 'peak', 'centroid', 'matched', 'likelihood'")
     if response is None:
-        raise ValueError(f"method = {method!r} needs a response")
-    if response.ndim != 2 or response.shape[0] != PHASES:
-        raise ValueError(f"response has shape {response.shape}, not ({PHASES}, taps)")
+        raise ArgumentError(f"method = {method!r} needs a response")
+    response = check_numbers("response", response)
+    if response.ndim != 2 or response.shape[0] != PHASES or response.size == 0:
+        raise ArgumentError(f"response has shape {response.shape}; ({PHASES}, taps) is needed")
+    if not (np.isfinite(response).all() and response.min() >= 0.0 and response.max() > 0.0):
+        raise ArgumentError(
+            f"response holds {response.min()} to {response.max()}; finite values >= 0 are needed, and one above"
+        )
     floor = RESPONSE_FLOOR * float(response.max())
     # A narrow response loses signal between the delays of the coarse search, a wide one does not.
     coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4

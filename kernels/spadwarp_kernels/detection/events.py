@@ -6,11 +6,12 @@ Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not de
 import numpy as np
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_integer, check_number, check_numbers
 from spadwarp_kernels.math.float64 import log1p
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.binomial import PURPOSE_EVENTS, uniforms
 
-from .first_photon import zeroed_counts
+from .first_photon import check_exposure, check_rates, zeroed_counts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,7 +43,9 @@ def _cumulative_kernel(
     total = wp.float64(0.0)
     cumulative[pixel, 0] = total
     for k in range(hazard.shape[1]):
-        total += wp.float64(hazard[offset + pixel, k])
+        # What is no rate counts as none: a history must come to its end.
+        if hazard[offset + pixel, k] > 0.0:
+            total += wp.float64(wp.min(hazard[offset + pixel, k], 1.0e30))
         cumulative[pixel, k + 1] = total
 
 
@@ -192,6 +195,15 @@ def _event_kernel(
     tag_count[row] = tags
 
 
+def _rising_edges(edges: np.ndarray, bins: int, period: float) -> np.ndarray:
+    edges = check_numbers("edges", edges)
+    if edges.shape != (bins + 1,):
+        raise ArgumentError(f"edges has shape {edges.shape}; ({bins + 1},), one more than the bins, is needed")
+    if not (edges[0] == 0.0 and (np.diff(edges) > 0.0).all() and edges[-1] <= period * (1.0 + 1e-9)):
+        raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
+    return edges
+
+
 def event_counts(
     hazard: wp.array,
     *,
@@ -217,7 +229,7 @@ def event_counts(
     time, with exponential delay; afterpulses have afterpulses.
 
     Args:
-        hazard: λ, float32 `[pixel, bin]`.
+        hazard: λ, as in `first_photon_counts`.
         edges: of its bins [s], float64 `[bin + 1]`, from 0 to at most `period`; no photon comes after the last.
         recorded: the first `recorded` bins are histogrammed; in the others the detector fires unseen.
         gated: off from a detection, or from the last edge, to the next pulse: first-photon TCSPC. Else free-running.
@@ -228,19 +240,35 @@ def event_counts(
     Returns:
         int32 `[frames · pixel, recorded]` and, with `tags`, the arrays `row` (frame · pixels + pixel, int64), `pulse`
         (int64) and `bin` (int32) in the order of row and time; otherwise None.
+
+    Raises:
+        ArgumentError: A number out of range, an array of another kind, or too many detections in a frame.
     """
+    check_rates("hazard", hazard)
     device = hazard.device
     pixels, bins = hazard.shape
+    pulses, frames, first_frame, counter_depth, seed = check_exposure(
+        hazard, pulses, frames, first_frame, counter_depth, seed
+    )
+    recorded = check_integer("recorded", recorded, 1, bins)
+    check_number("period", period, "(0, inf)")
+    check_number("dead_time", dead_time, "[0, inf)")
+    check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
+    check_number("afterpulsing_time_constant", afterpulsing_time_constant, "(0, inf)")
+    edges = _rising_edges(edges, bins, period)
     rows = frames * pixels
     counts = zeroed_counts(counts, (rows, recorded), device)
     number = wp.zeros(rows, dtype=int, device=device)
     # A period without dead time holds any number of detections: only then does the mean have to be looked up.
     most = 1.0 if gated else period / dead_time + 1.0 if dead_time > 0 else np.inf
     if pulses * most > EVENT_LIMIT:
-        most = min(most, float(hazard.numpy().sum(axis=1, dtype=np.float64).max()) / (1.0 - afterpulsing_probability))
+        mean = np.nan_to_num(hazard.numpy(), posinf=1e30).clip(0.0, 1e30).sum(axis=1, dtype=np.float64).max(initial=0.0)
+        most = min(most, float(mean) / (1.0 - afterpulsing_probability))
     if pulses * most > EVENT_LIMIT:
-        raise ValueError(f"a pixel may see {pulses * most:.3g} counts in a frame, above {EVENT_LIMIT}: use more frames")
-    edge_row = wp.array(np.asarray(edges, np.float64)[None, :], dtype=wp.float64, device=device)
+        raise ArgumentError(
+            f"a pixel may see {pulses * most:.3g} counts in a frame, above {EVENT_LIMIT}: use more frames"
+        )
+    edge_row = wp.array(edges[None, :], dtype=wp.float64, device=device)
     chunk = max(1, min(pixels, 2**25 // (bins + 1)))
 
     def run(write: int, start: wp.array, pulse: wp.array, bin: wp.array) -> None:
@@ -248,7 +276,7 @@ def event_counts(
             size = min(chunk, pixels - offset)
             cumulative = wp.empty((size, bins + 1), dtype=wp.float64, device=device)
             launch_pixels(_cumulative_kernel, size, [offset, hazard, cumulative], device=device)
-            inputs = [cumulative, offset, pixels, edge_row, recorded, pulses, period, int(gated), dead_time]
+            inputs = [cumulative, offset, pixels, edge_row, recorded, pulses, period, int(bool(gated)), dead_time]
             inputs += [afterpulsing_probability, afterpulsing_time_constant, first_frame]
             inputs += [counter_depth or 2**31 - 1, seed, write, start, counts, number, pulse, bin]
             launch_pixels(_event_kernel, frames * size, inputs, device=device)

@@ -10,9 +10,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_array,
+    check_device,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_seed,
+)
 from spadwarp_kernels.math.float64 import expm1, log1p
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.binomial import PURPOSE_DARK_COUNTS, uniforms
+
+from .rates import RATES
 
 wp.set_module_options({"enable_backward": False})
 
@@ -154,8 +165,13 @@ def dark_count_rates(
     """Dark count rate of every pixel [1/s], float32.
 
     Lognormal about `median` with `spread` the standard deviation of ln(rate); hot pixels, a `hot_fraction` of all, have
-    `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure.
+    `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
+    pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
+    for name, value in {"median": median, "spread": spread, "hot_rate": hot_rate, "offset": offset}.items():
+        check_number(name, value, "[0, inf)")
+    check_number("hot_fraction", hot_fraction, "[0, 1]")
+    device = check_device("device", device)
     rate = wp.empty(pixels, dtype=float, device=device)
     inputs = [seed, median, spread, hot_fraction, hot_rate, offset, rate]
     launch_pixels(_dark_count_kernel, pixels, inputs, device=rate.device)
@@ -180,8 +196,14 @@ def expected_detections(
         row_start, source_bin, weight: sparse matrix (CSR) of the response, detector bins by source bins.
         width: of the detector bins [s].
         noise_rate: of dark counts and ambient light per pixel [1/s], float32.
+
+    Raises:
+        ArgumentError: Arrays that do not fit each other, or a matrix that points outside the source.
     """
+    check_array("source", source, RATES, (None, None))
     device = source.device
+    check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
+    _check_matrix(source.shape[1], row_start, source_bin, weight, width)
     hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
     matrix = [
         wp.array(row_start, dtype=int, device=device),
@@ -194,14 +216,42 @@ def expected_detections(
     return hazard
 
 
+def _check_matrix(
+    columns: int, row_start: np.ndarray, source_bin: np.ndarray, weight: np.ndarray, width: np.ndarray
+) -> None:
+    rows, entries = check_numbers("row_start", row_start, 1), check_numbers("source_bin", source_bin, 1)
+    weight, width = check_numbers("weight", weight, 1), check_numbers("width", width, 1)
+    if rows.size != width.size + 1:
+        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {width.shape}, is needed")
+    if weight.shape != entries.shape:
+        raise ArgumentError(f"source_bin {entries.shape} and weight {weight.shape} are not two equal lists")
+    if rows[0] != 0 or rows[-1] != entries.size or (np.diff(rows) < 0).any():
+        raise ArgumentError(f"row_start does not rise from 0 to {entries.size}, the number of entries")
+    if entries.size and not (entries.min() >= 0 and entries.max() < columns):
+        raise ArgumentError(f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {columns - 1}]")
+    for name, values in {"weight": weight, "width": width}.items():
+        if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
+            raise ArgumentError(f"{name} holds numbers that are negative or not finite")
+
+
 def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, probability: float) -> None:
-    """Add `probability` times the four neighbours' expected detections to λ, in place; both float32 `[pixel, bin]`."""
+    """Add `probability` times the four neighbours' expected detections to λ, in place; both float32 `[pixel, bin]`.
+
+    Raises `ArgumentError`.
+    """
+    check_array("hazard", hazard, wp.float32, (None, None))
+    check_array("detections", detections, wp.float32, hazard.shape, hazard.device)
+    image_width = check_integer("image_width", image_width, 1)
+    check_number("probability", probability, "[0, 1]")
+    if hazard.shape[0] % image_width:
+        raise ArgumentError(f"image_width = {image_width} does not divide hazard's {hazard.shape[0]} pixels")
     inputs = [image_width, probability, detections, hazard]
     launch_pixels(_crosstalk_kernel, hazard.shape[0], inputs, device=hazard.device)
 
 
 def first_photon_probabilities(hazard: wp.array) -> wp.array:
     """P(first photon in bin k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)), of λ's shape `[pixel, bin]` and float type."""
+    check_array("hazard", hazard, (wp.float32, wp.float64), (None, None))
     law = wp.empty(hazard.shape, dtype=hazard.dtype, device=hazard.device)
     launch_pixels(_first_photon_law_kernel(hazard.dtype), hazard.shape[0], [hazard, law], device=hazard.device)
     return law
@@ -212,6 +262,9 @@ def free_running_probabilities(hazard: wp.array, *, dead_time: float, period: fl
 
     Exact in the sum for a steady rate; the shadow that a strong return casts over the bins behind it is spread out.
     """
+    check_array("hazard", hazard, wp.float32, (None, None))
+    check_number("dead_time", dead_time, "[0, inf)")
+    check_number("period", period, "(0, inf)")
     seen = wp.empty(hazard.shape, dtype=float, device=hazard.device)
     inputs = [hazard, dead_time, period, seen]
     launch_pixels(_free_running_kernel, hazard.shape[0], inputs, device=hazard.device)
@@ -225,6 +278,8 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
     Source: P. B. Coates, "The correction for photon pile-up in the measurement of radiative lifetimes", J. Phys. E 1,
     878 (1968).
     """
+    check_array("counts", counts, wp.int32, (None, None))
+    check_number("pulses", pulses, "(0, inf)")
     hazard = wp.empty(counts.shape, dtype=wp.float64, device=counts.device)
     launch_pixels(_coates_kernel, counts.shape[0], [counts, pulses, hazard], device=counts.device)
     return hazard

@@ -7,8 +7,11 @@ from typing import Any
 
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_seed
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.binomial import PURPOSE_COUNTS, binomial, uniforms
+
+from .rates import first_invalid_row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,7 +91,8 @@ def first_photon_counts(
     """Counts of first-photon TCSPC, drawn exactly: bin after bin a binomial of the pulses that have not counted yet.
 
     Args:
-        hazard: λ, float32 `[pixel, bin]`, not negative.
+        hazard: λ, float32 `[pixel, bin]`, finite and not negative, which is checked on the CPU alone: on a GPU every
+            call would wait for it.
         pulses: per frame, below 2^31.
         frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call.
         summed: add the frames up.
@@ -98,7 +102,14 @@ def first_photon_counts(
 
     Returns:
         int32 `[frames · pixel, bin]`, or `[pixel, bin]` if summed. At most one count per pulse and pixel.
+
+    Raises:
+        ArgumentError: A number out of range, or an array of another kind.
     """
+    check_rates("hazard", hazard)
+    pulses, frames, first_frame, counter_depth, seed = check_exposure(
+        hazard, pulses, frames, first_frame, counter_depth, seed
+    )
     pixels, bins = hazard.shape
     rows = pixels if summed else frames * pixels
     counts = zeroed_counts(counts, (rows, bins), hazard.device)
@@ -107,11 +118,32 @@ def first_photon_counts(
     return counts
 
 
+def check_rates(name: str, rates: wp.array) -> None:
+    """float32 `[pixel, bin]`; on the CPU, where nobody has to wait for it, also that every rate is one."""
+    check_array(name, rates, wp.float32, (None, None))
+    if rates.device.is_cpu and (row := first_invalid_row(rates)) is not None:
+        raise ArgumentError(f"{name} of pixel {row} holds numbers that are negative or not finite")
+
+
+def check_exposure(
+    hazard: wp.array, pulses: int, frames: int, first_frame: int, counter_depth: int, seed: int
+) -> tuple[int, int, int, int, int]:
+    """The numbers of an exposure, in range: at most 2^31 - 1 rows in one call."""
+    return (
+        check_integer("pulses", pulses, 0),
+        check_integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
+        check_integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31),
+        check_integer("counter_depth", counter_depth, 0),
+        check_seed(seed),
+    )
+
+
 def zeroed_counts(array: wp.array | None, shape: tuple[int, int], device: Any) -> wp.array:
     """The caller's array of counts, or a new one, set to zero."""
     if array is None:
         return wp.zeros(shape, dtype=int, device=device)
-    if array.dtype is not wp.int32 or array.size != shape[0] * shape[1] or not array.is_contiguous:
-        raise ValueError(f"counts are {array.dtype.__name__} {array.shape}; contiguous int32 {shape} is needed")
+    if not isinstance(array, wp.array) or array.size != shape[0] * shape[1]:
+        raise ArgumentError(f"counts do not have the {shape[0] * shape[1]} entries of a contiguous int32 array {shape}")
+    check_array("counts", array, wp.int32, tuple(array.shape), device, contiguous=True)
     array.zero_()
     return array.reshape(shape)

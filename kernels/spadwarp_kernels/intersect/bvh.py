@@ -11,6 +11,7 @@ of a lower corner holds the bits of the child: the index of its own pair, or -2 
 three vec4 each, see `face_distance`, in the order of the leaves.
 """
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
@@ -139,6 +140,13 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
     wp.launch(_pack_kernel, has_children.size, [mesh.id, padding, before], outputs=[nodes, order], device=device)
     wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=device)
     return nodes, faces, order
+
+
+def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
+    """What `pack_bvh` returns, for no faces at all: a root whose two children no ray meets."""
+    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
+    nodes = wp.array([[x, x, x, bits]] * 4, dtype=wp.vec4, device=device)
+    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
 @wp.struct

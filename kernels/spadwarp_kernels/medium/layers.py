@@ -10,7 +10,18 @@ from typing import NamedTuple
 
 import warp as wp
 
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_device,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_vector,
+)
+
 from .water import Medium, free_path
+
+_RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)"}
 
 
 @wp.struct
@@ -151,11 +162,24 @@ def make_layers(
     axis: Sequence[float] = (0.0, 0.0, 1.0),
     device: wp.DeviceLike = None,
 ) -> Layers:
-    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning."""
+    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning and ranges.
+
+    Raises `ArgumentError`.
+    """
     columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
+    for name, column in columns.items():
+        check_numbers(name, column, 1)
+    device = check_device("device", device)
     if len({len(column) for column in columns.values()}) > 1:
         sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
-        raise ValueError(f"layers: {sizes} entries; one each for every layer are needed")
+        raise ArgumentError(f"layers: {sizes} entries; one each for every layer are needed")
+    check_integer("number of layers", len(start), 1)
+    check_vector("axis", axis, unit=True)
+    for name, interval in _RANGES.items():
+        for k, value in enumerate(columns[name]):
+            check_number(f"{name}[{k}]", value, interval)
+    for k in range(2, len(start)):
+        check_number(f"start[{k}]", start[k], f"[{float(start[k - 1])}, inf)")
     layers = Layers()
     layers.axis = wp.vec3(*axis)
     for name, column in columns.items():

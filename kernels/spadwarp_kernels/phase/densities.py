@@ -6,17 +6,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spadwarp_kernels.arguments import ArgumentError, check_number, check_numbers
 from spadwarp_kernels.random.density_tables import Floats, folded_quadrature
 
 
 def henyey_greenstein_density(t: ArrayLike, g: float) -> Floats:
     """Henyey & Greenstein (1941); mean cosine g in (-1, 1)."""
-    t = np.asarray(t, np.float64)
+    check_number("g", g, "(-1, 1)")
+    t = check_numbers("t", t)
     return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
 
 
 def two_term_henyey_greenstein_density(t: ArrayLike, g1: float, g2: float, alpha: float) -> Floats:
     """alpha HG(g1) + (1 - alpha) HG(g2), alpha in [0, 1] (Haltrin, Appl. Opt. 41, 1022 (2002), with -g2 for his g2)."""
+    check_number("alpha", alpha, "[0, 1]")
     return alpha * henyey_greenstein_density(t, g1) + (1.0 - alpha) * henyey_greenstein_density(t, g2)
 
 
@@ -28,7 +31,9 @@ def fournier_forand_density(t: ArrayLike, particle_index: float, junge_slope: fl
         particle_index: Real index n of the particles over that of the water, in (1, 1.35].
         junge_slope: Slope mu of their size distribution, in (3, 5).
     """
-    s2 = 0.5 * np.asarray(t, np.float64)  # sin^2(theta/2)
+    check_number("particle_index", particle_index, "(1, 1.35]")
+    check_number("junge_slope", junge_slope, "(3, 5)")
+    s2 = 0.5 * check_numbers("t", t)  # sin^2(theta/2)
     nu = 0.5 * (3.0 - junge_slope)
     delta_180 = 4.0 / (3.0 * (particle_index - 1.0) ** 2)
     delta = delta_180 * s2
@@ -59,17 +64,17 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
         values: >= 0, of any scale.
 
     Raises:
-        ValueError: Angles or values are not of that kind.
+        ArgumentError: Angles or values are not of that kind.
     """
-    theta, value = np.array(angles, np.float64), np.array(values, np.float64)
+    theta, value = check_numbers("angles", angles), check_numbers("values", values)
     if theta.ndim != 1 or theta.size < 2 or value.shape != theta.shape:
-        raise ValueError(f"angles {theta.shape} and values {value.shape} are not two equal lists of two or more")
+        raise ArgumentError(f"angles {theta.shape} and values {value.shape} are not two equal lists of two or more")
     if not (np.isfinite(theta).all() and (np.diff(theta) > 0.0).all()):
-        raise ValueError("angles of a phase function must be finite and ascending")
+        raise ArgumentError("angles of a phase function must be finite and ascending")
     if theta[0] < 0.0 or theta[-1] > np.pi * (1.0 + 1e-12):
-        raise ValueError(f"angles [{theta[0]:g}, {theta[-1]:g}] rad are outside [0, pi]")
+        raise ArgumentError(f"angles [{theta[0]:g}, {theta[-1]:g}] rad are outside [0, pi]")
     if not (np.isfinite(value).all() and value.min() >= 0.0 and value.any()):
-        raise ValueError(f"values ({value.min():g} ... {value.max():g}) must be finite, not negative and not all 0")
+        raise ArgumentError(f"values ({value.min():g} ... {value.max():g}) must be finite, not negative and not all 0")
     logs = np.log(np.maximum(theta, 1e-300)), np.log(np.maximum(value, 1e-300))
     straight = (value[:-1] > 0.0) & (value[1:] > 0.0) & (theta[:-1] > 0.0)
     slope = np.diff(logs[1]) / np.diff(logs[0])

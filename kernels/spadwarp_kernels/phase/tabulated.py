@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from spadwarp_kernels.arguments import check_device, check_kind
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.random.density_tables import (
     DensityTables,
@@ -96,8 +97,10 @@ def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceL
         density: Over t = 1 - cos(theta) in (0, 2), >= 0, of any scale. Towards t = 0 it may rise as t^-0.95.
 
     Raises:
-        ValueError: The density is negative, not finite or zero everywhere.
+        ArgumentError: The density is negative, not finite or zero everywhere.
     """
+    device = check_device("device", device)
+    check_kind("density", density, Callable)
     scattering = tabulate(lambda z: density(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
 
     def over_angle(z: Floats) -> Floats:

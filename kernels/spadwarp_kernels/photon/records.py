@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_device, check_integer
+
 
 @wp.struct
 class Records:
@@ -25,7 +27,9 @@ class Records:
 
 
 def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
-    """Room for the terminal states of `count` photons."""
+    """Room for the terminal states of `count` photons; raises `ArgumentError` for a negative count."""
+    count = check_integer("count", count, 0)
+    device = check_device("device", device)
     records = Records()
     records.position = wp.zeros(count, dtype=wp.vec3, device=device)
     records.direction = wp.zeros(count, dtype=wp.vec3, device=device)

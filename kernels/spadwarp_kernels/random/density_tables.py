@@ -14,10 +14,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from spadwarp_kernels.arguments import ArgumentError, check_numbers
+
 Floats = NDArray[np.float64]
 
 _OCTAVES = 32
 _HALF = _OCTAVES * 16 + 1  # cells of one half; the first of them reaches to the end of the interval
+TABLE_CELLS = 2 * _HALF
 
 # Distances from the nearer end at which the cells of a half begin, and 1/2.
 _NODES = np.concatenate(
@@ -127,13 +130,15 @@ def folded_quadrature() -> tuple[Floats, Floats]:
 def tabulate(density: Callable[[Floats], Floats]) -> Floats:
     """The cells of a density in float64, `[cells, 4]`, from a density of any scale over folded coordinates.
 
-    Up to 2^-33 from an end the density is replaced by its mean there. Raises `ValueError` if it is negative, not finite
-    or zero everywhere.
+    Up to 2^-33 from an end the density is replaced by its mean there. Raises `ArgumentError` if it is negative, not
+    finite or zero everywhere.
     """
     z, weight = folded_quadrature()
-    values = np.asarray(density(z), np.float64)
+    values = check_numbers("density(t)", density(z))
+    if values.shape != z.shape:
+        raise ArgumentError(f"density(t) has shape {values.shape}; that of t, {z.shape}, is needed")
     if not (np.isfinite(values).all() and values.min() >= 0.0 and values.any()):
-        raise ValueError("a density must be finite, not negative and not zero everywhere")
+        raise ArgumentError("a density must be finite, not negative and not zero everywhere")
     width = np.diff(_NODES)
     mass = (values * weight).sum(axis=2)
     middle = 0.5 * (_NODES[1:] + _NODES[:-1])[:, None]

@@ -3,8 +3,11 @@
 Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangents are x/z and y/z of a direction.
 """
 
+from typing import Any
+
 import warp as wp
 
+from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
 from spadwarp_kernels.math.rotations import cos_sin_turn
 
 
@@ -156,3 +159,25 @@ def field(camera: Camera) -> wp.vec4:
     half_width = 0.5 * float(camera.width) * camera.pixel_tangent
     half_height = 0.5 * float(camera.height) * camera.pixel_tangent
     return wp.vec4(-half_width, -half_height, half_width, half_height)
+
+
+def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
+    """A camera that images something; raises `ArgumentError`."""
+    check_struct(name, camera, Camera)
+    for field_name in ("width", "height"):
+        check_integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
+    check_fields(
+        name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)", "aperture_area": "(0, inf)"}
+    )
+    if not calibrated:
+        return
+    for focal in camera.focal:
+        check_number(f"{name}.focal", focal, "(0, inf)")
+    check_vector(f"{name}.principal", camera.principal, size=2)
+    check_vector(f"{name}.radial", camera.radial)
+    check_vector(f"{name}.tangential", camera.tangential, size=2)
+    left, top, right, bottom = camera.view
+    check_vector(f"{name}.view", camera.view, size=4)
+    check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
+    check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
+    check_fields(name, camera, {"thin": "[0, 1]", "inverse_focus": "[0, inf)"})

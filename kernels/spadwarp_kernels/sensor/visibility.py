@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from .camera import Camera, field
+from spadwarp_kernels.arguments import check_kind
+
+from .camera import Camera, check_camera, field
 
 # Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
 _TEXELS = wp.constant(128)
@@ -54,8 +56,11 @@ def near_depth_map(mesh: wp.Mesh, camera: Camera) -> wp.array:
     """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns].
 
     A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
-    the texel's cone, up to what the outlines of faces are widened by, and before every face in it.
+    the texel's cone, up to what the outlines of faces are widened by, and before every face in it. Raises
+    `ArgumentError` for a camera that images nothing.
     """
+    check_camera("camera", camera, calibrated=False)
+    check_kind("mesh", mesh, wp.Mesh)
     near_depth = wp.full((_TEXELS, _TEXELS), _NOTHING, dtype=float, device=mesh.device)
     wp.launch(_near_depth_kernel, mesh.indices.size // 3, [camera, mesh.id], outputs=[near_depth], device=mesh.device)
     return near_depth

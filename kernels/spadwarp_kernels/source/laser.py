@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp_kernels.arguments import ArgumentError, check_numbers
 from spadwarp_kernels.math.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 from spadwarp_kernels.random.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 
@@ -83,13 +84,15 @@ def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.fl
         entries are 1.
 
     Raises:
-        ValueError: Another shape, or values that cannot be.
+        ArgumentError: Another shape, or values that cannot be.
     """
-    power = np.asarray(image, np.float64)
+    power = check_numbers("profile", image)
     if power.ndim != 2 or power.size == 0:
-        raise ValueError(f"profile has shape {power.shape}; [height, width] is needed")
+        raise ArgumentError(f"profile has shape {power.shape}; [height, width] is needed")
     if not (np.isfinite(power).all() and power.min() >= 0 and power.max() > 0):
-        raise ValueError(f"profile holds {power.min()} to {power.max()}; finite values >= 0 are needed, and one above")
+        raise ArgumentError(
+            f"profile holds {power.min()} to {power.max()}; finite values >= 0 are needed, and one above"
+        )
     power = power / power.max()
     rows = np.cumsum(power.sum(axis=1))
     columns = np.cumsum(power, axis=1)

@@ -1,11 +1,22 @@
 """The target as the kernels take it: a mesh, its tree, its reflectance, images on it."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.intersect.bvh import pack_bvh
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_array,
+    check_device,
+    check_kind,
+    check_number,
+    check_numbers,
+    check_struct,
+    check_values,
+)
+from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import near_depth_map
 
@@ -85,38 +96,48 @@ def make_surfaces(
         device: Where the empty arrays go if there is no mesh.
 
     Raises:
-        ValueError: An array whose length is not the number of faces.
+        ArgumentError: An array whose length is not the number of faces, a value out of range, a mesh without faces or
+            with points that are not finite.
     """
     surfaces = Surfaces()
-    device = device if mesh is None else mesh.device
+    device = check_device("device", device) if mesh is None else _check_mesh(mesh)
     face_count = 0 if mesh is None else mesh.indices.size // 3
 
-    def by_face(name: str, value: wp.array | float | None, dtype: type) -> wp.array:
+    if textures is not None:
+        check_struct("textures", textures, Textures)
+
+    def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
         if mesh is None or value is None:
             return wp.zeros(0, dtype=dtype, device=device)
-        if not isinstance(value, wp.array):
-            value = wp.full(face_count, value, dtype=dtype, device=device)
-        if len(value) != face_count:
-            raise ValueError(f"{name} has {len(value)} entries; the mesh has {face_count} faces")
+        if not isinstance(value, wp.array) and np.ndim(value) == 0:
+            return wp.full(face_count, check_number(name, value, interval), dtype=dtype, device=device)
+        if isinstance(value, wp.array) and value.ndim == 1 and value.size != face_count:
+            raise ArgumentError(f"{name} has {value.size} entries; the mesh has {face_count} faces")
+        check_array(name, value, dtype, (face_count,), device, contiguous=True)
+        check_values(name, value, interval)
         return value
 
     surfaces.reflectance = by_face("reflectance", reflectance, float)
-    if textures is not None and corner_reflectance is None:
+    if textures is not None and corner_reflectance is None and mesh is not None:
         rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
         corner_reflectance = wp.array(rows, dtype=wp.vec3, device=device)
     surfaces.corner_reflectance = by_face("corner_reflectance", corner_reflectance, wp.vec3)
     surfaces.specular = by_face("specular", specular, float)
-    surfaces.roughness = by_face("roughness", None if specular is None else roughness, float)
+    surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
+    _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
-    surfaces.faces = wp.zeros(0, dtype=wp.vec4, device=device)
-    surfaces.order = wp.zeros(0, dtype=int, device=device)
+    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
         return surfaces
     if textures is not None:
-        by_face("textures.face", textures.face, int)
+        check_array("textures.region", textures.region, wp.vec3i, (None,), device)
+        check_array("textures.texels", textures.texels, wp.float32, (None,), device)
+        by_face("textures.face", textures.face, int, f"[-1, {textures.region.size - 1}]")
+        check_array("textures.coordinates", textures.coordinates, wp.vec2, (face_count, 3), device)
     points = mesh.points.numpy()
+    if not np.isfinite(points).all():
+        raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
     lower, upper = points.min(axis=0), points.max(axis=0)
     extent = float(abs(points).max())
     padding = 1e-6 * extent + 1e-6
@@ -127,6 +148,27 @@ def make_surfaces(
     if camera is not None:
         surfaces.near_depth = near_depth_map(mesh, camera)
     return surfaces
+
+
+def _check_mesh(mesh: Any) -> wp.Device:
+    check_kind("mesh", mesh, wp.Mesh)
+    if mesh.indices.size < 3:
+        raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
+    check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+    return mesh.device
+
+
+def _check_sum(surfaces: Surfaces) -> None:
+    """What a face sends back is at most what it gets."""
+    if not surfaces.specular.size:
+        return
+    lambert = surfaces.reflectance.numpy()
+    if surfaces.corner_reflectance.size:
+        lambert = surfaces.corner_reflectance.numpy().max(axis=1)
+    total = lambert + surfaces.specular.numpy()
+    if total.max() > 1.0 + 1e-5:
+        face = int(total.argmax())
+        raise ArgumentError(f"reflectance[{face}] + specular[{face}] = {total[face]:g} is outside [0, 1]")
 
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
@@ -155,13 +197,36 @@ def make_textures(
             its upper right one; outside of [0, 1] it repeats.
         images: Reflectance factors in [0, 1], each [rows, columns], the first row on top.
         device: Where to.
+
+    Raises:
+        ArgumentError: Another shape, or a value out of range.
     """
+    check_kind("images", images, Sequence)
+    device = check_device("device", device)
+    images = [check_numbers(f"images[{k}]", image, 2).astype(np.float32) for k, image in enumerate(images)]
+    for k, image in enumerate(images):
+        if image.size == 0:
+            raise ArgumentError(f"images[{k}] has shape {image.shape}; one texel or more is needed")
+        if not (image.min() >= 0.0 and image.max() <= 1.0):
+            raise ArgumentError(f"images[{k}] holds {image.min()} to {image.max()}, outside [0, 1]")
+    if not images:
+        raise ArgumentError("images has no entries; one image or more is needed")
+    face, coordinates = np.asarray(face), check_numbers("coordinates", coordinates)
+    if face.ndim != 1 or face.dtype.kind not in "iu" or coordinates.shape != (face.size, 3, 2):
+        raise ArgumentError(
+            f"face {face.dtype} {face.shape} and coordinates {coordinates.shape} are not integers [faces] and "
+            "numbers [faces, 3, 2]"
+        )
+    if face.size and not (face.min() >= -1 and face.max() < len(images)):
+        raise ArgumentError(f"face holds {face.min()} to {face.max()}, outside [-1, {len(images) - 1}]")
+    if not np.isfinite(coordinates).all():
+        raise ArgumentError("coordinates are not all finite")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
     textures = Textures()
     textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
     textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
     textures.region = wp.array(np.array(region, np.int32), dtype=wp.vec3i, device=device)
-    texels = np.concatenate([np.asarray(image, np.float32).ravel() for image in images])
+    texels = np.concatenate([image.ravel() for image in images])
     textures.texels = wp.array(texels, dtype=float, device=device)
     return textures

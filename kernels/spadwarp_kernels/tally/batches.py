@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
+
 _LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
 
 
@@ -45,6 +47,8 @@ def close_batch_kernel(
 class Batches:
     """Totals and squares on the device of a tally; `total` may be the caller's own array of zeros.
 
+    Raises `ArgumentError` for arrays that do not fit each other.
+
     Attributes:
         total: int64, as the tally.
         second_moment: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
@@ -52,7 +56,14 @@ class Batches:
     """
 
     def __init__(self, tally: wp.array, component_count: int, *, total: wp.array | None = None) -> None:
-        self._component_count = component_count
+        check_array("tally", tally, wp.int64, (None,), contiguous=True)
+        self._component_count = check_integer("component_count", component_count, 1, max(tally.size, 1))
+        if tally.size % component_count:
+            raise ArgumentError(
+                f"tally has {tally.size} entries, which {component_count} components do not share evenly"
+            )
+        if total is not None:
+            check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
         voxels = tally.size // component_count
         self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device) if total is None else total
         self.second_moment = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
@@ -60,6 +71,7 @@ class Batches:
 
     def close(self, tally: wp.array) -> None:
         """Takes the tally over as one batch and sets it to zero."""
+        check_array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
         wp.launch(
             close_batch_kernel,
             dim=self.second_moment[0].size,

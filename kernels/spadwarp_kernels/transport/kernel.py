@@ -52,7 +52,6 @@ from spadwarp_kernels.photon.state import (
 from spadwarp_kernels.random.philox import RoundKeys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.projection import PINHOLE
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -60,6 +59,7 @@ from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
 from spadwarp_kernels.tally.ledger import slot_of_core
 from spadwarp_kernels.tally.tally import deposit
 
+from .checks import check_spec
 from .collide import make_arrives, make_collide
 from .emit import make_emit
 from .finish import make_finish, make_flush
@@ -85,12 +85,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     On CUDA they must be a multiple of the block size, since whole warps vote.
 
     Raises:
-        ValueError: An estimator that is not one of ESTIMATORS, or confocal with a pinhole.
+        ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with a pinhole.
     """
-    if spec.estimator not in ESTIMATORS:
-        raise ValueError(f"estimator = {spec.estimator!r} is not one of {', '.join(ESTIMATORS)}")
-    if spec.confocal and spec.lens.name == PINHOLE.name:
-        raise ValueError("confocal = True needs lens = CALIBRATED")
+    check_spec(spec)
     estimator = ESTIMATORS[spec.estimator](spec)
     cross, score = estimator.cross, estimator.score
     request_flight, request_event = estimator.request_flight, estimator.request_event

@@ -4,22 +4,24 @@ from dataclasses import dataclass, field
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_array, check_device, check_integer, check_kind, check_seed
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.records import Records, make_records
-from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
+from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.random.philox import round_keys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
+from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
 from spadwarp_kernels.tally.tally import COMPONENTS
 
+from .checks import check_launch, check_model, check_spec
 from .kernel import make_transport_kernel
 
 
@@ -35,6 +37,9 @@ class Model:
         scale: Tally units per emitted photon.
         layers: Of a layered spec, from `make_layers`; empty otherwise.
         scan: Raster of a confocal spec; empty otherwise.
+
+    Raises:
+        ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
     """
 
     device: wp.Device
@@ -49,6 +54,10 @@ class Model:
     scale: float
     layers: Layers = field(default_factory=Layers)
     scan: Scan = field(default_factory=Scan)
+
+    def __post_init__(self) -> None:
+        check_model(self)
+        object.__setattr__(self, "device", wp.get_device(self.device))
 
     @property
     def tally_size(self) -> int:
@@ -76,13 +85,15 @@ class Data:
 def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
     """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to.
 
-    `histogram=False` makes none, for an estimator that scores nothing.
+    `histogram=False` makes none, for an estimator that scores nothing; `record_count` is the number of photons of the
+    largest launch, where `spec.records` asks for their records. Raises `ArgumentError`.
     """
-    size = model.tally_size if histogram else 1
+    check_kind("model", model, Model)
+    size = check_integer("bins of the tally", model.tally_size, 0) if histogram else 1
     if tally is None:
         tally = wp.zeros(size, dtype=wp.int64, device=model.device)
-    elif tally.dtype is not wp.int64 or tally.size != size or not tally.is_contiguous or tally.ndim != 1:
-        raise ValueError(f"tally is {tally.dtype.__name__} {tally.shape}; contiguous int64 ({size},) is needed")
+    else:
+        check_array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
     return Data(
         tally=tally,
         ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
@@ -97,7 +108,8 @@ CUDA_THREADS = 1 << 19
 
 def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch."""
-    device = wp.get_device(device)
+    check_spec(spec)
+    device = check_device("device", device)
     make_transport_kernel(spec, device.is_cuda).module.load(device, BLOCK_SIZE if device.is_cuda else 1)
 
 
@@ -114,17 +126,16 @@ def launch_transport(
         photon_count: 1 ... 2^26 in one launch.
 
     Raises:
-        ValueError: A count out of range, or surfaces that the spec does not describe, see `surface_choices`.
+        ArgumentError: Before anything is launched, for what the kernel of this spec cannot take: a number out of range,
+            an array that is too short or on another device, or surfaces that the spec does not describe, see
+            `surface_choices`.
     """
-    if not 0 < photon_count <= 1 << 26:
-        raise ValueError(f"photon_count = {photon_count} is outside [1, 2^26]")
-    if spec.brute_force and not 0 < model.surfaces.order.size <= BRUTE_FORCE_FACES:
-        raise ValueError(f"spec.brute_force = True is for meshes of 1 to {BRUTE_FORCE_FACES} faces")
-    for name, needed in surface_choices(model.surfaces).items():
-        if spec.mesh and getattr(spec, name) != needed:
-            raise ValueError(
-                f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
-            )
+    check_kind("model", model, Model)
+    check_kind("data", data, Data)
+    photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
+    first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
+    seed = check_seed(seed)
+    check_launch(spec, model, data, photon_count)
     threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
     data.cursor.zero_()
     wp.launch(
@@ -154,6 +165,8 @@ def launch_transport(
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device."""
+    check_kind("data", data, Data)
+    check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
     totals = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS).sum(axis=1)
     names = LEDGER_ENTRIES + COUNTERS
     values = {name: int(total) for name, total in zip(names, totals, strict=True)}

@@ -56,7 +56,7 @@ def test_an_estimator_of_ones_own(monkeypatch):
 
 
 def test_a_name_that_is_not_in_the_table():
-    with pytest.raises(ValueError, match="estimator = 'other' is not one of none, analog, next_event, guided"):
+    with pytest.raises(ValueError, match="estimator = 'other' is not one of 'none', 'analog', 'next_event', 'guided'"):
         sk.launch_transport(
             sk.TransportSpec("other", mesh=False),
             water_model(),

@@ -1,0 +1,216 @@
+"""What `launch_transport` checks before it launches: a kernel trusts what it is given."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_array,
+    check_choice,
+    check_device,
+    check_fields,
+    check_integer,
+    check_number,
+    check_struct,
+    check_vector,
+)
+from spadwarp_kernels.estimators.estimator import Estimator
+from spadwarp_kernels.estimators.registry import ESTIMATORS
+from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
+from spadwarp_kernels.phase.tabulated import TABULATED
+from spadwarp_kernels.photon.records import Records
+from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
+from spadwarp_kernels.random.density_tables import TABLE_CELLS
+from spadwarp_kernels.sensor.camera import Camera, check_camera
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.sensor.projection import PINHOLE, Lens
+from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
+from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
+from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
+
+if TYPE_CHECKING:
+    from .launch import Data, Model
+
+_CHOICES = tuple(name for name, kind in TransportSpec.__annotations__.items() if kind is bool)
+_STRUCTS = {
+    "medium": Medium,
+    "laser": Laser,
+    "camera": Camera,
+    "gate": Gate,
+    "limits": Limits,
+    "guiding": Guiding,
+    "surfaces": Surfaces,
+    "layers": Layers,
+    "scan": Scan,
+}
+_MEDIUM = {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
+_GUIDING = {
+    "probability": "[0, 1)",
+    "surface_probability": "[0, 1)",
+    "anisotropy": "(-1, 1)",
+    "return_probability": "[0, 1)",
+    "return_anisotropy": "(-1, 1)",
+}
+# What each laser profile reads.
+_BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
+
+
+def check_spec(spec: Any) -> None:
+    """A `TransportSpec` of an estimator that exists, with a phase function and a lens that go with it."""
+    if not isinstance(spec, TransportSpec):
+        raise ArgumentError(f"spec = {spec!r} is not a TransportSpec")
+    check_choice("estimator", spec.estimator, ESTIMATORS)
+    for name, kind in (("phase", PhaseFunction), ("lens", Lens)):
+        if not isinstance(getattr(spec, name), kind):
+            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a {kind.__name__}")
+    for name in _CHOICES:
+        if not isinstance(getattr(spec, name), bool):
+            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
+    if spec.confocal and spec.lens.name == PINHOLE.name:
+        raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
+
+
+def check_model(model: Any) -> None:
+    """Kinds of what a model holds, and a device that exists."""
+    check_device("model.device", model.device)
+    for name, struct in _STRUCTS.items():
+        check_struct(f"model.{name}", getattr(model, name), struct)
+    if model.mesh is not None and not isinstance(model.mesh, wp.Mesh):
+        raise ArgumentError(f"model.mesh is {type(model.mesh).__name__}; a wp.Mesh or None is needed")
+    check_number("model.scale", model.scale, "(0, inf)")
+
+
+def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
+    """Everything that the kernel of a spec reads and writes: numbers in range, arrays long enough and on the device."""
+    check_spec(spec)
+    estimator = ESTIMATORS[spec.estimator](spec)
+    if spec.mesh:
+        _check_surfaces(spec, model)
+    _check_water(spec, model)
+    _check_laser(spec, model)
+    _check_limits(spec, model)
+    if estimator.scores:
+        check_camera("model.camera", model.camera, calibrated=spec.lens.name != PINHOLE.name)
+        check_integer("model.gate.bins", model.gate.bins, 1)
+        check_fields("model.gate", model.gate, {"start": "(-inf, inf)", "bins_per_metre": "(0, inf)"})
+        check_number("model.gate.stop", model.gate.stop, f"({float(model.gate.start)}, inf)")
+    if estimator.direct is not None:
+        check_fields("model.guiding", model.guiding, _GUIDING)
+    if spec.confocal:
+        _check_scan(model, estimator)
+    _check_data(spec, model, data, estimator, photon_count)
+
+
+def _check_water(spec: TransportSpec, model: Model) -> None:
+    medium, device = model.medium, model.device
+    check_fields("model.medium", medium, _MEDIUM)
+    if spec.phase.name == TABULATED.name:
+        for name, kind in (("cells", wp.vec4), ("guide", wp.int32)):
+            check_array(f"model.medium.phase.{name}", getattr(medium.phase, name), kind, (3, TABLE_CELLS), device)
+    if spec.layered:
+        layers = model.layers
+        start = check_array("model.layers.start", layers.start, wp.float32, (None,), device)
+        check_integer("number of model.layers", start.size, 1)
+        check_vector("model.layers.axis", layers.axis, unit=True)
+        for name in ("extinction", "albedo", "anisotropy"):
+            check_array(f"model.layers.{name}", getattr(layers, name), wp.float32, start.shape, device)
+
+
+def _check_laser(spec: TransportSpec, model: Model) -> None:
+    laser, device = model.laser, model.device
+    check_vector("model.laser.position", laser.position)
+    if not spec.confocal:
+        check_vector("model.laser.axis", laser.axis, unit=True)
+    if spec.measured_beam:
+        rows = check_array("model.laser.rows", laser.rows, wp.float32, (None,), device)
+        check_integer("rows of the laser's profile", rows.size, 1)
+        columns = check_array("model.laser.columns", laser.columns, wp.float32, (rows.size, None), device)
+        check_integer("columns of the laser's profile", columns.shape[1], 1)
+        for extent in laser.extent:
+            check_number("model.laser.extent", extent, "(0, inf)")
+    else:
+        profile = check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)
+        check_fields("model.laser", laser, _BEAM[profile])
+
+
+def _check_limits(spec: TransportSpec, model: Model) -> None:
+    limits = model.limits
+    check_fields("model.limits", limits, {"max_path": "(0, inf)", "weight_cutoff": "[0, 1)"})
+    check_integer("model.limits.max_collisions", limits.max_collisions, 0)
+    if spec.bounded:
+        check_number("model.limits.lateral", limits.lateral, "(0, inf)")
+        for low, high in zip(limits.lower, limits.upper, strict=True):
+            check_number("model.limits.lower", low)
+            check_number("model.limits.upper", high, f"({float(low)}, inf)")
+    if spec.rotated_domain:
+        check_vector("model.limits.origin", limits.origin)
+        rows = [[limits.rotation[i, j] for j in range(3)] for i in range(3)]
+        for row in rows:
+            check_vector("model.limits.rotation, a row", row, unit=True)
+
+
+def _check_surfaces(spec: TransportSpec, model: Model) -> None:
+    surfaces, device = model.surfaces, model.device
+    order = check_array("model.surfaces.order", surfaces.order, wp.int32, (None,), device)
+    faces = order.size
+    if faces == 0:
+        raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
+    if spec.brute_force and faces > BRUTE_FORCE_FACES:
+        raise ArgumentError(
+            f"spec.brute_force = True is for meshes of 1 to {BRUTE_FORCE_FACES} faces; model.surfaces has {faces}"
+        )
+    for name, needed in surface_choices(surfaces).items():
+        if getattr(spec, name) != needed:
+            raise ArgumentError(
+                f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
+            )
+    check_array("model.surfaces.reflectance", surfaces.reflectance, wp.float32, (faces,), device)
+    check_array("model.surfaces.faces", surfaces.faces, wp.vec4, (3 * faces,), device)
+    check_array("model.surfaces.nodes", surfaces.nodes, wp.vec4, (None,), device)
+    check_array("model.surfaces.near_depth", surfaces.near_depth, wp.float32, (None, None), device)
+    if spec.pattern:
+        check_array("model.surfaces.corner_reflectance", surfaces.corner_reflectance, wp.vec3, (faces,), device)
+        textured = check_array("model.surfaces.textures.face", surfaces.textures.face, wp.int32, (None,), device).size
+        if textured:
+            check_array("model.surfaces.textures.face", surfaces.textures.face, wp.int32, (faces,), device)
+            check_array(
+                "model.surfaces.textures.coordinates", surfaces.textures.coordinates, wp.vec2, (faces, 3), device
+            )
+    if spec.specular:
+        check_array("model.surfaces.specular", surfaces.specular, wp.float32, (faces,), device)
+        check_array("model.surfaces.roughness", surfaces.roughness, wp.float32, (faces,), device)
+
+
+def _check_scan(model: Model, estimator: Estimator) -> None:
+    scan, camera = model.scan, model.camera
+    most = camera.width * camera.height if estimator.scores else 2**31 - 1
+    count = check_integer("model.scan.count", scan.count, 1, most)
+    for name, kind in (("axis", wp.vec3), ("view", wp.vec4)):
+        array = check_array(f"model.scan.{name}", getattr(scan, name), kind, (None,), model.device)
+        check_integer(f"entries of model.scan.{name}", array.size, count)
+
+
+def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estimator, photon_count: int) -> None:
+    device = model.device
+    size = check_integer("bins of the tally", model.tally_size, 1) if estimator.scores else None
+    check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
+    check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
+    check_array("data.cursor", data.cursor, wp.int32, (1,), device)
+    check_struct("data.records", data.records, Records)
+    if spec.records:
+        for name in Records.vars:
+            array = check_array(
+                f"data.records.{name}", getattr(data.records, name), Records.vars[name].type.dtype, (None,), device
+            )
+            if array.size < photon_count:
+                raise ArgumentError(
+                    f"data.records.{name} has room for {array.size} photons; spec.records = True needs {photon_count}, "
+                    "see record_count of make_data"
+                )

@@ -1,0 +1,97 @@
+"""Runs a function in a child process with limits of time and memory, and says how it ended."""
+
+import contextlib
+import faulthandler
+import os
+import pickle
+import resource
+import select
+import signal
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+SECONDS, BYTES = 20.0, 2 << 30
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a call ended.
+
+    Attributes:
+        kind: "done", "traceback" (an exception), "crash" (a signal), "hang" (no end within the time).
+        value: What the function returned, or the name of the exception or signal.
+        text: Of the exception, or what the child wrote to stderr as it crashed.
+        seconds: Wall-clock time.
+    """
+
+    kind: str
+    value: Any
+    text: str
+    seconds: float
+
+
+def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: int = BYTES) -> Outcome:
+    """What `call()` returns, from a forked child that may take `memory` bytes more than its parent has now.
+
+    The child's stderr goes to a file, so that a fault's stack is known.
+    """
+    began = time.monotonic()
+    source, sink = os.pipe()
+    with tempfile.TemporaryFile() as log:
+        child = os.fork()
+        if child == 0:
+            os.close(source)
+            _live(call, sink, log.fileno(), memory)
+        os.close(sink)
+        answer = _read(source, began + seconds)
+        taken = time.monotonic() - began
+        if answer is None:
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        log.seek(0)
+        stderr = log.read()[-4000:].decode(errors="replace")
+    if answer is None:
+        return Outcome("hang", None, stderr, taken)
+    if os.WIFSIGNALED(status):
+        return Outcome("crash", signal.Signals(os.WTERMSIG(status)).name, stderr, taken)
+    if not answer:
+        return Outcome("crash", f"exit {os.WEXITSTATUS(status)}", stderr, taken)
+    return Outcome(*pickle.loads(answer), taken)
+
+
+def _read(source: int, deadline: float) -> bytes | None:
+    """All that comes until the pipe closes; None if it does not in time."""
+    parts = []
+    try:
+        while True:
+            ready, _, _ = select.select([source], [], [], max(deadline - time.monotonic(), 0.0))
+            if not ready:
+                return None
+            part = os.read(source, 1 << 16)
+            if not part:
+                return b"".join(parts)
+            parts.append(part)
+    finally:
+        os.close(source)
+
+
+def _live(call: Callable[[], Any], sink: int, log: int, memory: int) -> None:
+    """The child: never returns."""
+    os.setsid()
+    os.dup2(log, 2)
+    faulthandler.enable()
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        answer = ("done", call(), "")
+    except BaseException as error:
+        answer = ("traceback", type(error).__name__, traceback.format_exc()[-4000:])
+    with contextlib.suppress(BaseException):
+        os.write(sink, pickle.dumps(answer))
+    os._exit(0)
