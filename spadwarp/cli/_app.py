@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NoReturn
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any, NoReturn, TypeVar
 
 import typer
 from typer.core import TyperGroup
@@ -17,11 +18,15 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 
 
+_resources = ExitStack()  # of the command that runs
+Value = TypeVar("Value")
+
+
 class _Commands(TyperGroup):
     """Errors of spadwarp end a command without a traceback; warnings are one line."""
 
     def invoke(self, ctx: Any) -> Any:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _resources:
             warnings.showwarning = _show_warning
             try:
                 return super().invoke(ctx)
@@ -35,6 +40,11 @@ class _Commands(TyperGroup):
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     complain(f"warning: {message}")
+
+
+def until_the_end(context: AbstractContextManager[Value]) -> Value:
+    """Enters a context that is left when the command ends, however it ends."""
+    return _resources.enter_context(context)
 
 
 def say(text: str = "") -> None:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import shutil
-import tempfile
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import spadwarp
-from spadwarp.errors import FileError
+from spadwarp.cli._outputs import Json, Out, Outputs, Overwrite, check_outputs, in_bytes  # noqa: F401
 from spadwarp.units import quantity
 
 if TYPE_CHECKING:
@@ -111,8 +109,6 @@ Workers = Annotated[
     ),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threads; by default one for each core.")]
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Allow an output directory that is not empty.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and errors.")]
 TorchDevice = Annotated[
     str | None,
@@ -123,7 +119,6 @@ RunOrFrames = Annotated[
     typer.Argument(metavar="RUN", help="A result or frames, or the directory of one of them.", show_default=False),
 ]
 Frame = Annotated[int, typer.Option(min=0, metavar="N", help="Number of the frame, if RUN holds frames.")]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the output as JSON.")]
 
 
 class Estimator(enum.StrEnum):
@@ -172,44 +167,6 @@ def load_run(place: Path) -> Result:
     return spadwarp.load_result(spadwarp.io.file_within(place, ("result.h5",)))
 
 
-def prepare_directory(out: Path, *, overwrite: bool, needed: int) -> None:
-    """Makes the output directory, and finds out now whether `needed` bytes can be written to it.
-
-    Raises `FileError`, and `typer.BadParameter` where the directory is in use.
-    """
-    if out.exists() and not out.is_dir():
-        raise typer.BadParameter(f"{out} is a file; a directory is needed", param_hint="--out")
-    if out.is_dir() and any(out.iterdir()) and not overwrite:
-        raise typer.BadParameter(f"{out} is not empty; --overwrite replaces results in it", param_hint="--out")
-    check_writable(out)
-    free = shutil.disk_usage(out).free
-    if free < needed:
-        raise FileError(f"{out}: up to {in_bytes(needed)} will be written; {in_bytes(free)} are free there")
-
-
-def check_writable(directory: Path) -> None:
-    """Raises `FileError` where no file can be made in the directory, which is made if it is not there."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory):
-            pass
-    except OSError as error:
-        raise FileError(f"{directory}: cannot be written: {error.strerror}") from error
-
-
-def write_json(summary: dict[str, Any], path: Path | None) -> None:
-    """The machine-readable twin of what a command prints; numbers that are not finite become null."""
-    if path is None:
-        return
-    if not path.is_symlink() and (path.is_file() or not path.exists()):
-        spadwarp.io.write_json(summary, path)
-        return
-    try:  # a pipe, a device or a link such as /dev/stdout, which no file may replace
-        path.write_text(spadwarp.io.json_text(summary), encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror}") from error
-
-
 def read_part(text: str | None, option: str) -> tuple[int, int] | None:
     """The numbers of `3/64`, which Python checks."""
     if text is None:
@@ -226,15 +183,6 @@ def read_part(text: str | None, option: str) -> tuple[int, int] | None:
 def count(number: float) -> str:
     """2 000 000"""
     return f"{number:,.0f}".replace(",", " ")
-
-
-def in_bytes(number: float) -> str:
-    """1.5 GiB"""
-    for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if number < 1024:
-            return f"{number:.4g} {unit}"
-        number /= 1024
-    return f"{number:.3g} TiB"
 
 
 def rows(table: dict[str, str], *, indent: str = "") -> str:

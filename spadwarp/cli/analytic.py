@@ -95,7 +95,14 @@ def analytic(
             param_hint="--profile",
         )
     pixels = scene.camera.width * scene.camera.height
-    opt.prepare_directory(out, overwrite=overwrite, needed=(5 * max(frames, 0) + 200) * pixels + (16 << 20))
+    outputs = opt.check_outputs(
+        out,
+        ("analytic.h5", "analytic.png"),
+        json=json_path,
+        inputs=(scene_path, mesh, *scene.files, depth, normal, albedo, profile),
+        overwrite=overwrite,
+        needed=(5 * max(frames, 0) + 200) * pixels + (16 << 20),
+    )
     if frames < 0:
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     truth: Truth | None = None
@@ -124,7 +131,7 @@ def analytic(
     summary = {"frames": frames, "seed": seed, **_summary(result)}
     if not quiet:
         say(opt.rows({**_lines(summary), "written": ", ".join(path.name for path in written) + f" in {out}"}))
-    opt.write_json({**summary, "files": written}, json_path)
+    outputs.write_json({**summary, "files": written})
 
 
 def _albedo(text: str | None) -> Path | float:

@@ -28,6 +28,7 @@ def bench(
     photons: opt.Photons = None,
     repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest is reported.")] = 3,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
     compare: Annotated[
@@ -54,8 +55,7 @@ def bench(
         say(f"{'scaling':<20}  how cost and memory grow with photons, faces and bins")
         return
     before = None if compare is None else load_report(compare)
-    if json_path is not None:
-        opt.check_writable(json_path.parent)
+    outputs = opt.check_outputs(json=json_path, inputs=(compare,), overwrite=overwrite)
     results: list[BenchResult] = []
 
     def found(result: BenchResult) -> None:
@@ -76,7 +76,7 @@ def bench(
         )
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
-            opt.write_json(report(results), json_path)
+            outputs.write_json(report(results))
         raise
     summary = report(results)
     if not quiet:
@@ -88,7 +88,7 @@ def bench(
             made = before["provenance"]
             say(f"over {compare}: {made['device_name']}, {made['date']}")
             opt.show_table(_ratio_table(faster))
-    opt.write_json(summary, json_path)
+    outputs.write_json(summary)
     missed = [result.case for result in results if result.check is not None and not result.check["passed"]]
     if missed:
         fail(f"{', '.join(missed)}: a mean is not what it should be")

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
-from spadwarp.errors import ArgumentError
-
-if TYPE_CHECKING:
-    pass
 from spadwarp.cli._tables import budget_table
+from spadwarp.errors import ArgumentError
 
 
 @app.command()
@@ -52,8 +49,14 @@ def budget(
     from spadwarp.viz import draw_budget
 
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
-    if out is not None:
-        opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
+    outputs = opt.check_outputs(
+        out,
+        ("budget.png", "budget.csv"),
+        json=json_path,
+        inputs=(scene_path, *scene.files),
+        overwrite=overwrite,
+        needed=16 << 20,
+    )
     found = spadwarp.budget(scene, _numbers(ranges), media or None, reflectance=reflectance, device=device)
     written = []
     if out is not None:
@@ -66,7 +69,7 @@ def budget(
         opt.show_table(budget_table([row.medium for row in found], "water", found))
         if written:
             say(f"written: {', '.join(path.name for path in written)} in {out}")
-    opt.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written}, json_path)
+    outputs.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written})
 
 
 def _numbers(text: str | None) -> list[float] | None:

@@ -17,6 +17,7 @@ def check(
     scene_path: opt.ScenePath,
     mesh: opt.Mesh = None,
     overrides: opt.Overrides = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -32,6 +33,7 @@ def check(
     from spadwarp.mesh import build_mesh
 
     scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
+    outputs = opt.check_outputs(json=json_path, inputs=(scene_path, *scene.files), overwrite=overwrite)
     triangles = build_mesh(scene)
     messages, numbers = spadwarp.check(scene, triangles), summary(scene, triangles)
     faces = 0 if triangles is None else triangles.face_count
@@ -44,7 +46,7 @@ def check(
     if not quiet and not any(message.level == "warning" for message in messages):
         say(f"{scene_path}: valid, no warnings")
     found = [dataclasses.asdict(message) for message in messages]
-    opt.write_json({"scene": scene_path, "faces": faces, **numbers, "messages": found}, json_path)
+    outputs.write_json({"scene": scene_path, "faces": faces, **numbers, "messages": found})
 
 
 def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:

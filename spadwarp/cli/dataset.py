@@ -41,6 +41,7 @@ def make(
     engine_name: opt.EngineName = "local",
     ray_address: opt.RayAddress = None,
     workers: opt.Workers = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -58,6 +59,9 @@ def make(
     if overrides:
         recipe = recipe.with_overrides(overrides)
     engine = opt.read_engine(engine_name, ray_address, workers)
+    if json_path is not None and out.resolve() in json_path.resolve().parents:
+        raise typer.BadParameter(f"{json_path} is in the dataset's folder", param_hint="--json")
+    outputs = opt.check_outputs(json=json_path, inputs=(recipe_path,), overwrite=overwrite)
     with progress(quiet=quiet, unit="frames") as report:
         found = spadwarp.dataset.make_dataset(
             recipe,
@@ -85,11 +89,13 @@ def make(
         if found.missing:
             table["missing"] = f"{opt.count(len(found.missing))} shards, left to other machines"
         say(opt.rows(table))
-    opt.write_json(summary, json_path)
+    outputs.write_json(summary)
 
 
 @group.command()
-def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None) -> None:
+def verify(
+    folder: Folder, overwrite: opt.Overwrite = False, quiet: opt.Quiet = False, json_path: opt.Json = None
+) -> None:
     """Compares every file of a dataset with its checksum.
 
     Exit code 1 if something is missing or damaged.
@@ -98,8 +104,9 @@ def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None)
     Example:
       spadwarp dataset verify data/small/
     """
+    outputs = opt.check_outputs(json=json_path, inputs=(folder,), overwrite=overwrite)
     wrong = spadwarp.dataset.verify_dataset(folder)
-    opt.write_json({"folder": folder, "wrong": wrong}, json_path)
+    outputs.write_json({"folder": folder, "wrong": wrong})
     if wrong:
         fail("\n".join(wrong) + "\n`spadwarp dataset make` makes them again")
     if not quiet:
@@ -107,7 +114,7 @@ def verify(folder: Folder, quiet: opt.Quiet = False, json_path: opt.Json = None)
 
 
 @group.command()
-def info(folder: Folder, json_path: opt.Json = None) -> None:
+def info(folder: Folder, overwrite: opt.Overwrite = False, json_path: opt.Json = None) -> None:
     """Contents of a dataset.
 
     \b
@@ -116,6 +123,7 @@ def info(folder: Folder, json_path: opt.Json = None) -> None:
     """
     from spadwarp.dataset import read_manifest
 
+    outputs = opt.check_outputs(json=json_path, inputs=(folder,), overwrite=overwrite)
     manifest = read_manifest(folder)
     size = sum(one["bytes"] for one in manifest["files"].values())
     table = {
@@ -127,7 +135,7 @@ def info(folder: Folder, json_path: opt.Json = None) -> None:
     for name, split in manifest["splits"].items():
         table[name] = f"{opt.count(split['frames'])} frames: {', '.join(split['targets']) or 'none'}"
     say(opt.rows(table))
-    opt.write_json(manifest, json_path)
+    outputs.write_json(manifest)
 
 
 class Split(enum.StrEnum):
@@ -147,6 +155,7 @@ def preview(
     frames: Annotated[
         int, typer.Option(min=1, metavar="N", help="Number of frames, spread evenly over the split.")
     ] = 20,
+    overwrite: opt.Overwrite = False,
 ) -> None:
     """Draws frames of a dataset on one sheet.
 
@@ -158,7 +167,9 @@ def preview(
     """
     from spadwarp.viz import draw_dataset
 
-    path = draw_dataset(folder, out or folder / "preview.png", split=split.value, frames=frames)
+    picture = out or folder / "preview.png"
+    opt.check_outputs(files={"--out": picture}, inputs=(folder,), overwrite=overwrite)
+    path = draw_dataset(folder, picture, split=split.value, frames=frames)
     say(f"written: {path}")
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, say
 from spadwarp.errors import ConfigError, FileError
@@ -95,13 +96,11 @@ def denoise(
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
         raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
-    given = None
-    if profile is not None:
-        try:
-            given = np.load(profile, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise FileError(f"{profile}: not a .npy file that can be read: {error}") from error
-    opt.prepare_directory(out, overwrite=overwrite, needed=sum(one.stat().st_size for one in paths if one.is_file()))
+    given = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
+    names = [f"{stem}.{ending}" for stem in stems for ending in ("npy", "exr", "png")]
+    needed = sum(one.stat().st_size for one in paths if one.is_file())
+    options: dict[str, Any] = {"inputs": (*paths, profile, weights), "overwrite": overwrite, "needed": needed}
+    outputs = opt.check_outputs(out, names, json=json_path, **options)
     lines, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
         try:
@@ -139,6 +138,6 @@ def denoise(
                 complain(f"{number} of {len(paths)}")
     if not quiet:
         say(opt.rows({**lines, "written": f"{3 * len(summary)} files in {out}"}))
-    opt.write_json({"model": model, "files": summary}, json_path)
+    outputs.write_json({"model": model, "files": summary})
     if failed:
         raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")

@@ -96,10 +96,16 @@ def depth(
     from spadwarp.frames import depth_of, read_histograms
     from spadwarp.run import write_depth
 
-    if ply is not None:
-        opt.check_writable(ply.parent)
     histograms = read_histograms(spadwarp.io.file_within(path, ("frames.h5", "result.h5")), variable=variable)
-    opt.prepare_directory(out, overwrite=overwrite, needed=8 * histograms.values.size // histograms.values.shape[-1])
+    outputs = opt.check_outputs(
+        out,
+        [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")],
+        files={"--ply": ply},
+        json=json_path,
+        inputs=(path, irf),
+        overwrite=overwrite,
+        needed=8 * histograms.values.size // histograms.values.shape[-1],
+    )
     histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
     reduced = depth_of(
         histograms,
@@ -118,7 +124,7 @@ def depth(
             found += ", {:.4g} to {:.4g} m, median {:.4g} m".format(*summary["metres"])
         frames = f" (first of {opt.count(reduced.frames)} frames)" if reduced.frames > 1 else ""
         say(opt.rows({reduced.quantity: found + frames, "written": ", ".join(map(str, written))}))
-    opt.write_json(summary, json_path)
+    outputs.write_json(summary)
 
 
 def _background(text: str | None) -> Any:

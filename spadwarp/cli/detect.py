@@ -73,7 +73,14 @@ def detect(
     pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if window is None else window[1]
     shots = result.scene.detector.pulses_per_frame if pulses is None else pulses
     counted = min(shots, bins) if result.scene.detector.mode == "first_photon" else bins
-    opt.prepare_directory(out, overwrite=overwrite, needed=pixels * (4 * counted + 4 * len(chosen) + 8) + (16 << 20))
+    outputs = opt.check_outputs(
+        out,
+        ("frames.h5", "frame.png"),
+        json=json_path,
+        inputs=(run,),
+        overwrite=overwrite,
+        needed=pixels * (4 * counted + 4 * len(chosen) + 8) + (16 << 20),
+    )
     with progress(quiet=quiet, unit="frames") as report:
         recording = record_frames(
             result,
@@ -96,7 +103,7 @@ def detect(
         lines = _lines(recording, summary)
         lines["written"] = ", ".join(path.name for path in written) + f" in {out}"
         say(opt.rows(lines))
-    opt.write_json({**summary, "files": written}, json_path)
+    outputs.write_json({**summary, "files": written})
 
 
 def _with_detector(result: Result, overrides: list[str] | None) -> Result:

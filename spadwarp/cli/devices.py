@@ -8,17 +8,18 @@ from spadwarp.cli._app import app, say
 
 
 @app.command()
-def devices(json_path: opt.Json = None) -> None:
+def devices(overwrite: opt.Overwrite = False, json_path: opt.Json = None) -> None:
     """Devices that can trace photons: the CPU and the GPUs.
 
     \b
     Example:
       spadwarp devices
     """
+    outputs = opt.check_outputs(json=json_path, overwrite=overwrite)
     found = spadwarp.device.devices()
     for device in found:
         memory = f", {opt.in_bytes(device['memory'])}" if device["memory"] else ""
         say(f"{device['name']:<8}  {device['description']}{memory}" + ("  (default)" if device["default"] else ""))
     if len(found) == 1:
         say("no NVIDIA GPU with driver R580 or newer was found")
-    opt.write_json({"devices": found}, json_path)
+    outputs.write_json({"devices": found})

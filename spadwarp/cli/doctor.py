@@ -16,6 +16,7 @@ from spadwarp.cli._app import app, complain, fail, say
 def doctor(
     device: opt.Device = None,
     self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Trace two small scenes.")] = True,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -32,6 +33,7 @@ def doctor(
       spadwarp doctor
       spadwarp doctor --device cpu --json report.json
     """
+    outputs = opt.check_outputs(json=json_path, overwrite=overwrite)
     found = spadwarp.doctor.diagnose(device=device, self_test=self_test, progress=None if quiet else complain)
     if not quiet:
         for title, facts in found.facts.items():
@@ -42,7 +44,7 @@ def doctor(
             took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
             say(f"Self-test ({took})")
             say(opt.rows({test.name: _verdict(test) for test in found.tests}, indent="  "))
-    opt.write_json({**dataclasses.asdict(found), "healthy": found.healthy}, json_path)
+    outputs.write_json({**dataclasses.asdict(found), "healthy": found.healthy})
     if not found.healthy:
         failed = [f"self-test: {test.name}: {_verdict(test)}" for test in found.tests if not test.passed]
         fail("\n".join([*found.problems, *failed]))

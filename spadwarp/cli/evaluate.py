@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from spadwarp.denoise import Evaluation
 
 
+_PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons")
+_REPORT = ("report.html", "scores.json", *(f"{name}.png" for name in _PICTURES))
+
+
 @app.command()
 def evaluate(
     data: Annotated[
@@ -59,6 +63,7 @@ def evaluate(
         int, typer.Option(parser=opt.whole_number, metavar="N", help="Seed of the counts drawn from a result.")
     ] = 0,
     device: opt.TorchDevice = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -82,8 +87,9 @@ def evaluate(
     chosen = [name.strip() for name in chosen]
     if "bm3d" in chosen and bm3d_frames == 0:
         bm3d_frames = 20
-    if report is not None:
-        opt.check_writable(report)
+    outputs = opt.check_outputs(
+        report, _REPORT, json=json_path, inputs=(data, weights), overwrite=overwrite, option="--report"
+    )
     if data.is_file() or (data / "result.h5").is_file():
         _sweep(
             data,
@@ -93,7 +99,7 @@ def evaluate(
             seed=seed,
             device=device,
             quiet=quiet,
-            json_path=json_path,
+            outputs=outputs,
         )
         return
     with progress(quiet=quiet, unit="frames") as shown:
@@ -113,7 +119,7 @@ def evaluate(
         _say_gains(found)
         if written:
             say(f"written: {written[0]}")
-    opt.write_json({**found.to_dict(), "files": written}, json_path)
+    outputs.write_json({**found.to_dict(), "files": written})
 
 
 def _say_gains(found: Evaluation) -> None:
@@ -147,7 +153,7 @@ def _sweep(
     seed: int,
     device: str | None,
     quiet: bool,
-    json_path: Path | None,
+    outputs: opt.Outputs,
 ) -> None:
     """Frames of few photons from a result."""
     from rich.table import Table
@@ -176,4 +182,4 @@ def _sweep(
             opt.show_table(table)
         if written:
             say(f"written: {written[0]}")
-    opt.write_json({**found.to_dict(), "files": written}, json_path)
+    outputs.write_json({**found.to_dict(), "files": written})

@@ -66,19 +66,26 @@ def export(
     """
     source = _inside(path)
     chosen = _frames(frames)
-    opt.prepare_directory(out, overwrite=overwrite, needed=source.stat().st_size if source.is_file() else 0)
+    stem = source.resolve().stem
+    outputs = opt.check_outputs(
+        out,
+        [f"{stem}.{one.value}" for one in set(formats)],
+        json=json_path,
+        inputs=(source,),
+        overwrite=overwrite,
+        needed=source.stat().st_size if source.is_file() else 0,
+    )
     written: dict[str, list[Path]] = {}
     # Those that not every source has go first, so that nothing is written where one is refused.
     for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
-        path = out / f"{source.resolve().stem}.{one.value}"
-        written[one.value] = spadwarp.export(source, path, frames=chosen, split=split)
+        written[one.value] = spadwarp.export(source, out / f"{stem}.{one.value}", frames=chosen, split=split)
     if not quiet:
         lines = {}
         for name, paths in written.items():
             more = f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else ""
             lines[name] = f"{paths[0]}{more}"
         say(opt.rows(lines))
-    opt.write_json({"files": [path for paths in written.values() for path in paths]}, json_path)
+    outputs.write_json({"files": [path for paths in written.values() for path in paths]})
 
 
 def _inside(place: Path) -> Path:

@@ -15,6 +15,7 @@ from spadwarp.cli._app import app, say
 @app.command()
 def info(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A result, or its directory.")],
+    overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
     """Contents of a result, and how it was made.
@@ -25,11 +26,12 @@ def info(
     Example:
       spadwarp info out/result.h5
     """
+    outputs = opt.check_outputs(json=json_path, inputs=(path,), overwrite=overwrite)
     result = opt.load_run(path)
     summary = result.summary()
     outside = {name: result.counters[name] * result.unit / result.photons for name in ("before_gate", "after_gate")}
     say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _lines(summary, outside).items()))
-    opt.write_json(summary, json_path)
+    outputs.write_json(summary)
 
 
 def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str, dict[str, str]]:

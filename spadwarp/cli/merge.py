@@ -35,14 +35,16 @@ def merge(
       spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
       spadwarp merge a/ b/ --out ab/
     """
-    from spadwarp.run import bytes_needed, write_run
+    from spadwarp.run import RUN_FILES, bytes_needed, write_run
 
     result = spadwarp.merge(opt.load_run(place) for place in runs)
     needed = bytes_needed(result.scene, batches=result.batch_size > 0)
-    opt.prepare_directory(out, overwrite=overwrite, needed=needed)
+    outputs = opt.check_outputs(
+        out, RUN_FILES, json=json_path, inputs=(*runs, *result.scene.files), overwrite=overwrite, needed=needed
+    )
     files = write_run(result, out, device=device)
     if not quiet:
         ids = ", ".join(f"{opt.count(start)} to {opt.count(stop - 1)}" for start, stop in result.photon_ranges)
         say(opt.rows({"photon ids": ids}))
         say(described(result, files))
-    opt.write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": files.written}, json_path)
+    outputs.write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": files.written})

@@ -66,6 +66,7 @@ def plan(
     mesh: opt.Mesh = None,
     overrides: opt.Overrides = None,
     device: opt.Device = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -81,6 +82,9 @@ def plan(
       spadwarp plan configs/scenes/harbour_5m.toml --range 2:3 --time 100ms --eye-distance 1m
     """
     scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
+    outputs = opt.check_outputs(
+        files={"--write": write}, json=json_path, inputs=(scene_path, *scene.files), overwrite=overwrite
+    )
     with progress(quiet=quiet) as report:
         found = spadwarp.plan(
             scene,
@@ -112,7 +116,7 @@ def plan(
             say("The Monte Carlo run is too short to know the floor: it may be smaller; --photons takes more.")
         if write is not None:
             say(f"written: {write}")
-    opt.write_json({"scene": scene_path, **found.to_dict(), "files": [] if write is None else [write]}, json_path)
+    outputs.write_json({"scene": scene_path, **found.to_dict(), "files": [] if write is None else [write]})
 
 
 def _verdict(found: Proposal) -> str:

@@ -18,6 +18,7 @@ def presets(
         str | None,
         typer.Argument(metavar="SECTION", help="medium, laser, camera, detector or gate; all if left out."),
     ] = None,
+    overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
     """Named waters, lasers and detectors with their sources.
@@ -29,6 +30,7 @@ def presets(
     Example:
       spadwarp presets medium
     """
+    outputs = opt.check_outputs(json=json_path, overwrite=overwrite)
     everything = spadwarp.scene.presets()
     sections = list(dict.fromkeys(preset.section for preset in everything.values()))
     if section is not None and section not in sections:
@@ -42,4 +44,4 @@ def presets(
         shown = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in preset.values.items()}
         values = ", ".join(f"{name} {value}" for name, value in shown.items())
         say(f"  {preset.name:<28}  {values}")
-    opt.write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]}, json_path)
+    outputs.write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]})

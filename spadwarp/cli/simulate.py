@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -108,7 +108,7 @@ def simulate(
     earlier = None
     if resume is not None:
         given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
-        more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records, "--overwrite": overwrite}
+        more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records}
         if clash := [name for name, value in (given | more).items() if value]:
             raise typer.BadParameter(f"goes without {', '.join(clash)}: the run has them", param_hint="--resume")
         out = resume if resume.is_dir() else resume.parent
@@ -128,9 +128,9 @@ def simulate(
             complain(str(message))
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     needed = run.bytes_needed(scene, batches=batches, records=records, checkpoint=checkpoint > 0)
-    _prepare(out, needed, resume=earlier is not None, overwrite=overwrite)
-    if json_path is not None:
-        opt.check_writable(json_path.parent)
+    inputs = (scene_path, *scene.files)
+    options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
+    outputs = _outputs(out, resume=earlier is not None, **options)
 
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
@@ -155,7 +155,7 @@ def simulate(
     if not quiet:
         say(described(result, files))
     error = result.relative_error if _has_errors(result) else None
-    opt.write_json({**result.summary(), "relative_error": error, "files": files.written}, json_path)
+    outputs.write_json({**result.summary(), "relative_error": error, "files": files.written})
     if result.partial:
         _fail_as_interrupted(result, records)
     if relative_error is not None and (error is None or error > relative_error):
@@ -165,10 +165,9 @@ def simulate(
 
 def _earlier(place: Path, photons: int | None) -> Result:
     """The run to resume, whose scene asks for as many photons as it shall have."""
-    from spadwarp.run import newest_result
+    from spadwarp.run import load_resumable
 
-    place = newest_result(place)
-    earlier = opt.load_run(place)
+    earlier, place = load_resumable(place)
     start, stop = earlier.requested
     wanted = stop - start if photons is None else photons
     if wanted <= earlier.photons:
@@ -185,16 +184,17 @@ def _check_records(scene: Scene, *, whole: bool) -> None:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
 
 
-def _prepare(out: Path, needed: int, *, resume: bool, overwrite: bool) -> None:
-    """Makes the directory; refuses one that holds another run or has too little space for `needed` bytes."""
-    from spadwarp import run
+def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt.Outputs:
+    """Makes the directory; refuses one that holds another run, or a part of one."""
+    from spadwarp.run import CHECKPOINT, RUN_FILES, remove_checkpoint
 
-    if (out / run.CHECKPOINT).exists() and not (resume or overwrite):
+    if (out / CHECKPOINT).exists() and not (resume or overwrite):
         problem = f"{out} has a run that was not finished; --resume {out} resumes it, --overwrite replaces it"
         raise typer.BadParameter(problem, param_hint="--out")
-    opt.prepare_directory(out, overwrite=overwrite or resume, needed=needed)
+    outputs = opt.check_outputs(out, RUN_FILES, resume=resume, overwrite=overwrite, **options)
     if not resume:
-        run.remove_checkpoint(out)
+        remove_checkpoint(out)
+    return outputs
 
 
 def _has_errors(result: Result) -> bool:

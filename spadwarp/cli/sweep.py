@@ -57,7 +57,14 @@ def sweep(
     from spadwarp.viz import draw_sweep
 
     scene: Scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
-    opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
+    outputs = opt.check_outputs(
+        out,
+        ("sweep.png", "sweep.csv"),
+        json=json_path,
+        inputs=(scene_path, mesh, *scene.files),
+        overwrite=overwrite,
+        needed=16 << 20,
+    )
     curves = spadwarp.sweep(scene, vary=vary, of=of.value, device=device)
     draw_sweep(curves, out / "sweep.png")
     values, some = list(curves.values), list[Any](curves.rows)
@@ -72,9 +79,7 @@ def sweep(
             else _error_table(names, curves.field, some)
         )
         say(f"written: {', '.join(path.name for path in written)} in {out}")
-    opt.write_json(
-        {"field": curves.field, "values": values, "of": of.value, "rows": found, "files": written}, json_path
-    )
+    outputs.write_json({"field": curves.field, "values": values, "of": of.value, "rows": found, "files": written})
 
 
 def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -39,10 +39,11 @@ def targets(
       spadwarp targets --out pictures/
       spadwarp targets bust.stl --out pictures/
     """
-    if out is not None:
-        opt.prepare_directory(out, overwrite=overwrite, needed=16 << 20)
+    names = [f"{path.stem}.png" for path in meshes or ()] or ["targets.png"]
+    options: dict[str, Any] = {"inputs": meshes or (), "overwrite": overwrite, "needed": 16 << 20}
+    outputs = opt.check_outputs(out, names, json=json_path, **options)
     if meshes:
-        _show_meshes(meshes, out, device, quiet, json_path)
+        _show_meshes(meshes, out, device, quiet, outputs)
         return
     from spadwarp.viz import describe_targets, draw_targets
 
@@ -54,10 +55,10 @@ def targets(
             say(f"{one['name']:<14}  {extent} m  {opt.count(one['faces']):>7} faces")
         if sheet is not None:
             say(f"written: {sheet}")
-    opt.write_json({"targets": found, "files": [] if sheet is None else [sheet]}, json_path)
+    outputs.write_json({"targets": found, "files": [] if sheet is None else [sheet]})
 
 
-def _show_meshes(meshes: list[Path], out: Path | None, device: str | None, quiet: bool, json_path: Path | None) -> None:
+def _show_meshes(meshes: list[Path], out: Path | None, device: str | None, quiet: bool, outputs: opt.Outputs) -> None:
     from spadwarp.mesh import describe_mesh
     from spadwarp.viz import draw_mesh
 
@@ -69,7 +70,7 @@ def _show_meshes(meshes: list[Path], out: Path | None, device: str | None, quiet
         for picture in pictures:
             say(f"written: {picture}")
     summary = [{**dataclasses.asdict(one), "hints": one.hints} for one in found]
-    opt.write_json({"meshes": summary, "files": pictures}, json_path)
+    outputs.write_json({"meshes": summary, "files": pictures})
 
 
 def _lines(mesh: MeshSummary) -> dict[str, str]:

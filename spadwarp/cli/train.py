@@ -11,7 +11,6 @@ import typer
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 from spadwarp.cli._progress import progress
-from spadwarp.errors import ConfigError
 
 
 @app.command()
@@ -28,6 +27,7 @@ def train(
         int | None, typer.Option(parser=opt.whole_number, metavar="N", help="Seed. By default the recipe's.")
     ] = None,
     device: opt.TorchDevice = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -52,10 +52,15 @@ def train(
     if steps is not None:
         changes["optimiser"] = {"steps": steps}
     chosen = load_training_recipe(recipe, overrides=changes)
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out: {out} is a file; a directory is needed")
-    opt.check_writable(out)
     first = int(os.environ.get("RANK", "0")) == 0
+    outputs = opt.check_outputs(
+        out if first else None,  # one process of torchrun writes
+        (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt"),
+        json=json_path,
+        inputs=(recipe,),
+        overwrite=overwrite,
+        resume=True,
+    )
     with progress(quiet=quiet or not first, unit="steps") as shown:
         trained = run(chosen, out, device=device, progress=shown)
     if first:
@@ -70,4 +75,4 @@ def train(
                     }
                 )
             )
-        opt.write_json({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights}, json_path)
+        outputs.write_json({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights})

@@ -33,6 +33,7 @@ def validate(
     ] = False,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Also draw a picture of each case.")] = None,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
@@ -45,14 +46,14 @@ def validate(
       spadwarp validate
       spadwarp validate slab cube60 --photons 1e7 --seed 1 --json report.json --plots plots/
     """
-    from spadwarp.validate import CASES, draw_results, run, write_json
+    from spadwarp.validate import CASES, draw_results, report, run
 
     if list_cases:
         say(opt.rows({case.name: case.summary for case in CASES.values()}))
         return
-    for place in (plots, None if json_path is None else json_path.parent):
-        if place is not None:
-            opt.check_writable(place)
+    outputs = opt.check_outputs(
+        plots, [f"{name}.png" for name in CASES], json=json_path, overwrite=overwrite, option="--plots"
+    )
     results = run(
         cases or None,
         photons=photons,
@@ -62,8 +63,7 @@ def validate(
         progress=None if quiet else lambda case: complain(f"{case.name}: {case.summary}"),
     )
     failed = [result for result in results if not result.passed]
-    if json_path is not None:
-        write_json(results, json_path, photons=photons, seed=seed or 0)
+    outputs.write_json(report(results, photons=photons, seed=seed or 0))
     drawn = [] if plots is None else draw_results(results, plots)
     if not quiet:
         opt.show_table(_table(results))

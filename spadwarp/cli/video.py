@@ -27,6 +27,7 @@ def video(
     fps: Annotated[float, typer.Option(metavar="N", help="Pictures per second, up to 50.")] = 12.0,
     linear: Annotated[bool, typer.Option("--linear", help="A linear colour scale instead of four decades.")] = False,
     frame: opt.Frame = 0,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
 ) -> None:
     """A video of light in flight, from time bin to time bin.
@@ -36,6 +37,7 @@ def video(
       spadwarp video out/
       spadwarp video out/ --out light.mp4 --window 40,55 --fps 20
     """
+    opt.check_outputs(files={"--out": out}, inputs=(run,), overwrite=overwrite)
     scale: Literal["log", "linear"] = "linear" if linear else "log"
     path = spadwarp.viz.video(run, out, window_ns=_window(window), pictures=pictures, fps=fps, scale=scale, frame=frame)
     if not quiet:

@@ -22,6 +22,7 @@ def view(
     ] = None,
     frame: opt.Frame = 0,
     device: opt.Device = None,
+    overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
 ) -> None:
     """A run as one HTML file: click a pixel to see its histogram.
@@ -34,6 +35,7 @@ def view(
       spadwarp view out/
       spadwarp view frames/frames.h5 --frame 3 --out frame.html
     """
+    opt.check_outputs(files={"--out": out}, inputs=(run,), overwrite=overwrite)
     path = spadwarp.viz.view(run, out, method=method, frame=frame, device=device)
     if not quiet:
         say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")

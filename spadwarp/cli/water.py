@@ -20,6 +20,7 @@ def water(
     chlorophyll: Annotated[float, typer.Option(metavar="C", help="0 (pure water) to 30 [mg/m3].")] = 0.0,
     temperature: Annotated[float, typer.Option(metavar="T", help="0 to 30 [degrees Celsius].")] = 20.0,
     salinity: Annotated[float, typer.Option(metavar="S", help="0 (fresh) to 40 [g/kg].")] = 35.0,
+    overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
     """Absorption, scattering and indices of water at a wavelength.
@@ -30,6 +31,7 @@ def water(
     Example:
       spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
     """
+    outputs = opt.check_outputs(json=json_path, overwrite=overwrite)
     optics = spadwarp.water.water_optics(
         wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity
     )
@@ -46,4 +48,4 @@ def water(
         )
     )
     asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
-    opt.write_json({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction}, json_path)
+    outputs.write_json({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction})

@@ -21,6 +21,7 @@ from spadwarp.frames.measured import Histograms, read_array, read_histograms
 from spadwarp.frames.response import instrument_response
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
+from spadwarp.io.paths import existing_file
 from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time
 from spadwarp.viz import draw_denoised
@@ -177,9 +178,7 @@ def read_depth(
         FileError: No such file, not readable, or without depth.
         ArgumentError: An argument out of range, or missing for what the file holds.
     """
-    place = Path(path)
-    if not place.is_file():
-        raise FileError(f"{place}: {'is not a file' if place.exists() else 'no such file'}")
+    place = existing_file(path)
     if place.suffix.lower() not in ENDINGS:
         raise FileError(f"{place}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):

@@ -15,6 +15,7 @@ from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import POOLED, DepthFrames, depth_frames
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
+from spadwarp.io.paths import existing_file
 
 __all__ = ["METHODS", "WEIGHTS", "apply", "denoise_frames", "features_of_histograms", "weights_metadata"]
 
@@ -224,9 +225,7 @@ def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, 
     """`weights` by the network that the file names; empty without. Raises `ArgumentError` if it is none of `models`."""
     if weights is None:
         return {}
-    if not Path(weights).is_file():
-        raise FileError(f"{weights}: no such file")
-    model = _header(Path(weights)).get("model")
+    model = _header(existing_file(weights)).get("model")
     if model not in MODELS:
         raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
     if model not in models:
@@ -261,10 +260,7 @@ def torch_device(name: str | None) -> Any:
 def _weights_path(model: str, weights: str | Path | None) -> Path:
     if model not in MODELS:
         raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
-    path = WEIGHTS / f"{model}.safetensors" if weights is None else Path(weights)
-    if not path.is_file():
-        raise FileError(f"{path}: no such file")
-    return path
+    return existing_file(WEIGHTS / f"{model}.safetensors" if weights is None else weights)
 
 
 def _header(path: Path) -> dict[str, str]:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
+from spadwarp.io.npy import read_npy
+from spadwarp.io.paths import existing_file
 from spadwarp.result.file import load_result
 
 if TYPE_CHECKING:
@@ -63,9 +65,7 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
         FileError: No such file, not readable, of an unknown kind, without such an array, or with values that are
             negative or not finite; a package that is needed to read it is not installed.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    path = existing_file(path)
     readers: dict[str, Callable[[Path], Histograms]] = {
         ".h5": _read_own,
         ".npy": lambda path: Histograms(values=read_array(path)),
@@ -127,7 +127,7 @@ def read_array(path: Path, variable: str | None = None, *, dimensions: Sequence[
     Raises `FileError` for a `.mat` without such an array, and what the reader of the format raises.
     """
     if path.suffix.lower() == ".npy":
-        return np.load(path, allow_pickle=False)
+        return read_npy(path)
     import h5py
 
     if h5py.is_hdf5(path):  # MATLAB 7.3

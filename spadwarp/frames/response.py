@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.parsing import file_problem, read_columns
+from spadwarp.io.parsing import read_columns
+from spadwarp.io.paths import file_problem
 from spadwarp.limits import shown
 
 if TYPE_CHECKING:

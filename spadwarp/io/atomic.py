@@ -1,28 +1,22 @@
-"""Files that appear whole or not at all, and the file of a given name in a folder."""
+"""Files that appear whole or not at all."""
 
 from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterator, Sequence
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.paths import is_stream
+
+__all__ = ["atomic_path", "remove_temporaries"]
 
 _LONGEST_PREFIX = 100  # bytes of a file's name in that of its temporary file; file systems allow 255 in all
-
-
-def file_within(path: str | Path, names: Sequence[str]) -> Path:
-    """A file itself, or the only one of `names` in a directory. Raises `FileError` where there are none or several."""
-    folder = Path(path)
-    if not folder.is_dir():
-        return folder
-    found = [folder / name for name in names if (folder / name).is_file()]
-    if len(found) != 1:
-        held = " and ".join(path.name for path in found) if found else f"no {' and no '.join(names)}"
-        raise FileError(f"{path}: holds {held}; name the file")
-    return found[0]
 
 
 @contextmanager
@@ -30,10 +24,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """A new empty file beside `path` that takes its name when the block ends well, and is removed when it does not.
 
     What was at `path` stays untouched until then; a symbolic link is replaced, not what it leads to. No other process,
-    on this machine or another, gets the same temporary name. Raises `FileError` where the folder or the file cannot be
-    written.
+    on this machine or another, gets the same temporary name. A pipe or a device is written to at the end. Raises
+    `FileError` where the folder or the file cannot be written.
     """
     target = Path(path)
+    if is_stream(target):
+        with _stream(target) as temporary:
+            yield temporary
+        return
     if not target.name:
         raise FileError(f"{target}: is no name of a file")
     temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
@@ -51,6 +49,23 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+@contextmanager
+def _stream(target: Path) -> Iterator[Path]:
+    """A temporary file whose content goes to a pipe or a device when the block ends well."""
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / target.name
+            temporary.touch()
+            yield temporary
+            sys.stdout.flush()  # what was printed before comes first
+            with temporary.open("rb") as source, target.open("ab") as stream:
+                shutil.copyfileobj(source, stream)
+    except SpadwarpError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise FileError(f"{target}: cannot be written: {error}") from error
 
 
 def remove_temporaries(path: str | Path) -> None:

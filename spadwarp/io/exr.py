@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import existing_file
 
 _STRUCTURE = (
     "channels",
@@ -23,6 +25,10 @@ _STRUCTURE = (
     "screenWindowWidth",
     "type",
 )
+
+
+_LARGEST_IMAGE = 1 << 28  # values that are read
+_DEFLATE, _SMALL = 1100, 1 << 16  # no compression of EXR makes an image smaller by more than this, its header aside
 
 
 def write_exr(
@@ -67,20 +73,35 @@ def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
     return np.ascontiguousarray(pixels)
 
 
-def read_exr(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def read_exr(path: str | Path, *, largest: int = _LARGEST_IMAGE) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Channels (name → `[H, W]`, float16, float32 or uint32 as stored) and metadata of an EXR image's first part.
 
+    Args:
+        path: The file.
+        largest: Allowed number of values, of all channels and parts.
+
     Raises:
-        FileError: No such file, not an EXR, or damaged.
+        FileError: No such file, not an EXR, damaged, or larger than allowed.
     """
     import OpenEXR
 
-    if not Path(path).is_file():
-        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
+    existing_file(path)
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            values = sum(map(_value_count, file.parts))
+        if values > largest:
+            raise FileError(f"{path}: an image of {values} values; at most {largest} are read")
+        if 2 * values > _DEFLATE * Path(path).stat().st_size + _SMALL:
+            raise FileError(f"{path}: {values} values cannot be in a file of {Path(path).stat().st_size} bytes")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
             metadata = {name: value for name, value in file.header().items() if name not in _STRUCTURE}
-    except (OSError, RuntimeError, ValueError, TypeError) as error:
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
         raise FileError(f"{path}: not an EXR image, or damaged: {error}") from error
     return channels, metadata
+
+
+def _value_count(part: Any) -> int:
+    """Values of all channels, as an image's header has them."""
+    low, high = (corner.astype(np.int64) for corner in part.header["dataWindow"])
+    return math.prod(int(side) for side in np.maximum(high - low + 1, 0)) * len(part.header["channels"])

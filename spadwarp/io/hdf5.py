@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import existing_file
 
 if TYPE_CHECKING:
     import h5py
@@ -110,8 +111,7 @@ def hdf5_format(path: str | Path) -> str | None:
     """
     import h5py
 
-    if not Path(path).is_file():
-        raise FileError(f"{path}: {'is not a file' if Path(path).exists() else 'no such file'}")
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             return file.attrs.get("format")

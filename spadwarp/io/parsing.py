@@ -11,7 +11,6 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,22 +19,12 @@ from numpy.typing import NDArray
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.limits import Interval, parse_number, shown
 
-__all__ = ["file_problem", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml"]
+__all__ = ["parse_json", "parse_toml", "read_columns", "read_text", "read_toml"]
 
 _LARGEST_TEXT = 4 << 20  # bytes; a table of 100 000 rows has 2 MiB
 _DEEPEST = 32  # tables and lists in each other; a recipe has 6
 # More parts than a key of ours has, in front of which no other part stands: the time to read one grows as their square.
 _LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){64}""")
-
-
-def file_problem(path: str | os.PathLike[str]) -> str | None:
-    """Why there is no file to read at a path: "no such file", "is not a file", …; None where there is one."""
-    try:
-        if Path(path).is_file():
-            return None
-        return "is not a file" if Path(path).exists() else "no such file"
-    except OSError as error:  # a name that is too long, a folder without permission
-        return f"cannot be read: {error.strerror}"
 
 
 def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import MeshError
+from spadwarp.io.paths import file_problem
 from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.scene.pose import rotation_matrix, to_camera
@@ -168,8 +169,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
     images: Images = ()
     if target.mesh is not None:
         name, path = f"{field}.mesh = {target.mesh!r}", Path(target.mesh)
-        if not path.is_file():
-            raise MeshError(f"{name}: {'is not a file' if path.exists() else 'no such file'}")
+        if (problem := file_problem(path)) is not None:
+            raise MeshError(f"{name}: {problem}")
         if target.reflectance == "from_file":
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
         else:

@@ -124,6 +124,12 @@ def check_targets(a: Truth, b: Truth, action: str) -> None:
         raise ConfigError(f"{action}: the targets of the results differ, by their truth maps: was a mesh file changed?")
 
 
+def is_one_run(a: Result, b: Result) -> bool:
+    """Whether two results hold photons of one run: the one with fewer photons is an earlier state of the other."""
+    same = (a.seed, a.unit, a.batch_size, a.requested[0]) == (b.seed, b.unit, b.batch_size, b.requested[0])
+    return same and physics_of(a.scene) == physics_of(b.scene)
+
+
 def physics_of(scene: Scene) -> Scene:
     """The scene without what does not change a photon's history."""
     transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})

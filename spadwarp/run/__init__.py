@@ -2,17 +2,26 @@
 
 from spadwarp.run.analytic_file import save_analytic
 from spadwarp.run.depth import write_depth
-from spadwarp.run.directory import CHECKPOINT, RunFiles, bytes_needed, newest_result, remove_checkpoint, write_run
+from spadwarp.run.directory import (
+    CHECKPOINT,
+    RUN_FILES,
+    RunFiles,
+    bytes_needed,
+    load_resumable,
+    remove_checkpoint,
+    write_run,
+)
 from spadwarp.run.formats import FORMATS, export
 from spadwarp.run.sources import open_source
 
 __all__ = [
     "CHECKPOINT",
     "FORMATS",
+    "RUN_FILES",
     "RunFiles",
     "bytes_needed",
     "export",
-    "newest_result",
+    "load_resumable",
     "open_source",
     "remove_checkpoint",
     "save_analytic",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,16 +16,20 @@ from numpy.typing import NDArray
 from spadwarp.errors import FileError
 from spadwarp.frames import detector_response
 from spadwarp.io.atomic import atomic_path, remove_temporaries
-from spadwarp.result import Result, save_depth_exr, save_truth_maps
+from spadwarp.io.paths import file_within
+from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
+from spadwarp.result.merging import is_one_run
 from spadwarp.scene import Scene
 
-__all__ = ["CHECKPOINT", "RunFiles", "bytes_needed", "newest_result", "remove_checkpoint", "write_run"]
+__all__ = ["CHECKPOINT", "RUN_FILES", "RunFiles", "bytes_needed", "load_resumable", "remove_checkpoint"]
+__all__ += ["write_run"]
 
 CHECKPOINT = "checkpoint.h5"
 """Name of the partial result of an unfinished run."""
 
-_NAMES = {"result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr"}
-_PICTURES = {f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")}
+_PICTURES = (f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf"))
+RUN_FILES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr", CHECKPOINT, *_PICTURES)
+"""Names of all files that the directory of a run may have."""
 
 _RECORD_BYTES = 52  # of one photon's terminal state, id included
 _OTHER_BYTES = 16 << 20  # pictures, maps, text
@@ -75,7 +80,7 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
 
         written += draw_result(result, folder, depth=depth, method=output.depth_method, formats=formats)
     remove_checkpoint(folder)
-    for name in (_NAMES | _PICTURES) - set(keep) - {path.name for path in written}:
+    for name in set(RUN_FILES) - set(keep) - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)
     return RunFiles(written, depth)
 
@@ -90,11 +95,30 @@ def _save(result: Result, path: Path) -> Path:
         raise FileError(f"{error}\n{refuge}: the result is here instead") from error
 
 
-def newest_result(path: str | Path) -> Path:
-    """Of a directory its result or its checkpoint, whichever is newer; any other path as it is."""
+def load_resumable(path: str | Path) -> tuple[Result, Path]:
+    """The result to resume and its file: of a directory its result or its checkpoint.
+
+    Of one run that which has more photons, whatever the clock said when they were written; of two runs the checkpoint,
+    since the result is then an earlier one that the unfinished run replaces. Where one cannot be read, the other, with
+    a warning. Raises `FileError`.
+    """
     folder = Path(path)
-    found = [file for name in ("result.h5", CHECKPOINT) if (file := folder / name).is_file()]
-    return max(found, key=lambda file: file.stat().st_mtime_ns, default=folder)
+    files = [file for name in (CHECKPOINT, "result.h5") if (file := folder / name).is_file()]
+    if len(files) < 2:
+        file = files[0] if files else file_within(folder, ("result.h5",))
+        return load_result(file), file
+    found: list[tuple[Result, Path]] = []
+    for file in files:
+        try:
+            found.append((load_result(file), file))
+        except FileError as error:
+            if file == files[-1] and not found:
+                raise
+            warnings.warn(f"{error}; the other file of the run is resumed", RuntimeWarning, stacklevel=2)
+    first, last = (result for result, _ in (found[0], found[-1]))
+    if not is_one_run(first, last):
+        return found[0]
+    return max(found, key=lambda pair: pair[0].photons)
 
 
 def remove_checkpoint(out: str | Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.exr import read_exr
+from spadwarp.io.npy import read_npy
+from spadwarp.io.paths import existing_file
 
 if TYPE_CHECKING:
     from spadwarp.scene import Laser
+
+_LARGEST = 1 << 25  # pixels: more than cameras for beams have, and little beside a computer's memory
 
 __all__ = ["load_profile", "profile_axes", "profile_extent"]
 
@@ -27,14 +33,12 @@ def load_profile(laser: Laser) -> NDArray[np.float64]:
     """
     path = Path(laser.profile_image or "")
     where = f"laser.profile_image = {str(path)!r}"
-    if not path.is_file():
-        raise FileError(f"{where}: {'is not a file' if path.exists() else 'no such file'}")
     readers = {".npy": _read_npy, ".exr": _read_exr, ".png": _read_png}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise FileError(f"{where}: ending {path.suffix!r} is not one of {', '.join(readers)}")
     try:
-        image = reader(path)
+        image = reader(existing_file(path))
     except SpadwarpError as error:
         raise FileError(f"{where}: {error}") from error
     except Exception as error:  # what a reader raises depends on the format
@@ -66,20 +70,24 @@ def profile_axes(axis: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
-    return np.asarray(np.load(path, allow_pickle=False))
+    return read_npy(path, largest=_LARGEST)
 
 
 def _read_exr(path: Path) -> NDArray[np.generic]:
-    from spadwarp.io.exr import read_exr
-
-    channels, _ = read_exr(path)
+    channels, _ = read_exr(path, largest=4 * _LARGEST)
     colours = [pixels.astype(np.float64) for name, pixels in channels.items() if name.rsplit(".", 1)[-1] != "A"]
     return np.mean(colours, axis=0)
 
 
 def _read_png(path: Path) -> NDArray[np.generic]:
     from matplotlib.image import imread
+    from PIL import Image
 
+    with warnings.catch_warnings(), Image.open(path, formats=("PNG",)) as image:
+        warnings.simplefilter("ignore")  # of Pillow's own limit
+        width, height = image.size
+    if width * height > _LARGEST:
+        raise FileError(f"{width} x {height} pixels; at most {_LARGEST} are read")
     pixels = np.asarray(imread(path))
     colours = {2: 1, 4: 3}.get(pixels.shape[-1], pixels.shape[-1])  # without alpha
     return pixels if pixels.ndim == 2 else pixels[..., :colours].mean(axis=-1)

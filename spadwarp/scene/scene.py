@@ -72,6 +72,14 @@ class Scene(BaseModel):
         return self._source
 
     @property
+    def files(self) -> list[Path]:
+        """Files that the scene refers to: meshes, tables and images, all that `to_dict` names."""
+        tables = self.to_dict()
+        named = [tables[section].get(name, "") for section, name, _ in _FILE_FIELDS]
+        named += [target.get("mesh", "") for target in tables.get("targets", ())]
+        return [Path(path) for path in named if Path(path).suffix]
+
+    @property
     def scan_positions(self) -> int:
         """Positions of the beam: photon i is emitted at position i modulo this number."""
         return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
@@ -175,6 +183,15 @@ def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
     return changed
 
 
+# Fields with the path of a file beside `mesh` of a target: section, name, the ending that makes text a path.
+_FILE_FIELDS = (
+    ("medium", "phase_table", ".csv"),
+    ("detector", "irf", ".csv"),
+    ("camera", "calibration", ""),
+    ("laser", "profile_image", ""),
+)
+
+
 def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The tables with relative paths of files made absolute."""
 
@@ -190,12 +207,7 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
     elif isinstance(targets, (list, tuple)):
         changed["targets"] = [absolute(target, "mesh") for target in targets]
-    for section, name, ending in (
-        ("medium", "phase_table", ".csv"),
-        ("detector", "irf", ".csv"),
-        ("camera", "calibration", ""),
-        ("laser", "profile_image", ""),
-    ):
+    for section, name, ending in _FILE_FIELDS:
         if section in tables:
             changed[section] = absolute(tables[section], name, ending)
     return changed

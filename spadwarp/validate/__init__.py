@@ -7,6 +7,6 @@ True
 """
 
 from spadwarp.validate.case import Case
-from spadwarp.validate.runs import CASES, FAMILY_LEVEL, CaseResult, draw_results, run, write_json
+from spadwarp.validate.runs import CASES, FAMILY_LEVEL, CaseResult, draw_results, report, run
 
-__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "run", "write_json"]
+__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]

@@ -6,15 +6,15 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from spadwarp.errors import ConfigError
-from spadwarp.io import text
 from spadwarp.validate import camera, phase, water
 from spadwarp.validate.case import Case, Run
 from spadwarp.validate.statistics import holm, two_sided_p
 from spadwarp.viz import draw_validation
 
-__all__ = ["CASES", "FAMILY_LEVEL", "CaseResult", "draw_results", "run", "write_json"]
+__all__ = ["CASES", "FAMILY_LEVEL", "CaseResult", "draw_results", "report", "run"]
 
 CASES: dict[str, Case] = {case.name: case for case in (*water.CASES, *phase.CASES, *camera.CASES)}
 """The reference cases by name."""
@@ -103,9 +103,9 @@ def run(
     ]
 
 
-def write_json(results: Sequence[CaseResult], path: str | Path, *, photons: int, seed: int) -> None:
-    """Writes the results with their cases' summaries; an infinite z is written as null. Raises `FileError`."""
-    report = {
+def report(results: Sequence[CaseResult], *, photons: int, seed: int) -> dict[str, Any]:
+    """The results with their cases' summaries as plain values; `spadwarp.io.write_json` writes them."""
+    return {
         "photons": photons,
         "seed": str(seed),
         "family_level": FAMILY_LEVEL,
@@ -113,7 +113,6 @@ def write_json(results: Sequence[CaseResult], path: str | Path, *, photons: int,
         "cases": {result.name: CASES[result.name].summary for result in results},
         "results": [asdict(result) for result in results],
     }
-    text.write_json(report, path, indent=1)
 
 
 def draw_results(results: Sequence[CaseResult], folder: str | Path) -> list[Path]:

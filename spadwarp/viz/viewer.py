@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response, is_frames_file
-from spadwarp.io.atomic import file_within
+from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth

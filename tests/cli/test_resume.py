@@ -1,5 +1,6 @@
 """Runs that are interrupted, resumed and added up."""
 
+import dataclasses
 import os
 import signal
 import time
@@ -9,6 +10,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, start, tables
+from spadwarp.run import load_resumable
 
 
 def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):
@@ -54,6 +56,38 @@ def test_what_does_not_go_with_resume(spad_scene, done, tmp_path):
     assert (
         "outside (0, 1)" in run("simulate", spad_scene, "--out", tmp_path / "x", "--relative-error", 2, code=2).stderr
     )
+
+
+def test_the_number_of_photons_decides_what_is_resumed(spad_scene, tmp_path):
+    """Not the time of the files: a clock that was in the future must not throw photons away."""
+    out, scene = tmp_path / "out", spadwarp.load_scene(spad_scene)
+    out.mkdir()
+
+    def put(name, photons, *, age, scene=scene):
+        whole = spadwarp.simulate(scene, photons=photons, device="cpu")
+        dataclasses.replace(whole, requested=(0, 40_000), partial=True).save(out / name)
+        os.utime(out / name, (4e9 - age, 4e9 - age))
+
+    for checkpoint, result in ((10_000, 20_000), (20_000, 10_000)):
+        put("result.h5", result, age=1 if result < checkpoint else 2)
+        put("checkpoint.h5", checkpoint, age=1 if checkpoint < result else 2)
+        earlier, path = load_resumable(out)
+        assert earlier.photons == 20_000 and path.name == ("result.h5" if result > checkpoint else "checkpoint.h5")
+    # One that cannot be read does not hide the other.
+    content = (out / "checkpoint.h5").read_bytes()
+    (out / "checkpoint.h5").write_bytes(content[: len(content) // 2])
+    with pytest.warns(RuntimeWarning, match=r"checkpoint\.h5: damaged"):
+        assert load_resumable(out)[1].name == "result.h5"
+    # A checkpoint beside the result of another scene is of the run that replaces this result.
+    put("checkpoint.h5", 5_000, age=2, scene=scene.with_overrides({"medium.extinction": 0.7}))
+    assert load_resumable(out)[1].name == "checkpoint.h5"
+
+    put("checkpoint.h5", 30_000, age=2)
+    run("simulate", "--resume", out, "--quiet", *DEVICE)
+    again = spadwarp.load_result(out / "result.h5")
+    long = spadwarp.simulate(scene, photons=40_000, device="cpu")
+    assert np.array_equal(again.tallies, long.tallies) and again.ledger == long.ledger and not again.partial
+    assert not (out / "checkpoint.h5").exists()
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ from reference.adding_doubling import cumulative_reflectance, exit_cosine_fracti
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
 from spadwarp.errors import ConfigError
-from spadwarp.validate import CASES, draw_results, references, run, write_json
+from spadwarp.io import json_text
+from spadwarp.validate import CASES, draw_results, references, report, run
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
 
 # The statistics
@@ -207,9 +208,8 @@ def test_one_seed_gives_one_result():
 
 @pytest.mark.physics
 def test_reports(results, tmp_path):
-    write_json(results, tmp_path / "report.json", photons=10_000, seed=3)
-    report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert report["passed"] is True and len(report["results"]) == len(results)
+    plain = json.loads(json_text(report(results, photons=10_000, seed=3)))
+    assert plain["passed"] is True and len(plain["results"]) == len(results)
     some = list(itertools.islice((r for r in results if r.name in ("slab", "moments")), 20))
     for path in draw_results(some, tmp_path / "plots"):
         assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

@@ -1,0 +1,150 @@
+"""What a command writes, checked before it works: one rule for all commands.
+
+A file that exists is refused by name unless --overwrite is given, and so is a directory that is not empty. What a
+command reads is never what it writes. Pipes and devices such as /dev/stdout are written to as they are.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import spadwarp
+from spadwarp.cli._app import until_the_end
+from spadwarp.errors import FileError
+
+__all__ = ["Json", "Out", "Outputs", "Overwrite", "check_outputs", "check_writable", "in_bytes"]
+
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace output files that exist; allow a directory that is not empty.")
+]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the output as JSON.")]
+
+_READ_IN_DIRECTORIES = ("result.h5", "frames.h5", "analytic.h5")  # where an input is the directory of one of them
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The outputs of a command that `check_outputs` allowed."""
+
+    json: Path | None
+    overwrite: bool
+
+    def write_json(self, summary: Mapping[str, Any]) -> None:
+        """The machine-readable twin of what a command prints; numbers that are not finite become null."""
+        if self.json is None:
+            return
+        if not self.overwrite and os.path.lexists(self.json) and not spadwarp.io.is_stream(self.json):
+            raise FileError(f"{self.json}: appeared while the command ran; it is not replaced")
+        spadwarp.io.write_json(summary, self.json)
+
+
+def check_outputs(
+    out: Path | None = None,
+    names: Iterable[str] = (),
+    *,
+    files: Mapping[str, Path | None] | None = None,
+    json: Path | None = None,
+    inputs: Iterable[str | Path | None] = (),
+    overwrite: bool,
+    resume: bool = False,
+    needed: int = 0,
+    option: str = "--out",
+) -> Outputs:
+    """Refuses outputs that would replace something else, and finds out now whether they can be written.
+
+    The output directory is made, and locked until the command ends.
+
+    Args:
+        out: Directory of `option`.
+        names: Files that the command may write in it.
+        files: Option → file that the command writes.
+        json: File of --json.
+        inputs: Files that the command reads, or directories of a result or frames.
+        overwrite: Whether existing files are replaced.
+        resume: Whether the command continues what is in the directory.
+        needed: Bytes that may be written to `out`.
+        option: That names the directory.
+
+    Raises:
+        typer.BadParameter: An output exists, is an input, or is given twice.
+        FileError: A directory cannot be written, is in use by another process, or has too little space.
+    """
+    named = {option: path for option, path in {**(files or {}), "--json": json}.items() if path is not None}
+    named = {option: path for option, path in named.items() if not spadwarp.io.is_stream(path)}
+    written = [*named.items(), *((option, out / name) for name in names if out is not None)]
+    _check_apart(written, inputs)
+    for name, path in named.items():
+        if path.is_dir():
+            raise typer.BadParameter(f"{path} is a directory; a file is needed", param_hint=name)
+        if os.path.lexists(path) and not overwrite:
+            raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=name)
+    if out is not None:
+        _prepare_directory(out, option, may_hold_files=overwrite or resume, needed=needed)
+    for path in named.values():
+        check_writable(path.parent)
+    return Outputs(json, overwrite)
+
+
+def _check_apart(written: Iterable[tuple[str, Path]], inputs: Iterable[str | Path | None]) -> None:
+    """Raises `typer.BadParameter` where two outputs, or an output and an input, are one file."""
+    read = [Path(path) for path in inputs if path is not None]
+    for folder in [path for path in read if path.is_dir()]:
+        if (folder / "recipe.toml").exists():  # a dataset
+            read += [path for path in (*folder.glob("*"), *folder.glob("*/*")) if path.name != "preview.png"]
+        else:
+            read += [folder / name for name in _READ_IN_DIRECTORIES]
+    kept = {place for path in read for place in (_place(path), path.resolve())}
+    taken: dict[Path, str] = {}
+    for option, path in written:
+        place = _place(path)
+        if place in kept:
+            raise typer.BadParameter(f"{path} is read by this command and would be replaced", param_hint=option)
+        if place in taken:
+            raise typer.BadParameter(f"{path} is also written for {taken[place]}", param_hint=option)
+        taken[place] = option
+
+
+def _place(path: Path) -> Path:
+    """Where a file is written: links in its folder are followed, but not one in its own place, which is replaced."""
+    return path.parent.resolve() / path.name
+
+
+def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: int) -> None:
+    if out.exists() and not out.is_dir():
+        raise typer.BadParameter(f"{out} is a file; a directory is needed", param_hint=option)
+    check_writable(out)
+    if not until_the_end(spadwarp.io.lock(out / ".lock")):
+        raise FileError(f"{out}: another process is writing to this directory; wait for it, or name another one")
+    if any(not path.name.startswith(".") for path in out.iterdir()) and not may_hold_files:
+        raise typer.BadParameter(f"{out} is not empty; --overwrite replaces results in it", param_hint=option)
+    free = shutil.disk_usage(out).free
+    if free < needed:
+        raise FileError(f"{out}: up to {in_bytes(needed)} will be written; {in_bytes(free)} are free there")
+
+
+def check_writable(directory: Path) -> None:
+    """Raises `FileError` where no file can be made in the directory, which is made if it is not there."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise FileError(f"{directory}: cannot be written: {error.strerror}") from error
+
+
+def in_bytes(number: float) -> str:
+    """1.5 GiB"""
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if number < 1024:
+            return f"{number:.4g} {unit}"
+        number /= 1024
+    return f"{number:.3g} TiB"
