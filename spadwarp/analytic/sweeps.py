@@ -6,7 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,13 @@ from spadwarp.analytic.model import source_name
 from spadwarp.analytic.photon_budget import BudgetRow, axis_rows
 from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.scene import parse_override
+from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.load import parse_key
+from spadwarp.scene.messages import locate
+from spadwarp.scene.quantities import field_unit, takes_integers
 from spadwarp.transport import truth_maps
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
+from spadwarp.units import quantity
 
 __all__ = ["DepthErrorRow", "Sweep", "parse_vary", "sweep"]
 
@@ -69,7 +70,8 @@ def sweep(
     Args:
         scene: The scene.
         vary: `"medium.extinction=0.1:2:20"` (from, to, number of values), the same with `:log` at the end for a
-            geometric progression, `"laser.pulse_energy=1e-9,4e-9"`, or (field, values).
+            geometric progression, `"laser.pulse_energy=1 nJ,4 nJ"`, `"targets[0].translation[2]=5:15:11"`, or (field,
+            values).
         of: `"budget"`: `BudgetRow` at the range of the target pixel nearest to the optical axis. `"depth-error"`:
             `DepthErrorRow` over all pixels.
         device: Warp device; default: the first GPU, else the CPU.
@@ -90,29 +92,60 @@ def sweep(
     return Sweep(field=field, values=tuple(values), rows=tuple(rows))
 
 
-def parse_vary(text: str) -> tuple[str, list[Any]]:
-    """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ArgumentError`."""
+def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:
+    """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ArgumentError`.
+
+    Values may have units, such as `laser.pulse_energy=1 nJ:1 µJ:7:log`, and become numbers of the field's own unit, or
+    of `unit`. Of a field of integers they are whole, each once.
+    """
     field, equals, spec = (part.strip() for part in text.partition("="))
     if not field or not equals or not spec:
         raise ArgumentError(f"vary = {text!r} is not of the form section.field=from:to:count")
+    info = locate(Scene, parse_key(field))[1] if unit is None else None
+    unit = (field_unit(info) if info is not None else None) or unit
     if ":" not in spec:
         try:
-            return field, tomllib.loads(f"values = [{spec}]")["values"]
+            values = tomllib.loads(f"values = [{spec}]")["values"]
         except tomllib.TOMLDecodeError:  # bare words
-            return field, [parse_override(f"{field}={value}")[1] for value in spec.split(",")]
+            values = [parse_override(f"{field}={value}")[1] for value in spec.split(",")]
+        return field, [_number(value, unit, text) for value in values]
     parts = spec.split(":")
     try:
-        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        low, high = (float(_number(_bare(part), unit, text)) for part in parts[:2])
+        count = int(parts[2])
         geometric = len(parts) == 4 and parts[3] == "log"
         if count < 1 or len(parts) > 3 + geometric or not (math.isfinite(low) and math.isfinite(high)):
             raise ValueError
         if geometric and not (low > 0 and high > 0):
             raise ValueError
+    except ArgumentError:
+        raise
     except (ValueError, IndexError):
         raise ArgumentError(
             f"vary = {text!r} is not of the form section.field=from:to:count, with :log only for positive ends"
         ) from None
-    return field, [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
+    steps = [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
+    if info is not None and takes_integers(info):
+        return field, list(dict.fromkeys(round(value) for value in steps))
+    return field, steps
+
+
+def _bare(text: str) -> Any:
+    """The number that a text is, else the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
+
+
+def _number(value: Any, unit: str | None, text: str) -> Any:
+    """A text that begins like a number as a number of the unit; all else as it is."""
+    if unit is None or not isinstance(value, str) or not value.lstrip("+-.")[:1].isdigit():
+        return value
+    try:
+        return quantity(value, unit)
+    except ValueError as error:
+        raise ArgumentError(f"vary = {text!r}: {value!r} {error}") from None
 
 
 def _central_row(scene: Scene, device: str | None) -> BudgetRow:

@@ -77,7 +77,7 @@ def _numbers(text: str | None) -> list[float] | None:
 
     if text is None:
         return None
-    _, values = parse_vary(f"range={text}")
+    _, values = parse_vary(f"range={text}", unit="m")
     if not all(isinstance(value, (int, float)) for value in values):
         raise ArgumentError(f"range = {text!r} is not of the form from:to:count or a,b,c")
     return [float(value) for value in values]

@@ -48,10 +48,11 @@ def sweep(
 ) -> None:
     """Curves over any field of the scene, from the analytic model.
 
-    Writes sweep.png and sweep.csv.
+    Writes sweep.png and sweep.csv. FIELD may be an item of a list, and values may have units.
 
     \b
-    Example:
+    Examples:
+      spadwarp sweep configs/scenes/staircase_5m.toml --vary 'targets[0].translation[2]=3:8:11' --out sweep/
       spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
     """
     from spadwarp.viz import draw_sweep

@@ -163,8 +163,9 @@ def _parse_value(value: str, text: str) -> Any:
     return table["value"] if len(table) == 1 else value
 
 
-def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> Table:
-    """A layer for `merge_scene` from `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings.
+def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[Table, dict[Key, Any]]:
+    """A layer for `merge_scene` from `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings; and
+    for `set_item` the overrides that name an item: `targets[0].translation[2]`, `medium.layers[1].extinction`.
 
     Raises `ConfigError`.
     """
@@ -178,13 +179,37 @@ def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> Table:
     else:
         raise ConfigError(f"overrides = {shown(overrides)} are neither a dict nor texts such as 'section.field=value'")
     layer: Table = {}
+    items: dict[Key, Any] = {}
     for key, value in pairs:
+        if any(isinstance(part, int) for part in key[2:]):
+            items[key] = value
+            continue
         for leaf, leaf_value in _leaves(key, value):
             _insert(layer, leaf, leaf_value)
-    return {
+    current = {
         section: fields if section == "targets" or not isinstance(fields, Mapping) else current_fields(section, fields)
         for section, fields in layer.items()
     }
+    return current, items
+
+
+def set_item(place: Any, key: Key, value: Any, *, done: Key = ()) -> Any:
+    """A scene's complete tables with an item of a list replaced, or a field of a table in a list.
+
+    `done` is the part of the key that leads to `place`. Raises `ConfigError` for an item that is not there.
+    """
+    part, rest, here = key[0], key[1:], (*done, key[0])
+    if isinstance(part, int):
+        if not isinstance(place, list | tuple):
+            raise ConfigError(f"{key_text(here)} does not exist: {key_text(done)} = {shown(place)} is not a list")
+        if part >= len(place):
+            raise ConfigError(f"{key_text(here)} does not exist; {key_text(done)} has {len(place)} values, from 0 on")
+        new = set_item(place[part], rest, value, done=here) if rest else value
+        return [new if index == part else item for index, item in enumerate(place)]
+    if not rest:  # a layer of water
+        return merge_section("medium", place, {part: value}) if isinstance(place, Mapping) else {part: value}
+    inner = place.get(part) if isinstance(place, Mapping) else None
+    return {**(place if isinstance(place, Mapping) else {}), part: set_item(inner, rest, value, done=here)}
 
 
 def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:

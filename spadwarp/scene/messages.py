@@ -46,13 +46,13 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     lines: dict[Key, str] = {}
     problems = error.errors(include_url=False)
     for problem in problems[:_MOST]:
-        key, info = _locate(model, problem["loc"])
+        key, info = locate(model, problem["loc"])
         lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
     return [*dict.fromkeys(lines.values()), *more]  # a list that is too short misses each item
 
 
-def _locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, FieldInfo | None]:
+def locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, FieldInfo | None]:
     """The part of `loc` that names a field or a list's item, without pydantic's branch names, and the field."""
     key: list[str | int] = []
     info: FieldInfo | None = None

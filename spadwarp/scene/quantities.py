@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from spadwarp.units import UNITS, quantity
 
-__all__ = ["field_unit", "in_field_unit", "with_units"]
+__all__ = ["field_unit", "in_field_unit", "takes_integers", "with_units"]
 
 _NUMBER = re.compile(r"\s*[+-]?\.?\d")
 
@@ -26,6 +26,12 @@ def field_unit(info: FieldInfo) -> str | None:
         return None
     bracketed = re.findall(r"\[([^\]]+)\]", info.description or "")
     return next((unit for unit in bracketed if unit in UNITS), None if bracketed else "1")
+
+
+def takes_integers(info: FieldInfo) -> bool:
+    """Whether a field's numbers are whole."""
+    types = _types(info.annotation)
+    return int in types and float not in types
 
 
 def _types(annotation: Any) -> set[Any]:

@@ -142,9 +142,10 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     """Read a scene file.
 
     `overrides` lie over the file: `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings, None
-    for a field's default. A medium is given by two coefficients; overriding one keeps another: extinction keeps the
-    albedo, albedo the extinction, absorption the scattering, scattering the absorption; overriding two replaces both.
-    Relative paths start at the file's folder, those in overrides at the working directory.
+    for a field's default; `"targets[0].translation[2]=9"` sets one item of a list. A medium is given by two
+    coefficients; overriding one keeps another: extinction keeps the albedo, albedo the extinction, absorption the
+    scattering, scattering the absorption; overriding two replaces both. Relative paths start at the file's folder,
+    those in overrides at the working directory.
     Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
     """
     return _build(read_toml(path), overrides=overrides, source=path)
@@ -159,13 +160,16 @@ def _build(
 ) -> Scene:
     name = None if source is None else str(source)
     layer: dict[str, Any] = {}
+    items: dict[load.Key, Any] = {}
     try:
         if source is not None and resolve:
             tables = _with_paths(tables, Path(source).absolute().parent)
         if overrides:
-            layer = load.override_layer(overrides)
+            layer, items = load.override_layer(overrides)
             tables = load.merge_scene(_with_units(tables), _with_paths(_with_units(layer), Path.cwd()))
         scene = Scene.model_validate(tables)
+        for key, value in items.items():  # of lists that may be defaults
+            scene = Scene.model_validate(load.set_item(scene.to_dict(), key, value))
     except ConfigError as error:
         raise ConfigError(error.problems, source=name) from None
     except ValidationError as error:

@@ -101,6 +101,33 @@ def test_what_cannot_be_varied(text):
         parse_vary(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("targets[0].translation[2]=5:15:3", [5.0, 10.0, 15.0]),
+        ("gate.bins=10:100:4:log", [10, 22, 46, 100]),
+        ("camera.width=1:3:5", [1, 2, 3]),
+        ("laser.pulse_energy=1 nJ:1 µJ:4:log", [1e-9, 1e-8, 1e-7, 1e-6]),
+        ("laser.pulse_energy=1 nJ,20 nJ", [1e-9, 20e-9]),
+        ("gate.bin_width_ps=0.05 ns:100:2", [50.0, 100.0]),
+    ],
+)
+def test_items_whole_numbers_and_units_can_be_varied(text, values):
+    assert parse_vary(text)[1] == pytest.approx(values)
+    assert all(type(one) is type(value) for one, value in zip(parse_vary(text)[1], values, strict=True))
+
+
+def test_a_unit_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match="'1 ns' is a time; an energy is needed"):
+        parse_vary("laser.pulse_energy=1 ns:2 nJ:3")
+
+
+def test_a_sweep_over_an_item_moves_the_target():
+    plane = {"builtin": "plane", "size": [9, 9], "translation": [0, 0, 2]}
+    rows = sweep(SCENE.with_overrides(targets=[plane]), vary="targets[0].translation[2]=2:4:3").rows
+    assert [row.range for row in rows] == pytest.approx([2.0, 3.0, 4.0], rel=0.2)
+
+
 def test_a_sweep_follows_the_lidar_equation():
     """S falls as e^{−2cR} with the extinction and rises with the pulse energy; the field may be any of the scene."""
     curves = sweep(SCENE, vary="medium.extinction=0.1:1.1:3")

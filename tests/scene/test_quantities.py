@@ -165,3 +165,41 @@ def test_one_energy_is_given(fields, words):
     with pytest.raises(spadwarp.ConfigError) as error:
         Scene.from_dict({**make_scene().to_dict(), "laser": fields})
     assert words.replace("(0.0", "(0") in str(error.value).replace("(0.0", "(0")
+
+
+# One item of a list
+
+
+def test_an_item_of_a_list_can_be_set():
+    scene = make_scene(medium={"layers": [{"start": 2.0, "extinction": 1.0, "albedo": 0.5}]})
+    changed = scene.with_overrides(
+        {"targets[0].translation[2]": "90 cm", "laser.position[1]": 0.2, "medium.layers[0].extinction": 2.0}
+    )
+    assert changed.targets[0].translation == (*scene.targets[0].translation[:2], 0.9)
+    assert changed.laser.position == (-0.1, 0.2, 0.0)
+    layer = changed.medium.layers[0]
+    assert (layer.extinction, layer.albedo, layer.start) == (2.0, 0.5, 2.0)  # overriding one keeps the albedo
+
+
+def test_an_item_of_a_default_can_be_set_in_a_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(make_scene().to_toml().replace("rotation_deg", "# rotation_deg"))
+    assert spadwarp.load_scene(path, ["targets[0].rotation_deg[1]=30"]).targets[0].rotation_deg == (0.0, 30.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        (
+            "targets[0].translation[3]=9",
+            "targets[0].translation[3] does not exist; targets[0].translation has 3 values",
+        ),
+        ("targets[4].translation[0]=9", "targets[4] does not exist"),
+        ("medium.layers[0].extinction=1", "medium.layers = None is not a list"),
+        ("laser.pulse_energy[0]=1", "laser.pulse_energy = 3.75e-08 is not a list"),
+        ("targets[0].translation[0]=5 ps", "holds '5 ps', which is a time"),
+    ],
+)
+def test_an_item_that_is_not_there_is_told(override, words):
+    with pytest.raises(spadwarp.ConfigError, match=re.escape(words)):
+        make_scene().with_overrides([override])
