@@ -280,7 +280,8 @@ def commands() -> str:
     parts = [
         MADE + "# Command line\n\n"
         "Every command has a twin in [Python](python.md). stdout is for the answer, stderr for progress, warnings and "
-        "errors. Exit codes: 0 done, 1 failed, 2 wrong use or a scene that is not valid, 130 interrupted."
+        "errors. Exit codes: 0 done, 1 failed, 2 wrong use or a scene that is not valid, 130 interrupted, "
+        "70 a bug of spadwarp."
     ]
     parts += _help(group, "spadwarp")
     return "\n\n".join(parts) + "\n"

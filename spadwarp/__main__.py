@@ -1,5 +1,26 @@
-"""`python -m spadwarp` is the `spadwarp` command."""
+"""The `spadwarp` command, also as `python -m spadwarp`."""
 
-from spadwarp.cli import main
+import os
+import sys
 
-main()
+from spadwarp.errors import address_space, in_words
+
+
+def main() -> None:
+    """Loads the commands and runs one. What goes wrong while they are loaded ends with a sentence too."""
+    if address_space() is not None:
+        # OpenBLAS reserves memory for a thread a core, and waits for ever for what the limit keeps from it.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        from spadwarp.cli import app
+
+        app(prog_name="spadwarp")
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except (MemoryError, ImportError, OSError) as error:
+        sys.exit(f"error: {in_words(error)}")
+
+
+if __name__ == "__main__":
+    main()

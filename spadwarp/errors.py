@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"]
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+__all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError", "in_words"]
 
 
 class SpadwarpError(Exception):
@@ -54,3 +60,51 @@ def kernel_errors() -> Iterator[None]:
         yield
     except sk.ArgumentError as error:
         raise ArgumentError(str(error)) from error
+
+
+# What the loader and threads say when memory is short, which Python then reports as another error.
+_SHORT_OF_MEMORY = ("memory", "map segment", "start new thread", "bad_alloc")
+
+
+def in_words(error: BaseException) -> str | None:
+    """A sentence for an error that spadwarp did not raise but can foresee; None for any other, which is a bug.
+
+    Foreseen are those of the system (files, memory, threads), text that is not Unicode, and input that is nested too
+    deeply.
+    """
+    short = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+    if short or (isinstance(error, OSError | ImportError | RuntimeError) and _names_memory(error)):
+        return f"not enough memory{_limit_of_memory()}" + (f": {_one_line(error)}" if str(error) else "")
+    if isinstance(error, OSError) and error.strerror:
+        names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        return f"{names}: {error.strerror}" if names else error.strerror
+    if isinstance(error, UnicodeError):
+        return f"text that cannot be read or written: {_one_line(error)}"
+    if isinstance(error, RecursionError):
+        return "the input is nested too deeply"
+    if isinstance(error, ImportError):
+        return f"a package cannot be loaded, see `spadwarp doctor`: {_one_line(error)}"
+    return None if error.__cause__ is None else in_words(error.__cause__)
+
+
+def _names_memory(error: BaseException) -> bool:
+    text = str(error).lower()
+    return any(words in text for words in _SHORT_OF_MEMORY)
+
+
+def _limit_of_memory() -> str:
+    """The limit of this process where it has one, such as of `ulimit -v`."""
+    limit = address_space()
+    return "" if limit is None else f" (this process may use {limit / 2**30:.3g} GiB, see ulimit -v)"
+
+
+def address_space() -> int | None:
+    """Bytes that this process may map, such as `ulimit -v` sets; None without a limit."""
+    if resource is None:
+        return None
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -29,6 +29,6 @@ from spadwarp.cli import (  # noqa: F401  in the order of the help
     bench,
     doctor,
 )
-from spadwarp.cli._app import app, main
+from spadwarp.cli._app import app
 
-__all__ = ["app", "main"]
+__all__ = ["app"]

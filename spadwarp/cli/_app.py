@@ -1,21 +1,28 @@
 """The application to which all commands belong: messages in case of errors, and the exit codes.
 
-0 done, 1 failed, 2 wrong use (options, or a scene that is not valid), 130 interrupted.
+0 done, 1 failed, 2 wrong use (options, or a scene that is not valid), 70 a bug of spadwarp, 130 interrupted.
 """
 
 from __future__ import annotations
 
+import io
+import os
+import platform
+import shlex
+import sys
+import tempfile
+import traceback
 import warnings
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any, NoReturn, TypeVar
 
 import typer
 from typer.core import TyperGroup
 
 import spadwarp
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, in_words
 
-FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
 
 _resources = ExitStack()  # of the command that runs
@@ -23,19 +30,62 @@ Value = TypeVar("Value")
 
 
 class _Commands(TyperGroup):
-    """Errors of spadwarp end a command without a traceback; warnings are one line."""
+    """Errors end a command with a sentence, never with a traceback; warnings are one line."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a terminal may lack some of our letters; "?" stands for them
+                stream.reconfigure(errors="replace")
+        try:
+            return super().main(*args, **options)
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename is None and sys.stdout is sys.__stdout__:
+                sys.stdout = io.StringIO()  # Python would else try to write to it again
+            with suppress(OSError):
+                _complain_about(error)
+            sys.exit(_exit_code(error))
 
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), _resources:
             warnings.showwarning = _show_warning
             try:
-                return super().invoke(ctx)
-            except SpadwarpError as error:
-                fail(str(error), WRONG_USE if isinstance(error, ConfigError | ArgumentError) else FAILED)
-            except MemoryError as error:
-                fail(f"not enough memory: {error}")
+                answer = super().invoke(ctx)
+                if sys.stdout is not None:  # as in `spadwarp info out/ >&-`
+                    sys.stdout.flush()  # a full disk shows here, not when Python ends
+                return answer
             except KeyboardInterrupt:
                 fail("interrupted; unfinished files were not written", INTERRUPTED)
+
+
+def _exit_code(error: Exception) -> int:
+    if isinstance(error, ConfigError | ArgumentError):
+        return WRONG_USE
+    return FAILED if isinstance(error, SpadwarpError) or in_words(error) is not None else BUG
+
+
+def _complain_about(error: Exception) -> None:
+    text = str(error) if isinstance(error, SpadwarpError) else in_words(error)
+    if text is None:
+        what = traceback.format_exception_only(error)[-1].strip()
+        text = f"spadwarp has a bug: {what[:300]}\nplease report it with {_kept(error)}"
+    complain("\n".join(f"error: {line}" for line in text.splitlines()))
+
+
+def _kept(error: Exception) -> str:
+    """The file of the traceback; the traceback itself where no file can be written."""
+    lines = (
+        f"spadwarp {spadwarp.__version__}, Python {platform.python_version()}, {platform.platform()}",
+        shlex.join(sys.argv),
+        "".join(traceback.format_exception(error)),
+    )
+    text = "\n".join(lines)
+    try:
+        handle, path = tempfile.mkstemp(prefix="spadwarp-bug-", suffix=".txt")
+        with os.fdopen(handle, "w", encoding="utf-8", errors="replace") as file:
+            file.write(text)
+    except OSError:
+        return f"this:\n{text}"
+    return f"{path}, which says where it happened"
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -91,8 +141,3 @@ def _options(
       spadwarp simulate configs/scenes/staircase_15m.toml --out out/
       spadwarp info out/result.h5
     """
-
-
-def main() -> None:
-    """The `spadwarp` command."""
-    app(prog_name="spadwarp")

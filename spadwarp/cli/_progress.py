@@ -20,7 +20,7 @@ def progress(*, quiet: bool, unit: str = "photons") -> Iterator[Report | None]:
     """What `spadwarp.simulate` takes as `progress`; None where nothing is to be said."""
     if quiet:
         yield None
-    elif sys.stderr.isatty():
+    elif sys.stderr is not None and sys.stderr.isatty():
         with _bar(unit) as report:
             yield report
     else:

@@ -75,7 +75,7 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
     """
     try:
         from bmnd import BM3DProfile, bmnd
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise SpadwarpError("bm3d needs the package bmnd: pip install 'spadwarp[bm3d]'") from error
 
     start, stop = frames.gate

@@ -238,7 +238,7 @@ def require_torch() -> Any:
     try:
         import safetensors  # noqa: F401
         import torch
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise SpadwarpError(f"denoising needs {error.name}: pip install 'spadwarp[denoise]'") from error
     return torch
 

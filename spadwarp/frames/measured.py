@@ -78,7 +78,7 @@ def read_histograms(path: str | Path, *, variable: str | None = None) -> Histogr
         read = readers[path.suffix.lower()](path)
     except SpadwarpError:
         raise
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise FileError(f"{path}: reading it needs {error.name}: pip install 'spadwarp[formats]'") from error
     except Exception as error:  # what a reader raises depends on the format
         raise FileError(f"{path}: damaged or not readable: {error}") from error

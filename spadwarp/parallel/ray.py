@@ -111,7 +111,7 @@ class RayWorkers:
     def __enter__(self) -> RayWorkers:
         try:
             import ray
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise ConfigError("engine = Ray needs the package ray: pip install 'spadwarp[ray]'") from error
         self._ray = ray
         self._started = not ray.is_initialized()

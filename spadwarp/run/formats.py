@@ -73,7 +73,7 @@ def export(
                 return [(write_npy if ending == ".npy" else write_ptu)(opened, path, chosen)]
             write = write_mat if ending == ".mat" else write_exr_frame
             return [write(opened, name, number) for number, name in zip(chosen, _numbered(path, chosen), strict=True)]
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise FileError(f"{path}: writing it needs {error.name}: pip install 'spadwarp[formats]'") from error
 
 

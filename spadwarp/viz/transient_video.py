@@ -148,7 +148,7 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
     if program is None:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise FileError("an MP4 needs ffmpeg: pip install 'spadwarp[video]', or write a .gif") from error
         program = get_ffmpeg_exe()
     first = next(pictures)

@@ -90,7 +90,7 @@ def view(
     """
     try:
         from plotly.offline import get_plotlyjs
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
     run = load_run(source)
     page = _of_frames(run, method, frame) if isinstance(run, FramesFile) else _of_result(run, method, device)
