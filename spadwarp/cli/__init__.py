@@ -3,7 +3,10 @@
 Commands use the public API only, and load what is heavy when they run: `spadwarp --help` answers at once.
 """
 
-from spadwarp.cli import (  # noqa: F401  in the order of the help
+from spadwarp.cli import (  # noqa: F401
+    init,
+    examples,
+    schema,
     simulate,
     detect,
     depth,

@@ -29,8 +29,20 @@ _resources = ExitStack()  # of the command that runs
 Value = TypeVar("Value")
 
 
+# Commands by stage of work, in the order of the help.
+STAGES = {
+    "Begin": ("init", "examples", "schema", "doctor", "devices"),
+    "Plan": ("check", "plan", "budget", "sweep", "water", "presets", "targets"),
+    "Simulate": ("simulate", "merge", "analytic"),
+    "Counts and depth": ("detect", "depth", "denoise"),
+    "Look at results": ("info", "view", "video", "export"),
+    "Datasets and training": ("dataset", "train", "evaluate"),
+    "Trust and speed": ("validate", "bench"),
+}
+
+
 class _Commands(TyperGroup):
-    """Errors end a command with a sentence, never with a traceback; warnings are one line."""
+    """Errors end a command with a sentence, never with a traceback; warnings are one line; help by stage of work."""
 
     def main(self, *args: Any, **options: Any) -> Any:
         for stream in (sys.stdout, sys.stderr):
@@ -44,6 +56,19 @@ class _Commands(TyperGroup):
             with suppress(OSError):
                 _complain_about(error)
             sys.exit(_exit_code(error))
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """In the order of the help."""
+        ordered = [name for names in STAGES.values() for name in names if name in self.commands]
+        return ordered + [name for name in self.commands if name not in ordered]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """A heading for each stage, and the whole first sentence of each command."""
+        width = max(map(len, self.commands))
+        for stage, names in STAGES.items():
+            with formatter.section(stage):
+                rows = [(f"{name:<{width}}", self.commands[name].get_short_help_str(limit=200)) for name in names]
+                formatter.write_dl(rows)
 
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), _resources:
@@ -117,7 +142,7 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -137,7 +162,7 @@ def _options(
     """Monte Carlo photon transport for single-photon (SPAD) imaging in scattering water.
 
     \b
-    Example:
-      spadwarp simulate configs/scenes/staircase_15m.toml --out out/
+    Examples:
+      spadwarp simulate staircase_15m --out out/
       spadwarp info out/result.h5
     """

@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from spadwarp.errors import ConfigError
+from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
@@ -303,7 +304,11 @@ class Recipe(_Table):
 
 
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:
-    """Reads a recipe. Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it."""
+    """Reads a recipe, or by a bare name one of the package's, such as "small".
+
+    Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
+    """
+    path = example_or_path(path, "datasets")
     return Recipe.from_dict(read_toml(path), source=path)
 
 

@@ -11,6 +11,7 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from spadwarp.errors import ConfigError
+from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
 from spadwarp.scene.messages import describe
 
@@ -127,10 +128,11 @@ class TrainingRecipe(_Table):
 
 
 def load_training_recipe(path: str | os.PathLike[str], *, overrides: Mapping[str, Any] | None = None) -> TrainingRecipe:
-    """Reads a recipe; `overrides` are tables that replace the file's values.
+    """Reads a recipe, or by a bare name one of the package's; `overrides` are tables that replace the file's values.
 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
+    path = example_or_path(path, "training")
     tables = read_toml(path)
     for name, value in (overrides or {}).items():
         inner = tables.get(name)

@@ -12,15 +12,18 @@ from spadwarp.run.directory import (
     write_run,
 )
 from spadwarp.run.formats import FORMATS, export
+from spadwarp.run.schema import SCHEMAS, json_schema
 from spadwarp.run.sources import open_source
 
 __all__ = [
     "CHECKPOINT",
     "FORMATS",
     "RUN_FILES",
+    "SCHEMAS",
     "RunFiles",
     "bytes_needed",
     "export",
+    "json_schema",
     "load_resumable",
     "open_source",
     "remove_checkpoint",

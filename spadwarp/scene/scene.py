@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
 from spadwarp.errors import ConfigError
+from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
@@ -139,7 +141,7 @@ class Scene(BaseModel):
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Scene:
-    """Read a scene file.
+    """Read a scene file, or by a bare name a scene that comes with the package: `load_scene("staircase_5m")`.
 
     `overrides` lie over the file: `["medium.extinction=0.9"]`, `{"medium.extinction": 0.9}` or nested mappings, None
     for a field's default; `"targets[0].translation[2]=9"` sets one item of a list. A medium is given by two
@@ -148,7 +150,13 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     those in overrides at the working directory.
     Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
     """
+    path = example_or_path(path, "scenes")
     return _build(read_toml(path), overrides=overrides, source=path)
+
+
+def template() -> str:
+    """The text of a commented scene to start from."""
+    return (files("spadwarp.scene") / "template.toml").read_text(encoding="utf-8")
 
 
 def _build(

@@ -1,0 +1,154 @@
+"""First steps: a scene to start from, examples by name, JSON Schema for editors, help by stage of work."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+import typer.main
+
+import spadwarp
+from helpers.cli import DEVICE, ROOT, run, tables
+from helpers.scenes import scene as make_scene
+from spadwarp.cli import app
+from spadwarp.cli._app import STAGES
+from spadwarp.dataset import load_recipe
+from spadwarp.denoise import load_training_recipe
+from spadwarp.run import SCHEMAS, json_schema
+
+
+def test_init_writes_a_scene_that_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    printed = run("init", "mine").stdout
+    assert "written: mine.toml" in printed and "spadwarp plan mine.toml" in Path("mine.toml").read_text()
+    scene = spadwarp.load_scene("mine.toml")
+    assert [str(one) for one in spadwarp.check(scene) if one.level == "warning"] == []
+    assert "mine.toml exists; --overwrite" in run("init", "mine", code=2).stderr
+    run("init", "mine", "--example", "harbour_5m", "--overwrite")
+    assert spadwarp.load_scene("mine.toml") == spadwarp.load_scene("harbour_5m")
+    assert "staircase_5m" in run("init", "other", "--example", "staircase_6m", code=1).stderr
+
+
+def test_every_choice_in_the_template_is_valid():
+    """A commented field, taken alone, makes a valid scene or displaces the ones that it stands for."""
+    text = spadwarp.scene.template()
+    section, taken = "", 0
+    for line in text.splitlines():
+        section = line.split("]")[0].strip("[") if line.startswith("[") else section
+        if line.startswith("# ") and " = " in line and section:
+            fields = tomllib.loads(line[2:])
+            if section == "medium":
+                fields = fields | ({"albedo": 0.7} if "extinction" in fields else {})
+            key = "targets[0]" if section == "targets" else section
+            spadwarp.Scene.from_dict(tomllib.loads(text)).with_overrides({key: fields})
+            taken += 1
+    assert taken >= 4
+
+
+def test_examples_go_by_name(tmp_path):
+    printed = run("examples", "--json", tmp_path / "printed.json").stdout
+    known = tables(tmp_path / "printed.json")
+    assert {path.stem for path in (ROOT / "configs" / "scenes").glob("*.toml")} == set(known["scenes"])
+    assert all(name in printed for names in known.values() for name in names)
+    assert run("examples", "plane_5m").stdout.startswith("# A grey wall")
+    assert "'nothing'" in run("examples", "nothing", code=2).stderr
+    assert spadwarp.load_scene("plane_5m") == spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml")
+    assert load_recipe("small").name == "spadwarp small" and load_training_recipe("usdn").model == "usdn"
+    small = ("--set", "camera.width=4", "--set", "camera.height=4", "--set", "output.png=false", "--photons", 1000)
+    run("simulate", "plane_5m", "--out", tmp_path / "out", *small, *DEVICE)
+    assert "did you mean 'plane_5m'?" in run("check", "plane_6m", code=1).stderr
+
+
+def test_a_file_comes_before_an_example(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("plane_5m").write_text(make_scene().to_toml())
+    assert spadwarp.load_scene("plane_5m") == make_scene()
+
+
+# JSON Schema
+
+
+def validator(kind):
+    schema = json.loads(json.dumps(json_schema(kind), allow_nan=False))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+FOLDERS = {"scene": "scenes", "dataset": "datasets", "training": "training"}
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_all_configurations_fit_their_schema(kind):
+    texts = [path.read_text() for path in (ROOT / "configs" / FOLDERS[kind]).glob("*.toml")]
+    texts += [spadwarp.scene.template(), make_scene().to_toml()] if kind == "scene" else []
+    assert texts
+    for text in texts:
+        validator(kind).validate(tomllib.loads(text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'laser.pulse_energy = "150 nJ"',
+        'targets = [{builtin = "staircase", translation = [0, "20 cm", 5], scale = 0.5}]',
+        'medium = {preset = "uwoc-clear", group_index = "fresh"}',
+        'medium = {extinction = 1.0, albedo = "lu2024"}',
+        "domain = {shape = 'slab', lower = -1.0}",
+        "camera.focus_distance = inf",
+        "medium.layers = [{start = 1.0, preset = 'uwoc-clear'}]",
+    ],
+)
+def test_what_a_scene_takes_fits(text):
+    validator("scene").validate(tomllib.loads(text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "laser.pulse_energy = -1.0",
+        "laser.puls_energy = 1.0",
+        'laser.pulse_energy = "many"',
+        'medium.preset = "uwoc-cleer"',
+        'targets = [{builtin = "stairs"}]',
+        'transport.estimator = "guess"',
+        "gate.bins = 1.5",
+    ],
+)
+def test_what_a_scene_refuses_does_not_fit(text):
+    with pytest.raises(jsonschema.ValidationError):
+        validator("scene").validate(tomllib.loads(text))
+
+
+def test_every_field_is_described():
+    for kind in SCHEMAS:
+        for table in json_schema(kind)["$defs"].values():
+            for name, field in table.get("properties", {}).items():
+                if name != "weight_decay":
+                    assert field.get("description"), (kind, name)
+
+
+def test_schema_tells_editors_where_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    printed = run("schema", "scene").stdout
+    assert "#:schema ./scene.schema.json" in printed and "even-better-toml" in printed
+    assert tables("scene.schema.json") == json.loads(json.dumps(json_schema("scene")))
+    with pytest.raises(spadwarp.ArgumentError, match="'film' is not one of 'scene'"):
+        json_schema("film")
+
+
+# Help
+
+
+def test_help_shows_every_command_once_by_stage_and_in_full():
+    commands = typer.main.get_command(app).commands
+    assert sorted(name for names in STAGES.values() for name in names) == sorted(commands)
+    printed = run("--help").stdout
+    assert printed.count("...") == 1 and all(f"\n{stage}:\n" in printed for stage in STAGES)
+    joined = " ".join(printed.split())
+    for name, command in commands.items():
+        assert f"{name} {command.get_short_help_str(limit=200)}" in joined
+
+
+def test_completion_can_be_installed():
+    assert "--install-completion" in run("--help").stdout
