@@ -256,7 +256,7 @@ def dataset() -> str:
     plan = Plan(spadwarp.dataset.load_recipe(FOLDER.parents[1] / "configs" / "datasets" / "small.toml"))
     scenes = {
         name: (unit, f"{text}; {np.dtype(kind)}" + (f" `{list(shape)}` a scene" if shape else ""))
-        for name, (shape, kind, unit, text) in scene_columns(plan).items()
+        for name, (shape, kind, unit, text) in scene_columns(plan.shape).items()
     }
     parts = [
         MADE

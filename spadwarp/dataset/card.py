@@ -26,7 +26,7 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
         f"| {name} | {', '.join(split['targets'])} | {split['frames']} | {split['seed']} |"
         for name, split in used.items()
     ]
-    columns = {name: (unit, text) for name, (_, _, unit, text) in scene_columns(plan).items()}
+    columns = {name: (unit, text) for name, (_, _, unit, text) in scene_columns(plan.shape).items()}
     tables = [
         *_table("`frames-*.h5`", "One row for each frame.", FRAME_COLUMNS),
         *_table("`scenes.h5`", "One row for each scene. It refers to the files in `scenes/` beside it.", columns),

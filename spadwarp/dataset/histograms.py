@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from spadwarp.dataset.rendered import RenderedScene
 from spadwarp.dataset.schema import HISTOGRAM_COLUMNS, PACKED, describe
+from spadwarp.errors import FileError
+from spadwarp.io.hdf5_file import Hdf5File
 
 __all__ = ["HistogramFile", "HistogramWriter"]
 
+_COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
 _KINDS = {"scene": np.int32, "gate_start": np.float64, "bin_width": np.float64, "sample": np.int64}
 
 
@@ -80,28 +83,42 @@ class HistogramWriter:
 class HistogramFile:
     """The histograms of an open file, by scene index and by sample id."""
 
-    def __init__(self, file: Any) -> None:
-        self._file = file
+    def __init__(self, file: Hdf5File, shape: tuple[int, int]) -> None:
         self._scenes, self._samples = (
-            {int(number): row for row, number in enumerate(file[name][...])} for name in ("scene", "sample")
+            {int(number): row for row, number in enumerate(file.array(name, _KINDS[name], (None,)))}
+            for name in ("scene", "sample")
         )
-        self._starts = file["event_start"][...] if "event_start" in file else None
-        self.shape: tuple[int, ...] = file["expected"].shape[1:]
+        scenes, samples = len(file.stored("scene", np.int32, (None,))), len(file.stored("sample", np.int64, (None,)))
+        self._expected = file.stored("expected", np.float16, (scenes, *shape, None))
+        self.shape: tuple[int, ...] = self._expected.shape[1:]
+        self._counts = file.stored("counts", _COUNTS, (samples, *self.shape)) if "counts" in file else None
+        self._starts: NDArray[np.int64] | None = None
+        if "event_start" in file:
+            self._starts = file.array("event_start", np.int64, (samples + 1,))
+            self._index = file.stored("event_index", np.uint32, (None,))
+            self._events = file.stored("event_count", _COUNTS, (len(self._index),))
+            if self._starts[0] != 0 or self._starts[-1] != len(self._index) or (np.diff(self._starts) < 0).any():
+                file.refuse("event_start", f"does not divide {len(self._index)} events")
+        self._path = file.path
 
     def expected(self, scene: int) -> NDArray[np.float32] | None:
         """Expected counts of a frame `[H, W, T]`; None for a scene that was not traced."""
         row = self._scenes.get(scene)
-        return None if row is None else self._file["expected"][row].astype(np.float32)
+        return None if row is None else self._expected[row].astype(np.float32)
 
     def counts(self, sample: int) -> NDArray[np.float32] | None:
         """Counts `[H, W, T]` of a frame; None where there are none."""
         row = self._samples.get(sample)
-        if row is None or (self._starts is None and "counts" not in self._file):
+        if row is None or (self._starts is None and self._counts is None):
             return None
         if self._starts is None:
-            return self._file["counts"][row].astype(np.float32)
+            assert self._counts is not None
+            return self._counts[row].astype(np.float32)
         part = slice(int(self._starts[row]), int(self._starts[row + 1]))
-        return _cube(self._file["event_index"][part], self._file["event_count"][part], self.shape, np.float32)
+        index = self._index[part]
+        if index.size and index.max() >= math.prod(self.shape):
+            raise FileError(f"{self._path}: event_index is outside the histograms {self.shape} in row {row}")
+        return _cube(index, self._events[part], self.shape, np.float32)
 
 
 def _cube(index: NDArray[Any], counts: NDArray[Any], shape: tuple[int, ...], kind: Any) -> NDArray[Any]:

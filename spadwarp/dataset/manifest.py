@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
 from spadwarp.dataset.card import card
 from spadwarp.dataset.recipe import SPLITS, load_recipe
@@ -16,28 +17,93 @@ from spadwarp.dataset.schema import FORMAT_VERSION
 from spadwarp.dataset.shards import checksum, write_scene_index
 from spadwarp.device import core_count
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.text import write_json
+from spadwarp.io.parsing import parse_json, read_text
+from spadwarp.io.paths import file_problem
+from spadwarp.io.text import write_json, write_text
+from spadwarp.limits import shown
 
 __all__ = ["check_shards", "finish", "read_manifest", "record_path", "verify_dataset"]
+
+
+_LARGEST_MANIFEST = 1 << 28  # bytes; a shard takes 400
+
+# Names of files in a dataset's folder: nothing else is opened, whatever a manifest says.
+_FileName = Annotated[str, StringConstraints(pattern=r"^(scenes\.h5|(frames|histograms|scenes/scenes)-\d+\.h5)$")]
+_ShardName = Annotated[str, StringConstraints(pattern=r"^frames-\d+\.h5$")]
+_Count = Annotated[int, Field(ge=0, lt=2**31)]
+_Real = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class _File(_Strict):
+    bytes: Annotated[int, Field(ge=0)]
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Split(_Strict):
+    seed: str
+    targets: list[str]
+    shards: list[_ShardName]
+    frames: _Count
+
+
+class _Splits(_Strict):
+    train: _Split
+    validation: _Split
+    test: _Split
+
+
+class _Manifest(_Strict):
+    name: str
+    version: str
+    seed: str
+    frames: _Count
+    scenes: _Count
+    frames_per_scene: _Count
+    height: Annotated[int, Field(ge=1, lt=2**16)]
+    width: Annotated[int, Field(ge=1, lt=2**16)]
+    depth_step: Annotated[_Real, Field(gt=0)]
+    depth_offset: _Real
+    targets: list[str]
+    splits: _Splits
+    files: dict[_FileName, _File]
+
+
+_RECORD = TypeAdapter(dict[_FileName, _File])
 
 
 def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """The manifest of a dataset. Raises `FileError`."""
     path = Path(folder) / "manifest.json"
+    if file_problem(path) == "no such file":
+        if file_problem(path.parent / "recipe.toml") is None:
+            raise FileError(f"{folder}: not finished; `spadwarp dataset make` makes the missing shards")
+        raise FileError(f"{folder}: no dataset there (no manifest.json)")
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        if (path.parent / "recipe.toml").is_file():
-            raise FileError(f"{folder}: not finished; `spadwarp dataset make` makes the missing shards") from None
-        raise FileError(f"{folder}: no dataset there (no manifest.json)") from None
-    except (OSError, ValueError) as error:
+        manifest = parse_json(read_text(path, largest=_LARGEST_MANIFEST))
+    except ValueError as error:
         raise FileError(f"{path}: cannot be read: {error}") from error
-    if manifest.get("format") != "spadwarp dataset":
+    if not isinstance(manifest, dict) or manifest.get("format") != "spadwarp dataset":
         raise FileError(f"{path}: not the manifest of a spadwarp dataset")
-    if manifest["format_version"] > FORMAT_VERSION:
-        raise FileError(f"{path}: format version {manifest['format_version']} is newer than {FORMAT_VERSION}")
+    version = manifest.get("format_version")
+    if not isinstance(version, int):
+        raise FileError(f"{path}: not a whole manifest: format_version = {shown(version)} is no integer")
+    if version > FORMAT_VERSION:
+        raise FileError(f"{path}: format version {version} is newer than {FORMAT_VERSION}")
+    try:
+        _Manifest.model_validate(manifest)
+    except ValidationError as error:
+        raise FileError(f"{path}: not a whole manifest: {_first_problem(error)}") from error
     return manifest
+
+
+def _first_problem(error: ValidationError) -> str:
+    """Where and what: `splits.train.shards: Field required`."""
+    problem = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}"
 
 
 def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
@@ -64,18 +130,29 @@ def record_path(folder: Path, shard: Shard) -> Path:
     return folder / "shards" / f"{shard.name}.json"
 
 
+def _read_record(path: Path) -> dict[str, Any]:
+    """Sizes and checksums of a shard's files by name. Raises `FileError`."""
+    try:
+        record = parse_json(read_text(path))
+        _RECORD.validate_python(record)
+    except ValidationError as error:
+        raise FileError(f"{path}: cannot be read: {_first_problem(error)}") from error
+    except ValueError as error:
+        raise FileError(f"{path}: cannot be read: {error}") from error
+    return record
+
+
 def check_shards(plan: Plan, folder: Path, shards: Sequence[Shard]) -> dict[int, str]:
     """By the shards' indices "" (whole), "missing", or what is wrong."""
 
     def state(shard: Shard) -> str:
         path = record_path(folder, shard)
-        try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-            files = {name: {"bytes": int(file["bytes"]), "sha256": file["sha256"]} for name, file in record.items()}
-        except FileNotFoundError:
+        if file_problem(path) == "no such file":
             return "missing"
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            return f"{path}: cannot be read: {error}"
+        try:
+            files = _read_record(path)
+        except FileError as error:
+            return str(error)
         if set(files) != set(plan.files_of(shard)):
             return f"{path}: not the record of this shard"
         return next((text for name, file in files.items() if (text := _compare(folder, name, file))), "")
@@ -106,16 +183,16 @@ def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
     missing = []
     for shard in plan.shards:
         try:
-            files |= json.loads(record_path(folder, shard).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            files |= _read_record(record_path(folder, shard))
+        except FileError:
             missing.append(shard.frames_file)
     for split in SPLITS:
-        _write_text(folder / f"{split}.txt", "".join(f"{name}\n" for name in _shards_of(plan, split)))
+        write_text("".join(f"{name}\n" for name in _shards_of(plan, split)), folder / f"{split}.txt")
     write_scene_index(plan, folder)
     if not missing:
         files["scenes.h5"] = checksum(folder / "scenes.h5")
         manifest = _manifest(plan, files)
-        _write_text(folder / "README.md", card(plan, manifest))
+        write_text(card(plan, manifest), folder / "README.md")
         write_json(manifest, folder / "manifest.json", indent=1)
     return tuple(missing)
 
@@ -153,8 +230,3 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
         },
         "files": dict(sorted(files.items())),
     }
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.histograms import HistogramFile
 from spadwarp.dataset.manifest import read_manifest
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.dataset.shard_file import ShardFile, frame_count
+from spadwarp.errors import ArgumentError
+from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
 FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", "counts", "expected")
 """Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
-
-_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
 
 
 class FrameReader:
@@ -81,9 +80,9 @@ class FrameReader:
             raise ArgumentError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
         splits = [self.manifest["splits"][name] for name in (SPLITS if split == "all" else (split,))]
         self.shards: list[str] = [shard for described in splits for shard in described["shards"]]
-        self._stops = np.cumsum([_frame_count(self.path / name) for name in self.shards], dtype=np.int64)
-        self._open: dict[int, _Shard] = {}
+        self._open: dict[int, ShardFile] = {}
         self._process = os.getpid()
+        self._stops = np.cumsum([frame_count(self.path, name) for name in self.shards], dtype=np.int64)
 
     def __len__(self) -> int:
         return self.repeats * self.frame_count
@@ -101,10 +100,7 @@ class FrameReader:
         if not -len(self) <= index < len(self):
             raise IndexError(f"index = {index} is outside [{-len(self)}, {len(self)})")
         index %= len(self)
-        frame = index % self.frame_count
-        number = int(np.searchsorted(self._stops, frame, side="right"))
-        shard = self._shard(number)
-        row = frame - (int(self._stops[number - 1]) if number else 0)
+        shard, row = self._row(index % self.frame_count)
         window, turns, mirrored = self._changes(index)
         item: dict[str, Any] = {}
         for name, image in shard.images(row, self.fields, window).items():
@@ -114,6 +110,24 @@ class FrameReader:
         if "normal" in item:
             item["normal"] = _rotated(item["normal"], turns, mirrored)
         return item | shard.numbers(row)
+
+    def scene(self, index: int) -> Scene:
+        """The scene of a frame, given by its index."""
+        shard, row = self._row(index % self.frame_count)
+        return shard.scenes.scene(shard.scene_row(row))
+
+    def scene_numbers(self, name: str) -> NDArray[np.float64]:
+        """A number of each scene by the scene's index, such as "signal"; NaN for scenes of other splits."""
+        values = np.full(self.manifest["scenes"], np.nan)
+        for number in range(len(self.shards)):
+            shard = self._shard(number)
+            values[shard.first_scene : shard.first_scene + shard.scenes.count] = shard.scenes.array(name)
+        return values
+
+    def _row(self, frame: int) -> tuple[ShardFile, int]:
+        """The shard of a frame, and the frame's row in it."""
+        number = int(np.searchsorted(self._stops, frame, side="right"))
+        return self._shard(number), frame - (int(self._stops[number - 1]) if number else 0)
 
     def _changes(self, index: int) -> tuple[tuple[slice, slice], int, bool]:
         """The part of the frame, the rotations by 90°, and whether it is mirrored."""
@@ -135,11 +149,11 @@ class FrameReader:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": {}}
 
-    def _shard(self, number: int) -> _Shard:
+    def _shard(self, number: int) -> ShardFile:
         if self._process != os.getpid():  # files opened before a fork are the parent's
             self._open, self._process = {}, os.getpid()
         if number not in self._open:
-            self._open[number] = _Shard(self.path, self.shards[number])
+            self._open[number] = ShardFile(self.path, self.shards[number], self.manifest)
         return self._open[number]
 
 
@@ -176,114 +190,6 @@ def iterate_dataset(
     if shuffle is not None:
         np.random.Generator(np.random.Philox(shuffle)).shuffle(order)
     return (reader[int(index)] for index in order)
-
-
-class _Shard:
-    """Two or three open files. What is stored without compression is read past HDF5, through a memory map."""
-
-    def __init__(self, folder: Path, name: str) -> None:
-        self.frames = _opened(folder / name)
-        self.scenes = _opened(folder / "scenes" / name.replace("frames-", "scenes-"))
-        cubes = folder / name.replace("frames-", "histograms-")
-        self.histograms = HistogramFile(_opened(cubes)) if cubes.is_file() else None
-        depth = self.frames["depth"]
-        self.step, self.offset = np.float32(depth.attrs["step"]), np.float32(depth.attrs["offset"])
-        self.width: int = depth.shape[2]
-        self.stored = {field: _mapped(self.frames[field]) for field in ("depth", "label", "intensity")}
-        self.scene_images = {field: _mapped(self.scenes[column]) for field, column in _SCENE_FIELDS.items()}
-        self.columns: dict[str, NDArray[Any]] = {
-            column: stored[...] for column, stored in self.frames.items() if stored.ndim == 1
-        }
-        self.gate = np.stack([self.scenes["gate_near"][...], self.scenes["gate_far"][...]], axis=1).astype(np.float32)
-        self.profiles, self.edges = self.scenes["backscatter_profile"][...], self.scenes["profile_edges"][...]
-        self.first_scene = int(self.columns["scene"][0])
-
-    def images(self, row: int, fields: Sequence[str], window: tuple[slice, slice]) -> dict[str, NDArray[np.float32]]:
-        """A frame's images by field, `[C, H, W]` each."""
-        return {name: self._image(name, row, window) for name in fields}
-
-    def numbers(self, row: int) -> dict[str, Any]:
-        """What else an item holds."""
-        whole, real = ("sample", "scene", "target"), ("backscatter_fraction", "attenuation_lengths", "distance")
-        return {
-            **{name: int(self.columns[name][row]) for name in whole},
-            **{name: np.float32(self.columns[name][row]) for name in real},
-            "gate": self.gate[self._scene(row)].copy(),
-        }
-
-    def _scene(self, row: int) -> int:
-        return int(self.columns["scene"][row]) - self.first_scene
-
-    def _image(self, name: str, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
-        image: NDArray[Any]
-        if name in ("counts", "expected"):
-            return np.moveaxis(self._histogram(name, row)[window], -1, 0)
-        if name == "noisy":
-            image = self._noisy(row, window)
-        elif name == "prior":
-            image = self._prior(self._scene(row), self._noisy(row, window))
-        elif name == "label":
-            rows, columns = window
-            image = np.unpackbits(self.stored["label"][row, rows], axis=-1, count=self.width)[:, columns]
-        elif name == "intensity":
-            scale = self.columns["intensity_step"][row]
-            image = np.multiply(self.stored["intensity"][(row, *window)], scale, dtype=np.float32)
-        else:
-            image = np.array(self.scene_images[name][(self._scene(row), *window)])
-        image = image.astype(np.float32, copy=False)
-        return np.moveaxis(image, -1, 0) if name == "normal" else image[None]
-
-    def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
-        cube = None
-        if self.histograms is not None:
-            number = int(self.columns["sample" if name == "counts" else "scene"][row])
-            cube = self.histograms.counts(number) if name == "counts" else self.histograms.expected(number)
-        if cube is None:
-            raise FileError(f"{self.frames.filename}: frame {int(self.columns['sample'][row])} has no {name!r}")
-        return cube
-
-    def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
-        codes = self.stored["depth"][(row, *window)]
-        depth = codes.astype(np.float32)
-        depth *= self.step
-        depth += self.offset
-        np.copyto(depth, np.nan, where=codes == 0)
-        return depth
-
-    def _prior(self, scene: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        edges, profile = self.edges[scene], self.profiles[scene]
-        # Density 0 on both sides of the profile.
-        density = np.concatenate([[0.0], profile, [0.0]]).astype(np.float32)
-        place = (depth - edges[0]) * np.float32(len(profile) / (edges[-1] - edges[0])) + np.float32(1.0)
-        place = np.nan_to_num(np.clip(place, 0.0, np.float32(len(density) - 1)), copy=False)
-        prior = density[place.astype(np.intp)]
-        np.copyto(prior, np.nan, where=np.isnan(depth))
-        return prior
-
-
-def _opened(path: Path) -> Any:
-    import h5py
-
-    try:
-        return h5py.File(path, "r")
-    except FileNotFoundError:
-        raise FileError(f"{path}: no such file; `spadwarp dataset make` makes what is missing") from None
-    except OSError as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
-
-
-def _mapped(stored: Any) -> Any:
-    """A dataset's values without a copy where they lie in one piece, else the dataset itself."""
-    offset = stored.id.get_offset()
-    if offset is None:
-        return stored
-    path, kind = stored.file.filename, stored.dtype
-    return np.memmap(path, dtype=kind, mode="r", offset=offset, shape=stored.shape).view(np.ndarray)
-
-
-def _frame_count(path: Path) -> int:
-    with _opened(path) as file:
-        return int(file["sample"].shape[0])
 
 
 def _rotated(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:

@@ -78,9 +78,12 @@ def describe(file: Any, columns: Mapping[str, tuple[str, str]]) -> None:
         stored.attrs.update({"unit": unit, "description": text})
 
 
-def scene_columns(plan: Plan) -> dict[str, tuple[tuple[int, ...], Any, str, str]]:
-    """Datasets of `scenes.h5`, all with one first dimension: shape of a row, type, unit, meaning."""
-    height, width = plan.shape
+def scene_columns(shape: tuple[int, int]) -> dict[str, tuple[tuple[int, ...], Any, str, str]]:
+    """Datasets of `scenes.h5`, all with one first dimension: shape of a row, type, unit, meaning.
+
+    `shape`: height and width of the images.
+    """
+    height, width = shape
     real: Any = np.float32
     return {
         "depth": ((height, width), real, "m", "true planar depth; NaN where nothing is hit"),

@@ -54,7 +54,7 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
 
     with write_hdf5(folder / "scenes.h5", libver=_LIBRARY) as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
-        for name, (shape, kind, unit, text) in scene_columns(plan).items():
+        for name, (shape, kind, unit, text) in scene_columns(plan.shape).items():
             # The low-level interface, since h5py's own virtual datasets hold the time of day.
             layout = h5p.create(h5p.DATASET_CREATE)
             layout.set_layout(h5d.VIRTUAL)
@@ -112,7 +112,7 @@ def _fill(plan: Plan, shard: Shard, files: list[Any], *, device: str | None, thr
     stored["depth"].attrs.update({"step": plan.depth_step, "offset": plan.depth_offset})
     stored["intensity"].attrs["step"] = 1.0
     rows: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_COLUMNS if name not in stored}
-    table = scene_columns(plan)
+    table = scene_columns(plan.shape)
     records: dict[str, list[Any]] = {name: [] for name in table}
     histograms = None
     if len(files) > 2:

@@ -255,13 +255,10 @@ def _choose(
     data: str | os.PathLike[str], split: str, frames: int
 ) -> tuple[dict[tuple[str, str], list[int]], NDArray[np.float64], str]:
     """Indices of frames by (target, level); signal photons of every scene; what the frames show, as text."""
-    import h5py
-
     reader = FrameReader(data, split, fields=())
     if not len(reader):
         raise FileError(f"{data}: no frames in {split}")
-    with h5py.File(Path(data) / "scenes.h5") as file:
-        photons = file["signal"][...] * file["pulses"][...]
+    photons = reader.scene_numbers("signal") * reader.scene_numbers("pulses")
     chosen: dict[tuple[int, str], list[int]] = {}
     lengths, scenes = [], []
     for index in np.random.Generator(np.random.Philox(0)).permutation(len(reader)):

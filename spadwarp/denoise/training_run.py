@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spadwarp.dataset import read_manifest
+from spadwarp.dataset.shard_file import SceneFile
 from spadwarp.denoise.inference import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError
-from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.viz import draw_learning_curves
 
 if TYPE_CHECKING:
@@ -66,10 +67,12 @@ def read_scenes(folder: str | os.PathLike[str], split: str) -> CleanScenes:
     from spadwarp.denoise.synthetic_noise import CleanScenes
 
     parts: list[list[Any]] = []
-    for name in read_manifest(folder)["splits"][split]["shards"]:
-        with read_hdf5(Path(folder) / "scenes" / name.replace("frames-", "scenes-")) as file:
-            gate = np.stack([file["gate_near"][...], file["gate_far"][...]], axis=1)
-            parts.append([file["depth"][...], file["bound"][...], gate, file["backscatter_profile"][...]])
+    manifest = read_manifest(folder)
+    for name in manifest["splits"][split]["shards"]:
+        scenes = SceneFile(Path(folder), name, (manifest["height"], manifest["width"]))
+        with closing(scenes.file):
+            columns = [scenes.array(column) for column in ("depth", "bound", "backscatter_profile")]
+            parts.append([*columns[:2], scenes.gate(), columns[2]])
     if not parts:
         raise FileError(f"{folder}: the dataset has no scenes for {split}")
     depth, bound, gate, profile = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))

@@ -16,7 +16,7 @@ from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
-from spadwarp.io.parsing import parse_toml
+from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
@@ -82,27 +82,34 @@ class FramesFile:
         with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
             if "sample" in file:
                 raise FileError(f"{path}: a shard of a dataset; name the dataset's folder")
-            metadata, period = file.attrs, float(file.attrs["period"])
-            source = metadata.get("source")
-            if "irf" in file:
-                irf = InstrumentResponse(times=file["irf"][0], values=file["irf"][1])
-            else:
-                irf = InstrumentResponse(sigma=float(metadata["irf_sigma"]), tail=float(metadata["irf_tail"]))
-            cubes = {name: file[name][...] if name in file else None for name in ("expected", "background")}
+            scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
+            edges = file.array("edges", np.float64, (None,))
+            if edges.size < 2 or not (np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
+                file.refuse("edges", "are not two or more ascending times")
+            shape = (scene.camera.height, scene.camera.width, edges.size - 1)
+            period = file.real("period", "(0, inf]")
+            found = file.names("depth")
+            methods = tuple(name for name in METHODS if name in found)
+            if unknown := [name for name in found if name not in METHODS]:
+                file.refuse(f"depth/{unknown[0]}", f"is not by one of {', '.join(METHODS)}")
+            counts = file.stored("counts", np.int32, (None, *shape))
+            for name in methods:
+                file.stored(f"depth/{name}", np.float32, (len(counts), *shape[:2]))
             return cls(
                 path=Path(path),
-                frames=file["counts"].shape[0],
-                pulses=int(metadata["pulses"]),
-                seed=int(metadata["seed"]),
-                gate_start=float(metadata["gate_start"]),
-                bin_width=float(metadata["bin_width"]),
-                edges=file["edges"][...],
+                frames=len(counts),
+                pulses=file.integer("pulses", "[1, 9223372036854775807]"),
+                seed=file.integer("seed"),
+                gate_start=file.real("gate_start"),
+                bin_width=file.real("bin_width", "(0, inf)"),
+                edges=edges,
                 period=period if np.isfinite(period) else None,
-                irf=irf,
-                scene=Scene.from_dict(parse_toml(file["config"].asstr()[()]), source=source or None),
-                truth_depth=file["truth/depth"][...],
-                methods=tuple(file["depth"]),
-                **cubes,
+                irf=_response(file),
+                scene=scene,
+                truth_depth=file.array("truth/depth", np.float32, shape[:2]),
+                methods=methods,
+                expected=_expectation(file, "expected", shape),
+                background=_expectation(file, "background", shape),
             )
 
     @property
@@ -112,21 +119,28 @@ class FramesFile:
 
     def counts(self, frame: int | None = None) -> NDArray[np.int32]:
         """Counts of one frame `[H, W, T]`, or of all `[frames, H, W, T]`."""
-        return self._read("counts", frame)
+        counts = self._read("counts", np.int32, (*self._shape, self.edges.size - 1), frame)
+        if counts.size and counts.min() < 0:
+            raise FileError(f"{self.path}: counts are negative in some bins")
+        return counts
 
     def intensity(self, frame: int | None = None) -> NDArray[np.int64]:
         """Counts over all bins, `[H, W]` or `[frames, H, W]`."""
-        return self._read("intensity", frame)
+        return self._read("intensity", np.int64, self._shape, frame)
 
     def depth(self, method: Method, frame: int | None = None) -> NDArray[np.float32]:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
-        return self._read(f"depth/{method}", frame)
+        return self._read(f"depth/{method}", np.float32, self._shape, frame)
 
-    def _read(self, name: str, frame: int | None) -> NDArray[Any]:
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.scene.camera.height, self.scene.camera.width
+
+    def _read(self, name: str, kind: Any, shape: tuple[int, ...], frame: int | None) -> NDArray[Any]:
         if frame is not None and not 0 <= frame < self.frames:
             raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
         with read_hdf5(self.path, FORMAT) as file:
-            return file[name][... if frame is None else frame]
+            return file.stored(name, kind, (self.frames, *shape))[... if frame is None else frame]
 
     @staticmethod
     @contextmanager
@@ -134,6 +148,24 @@ class FramesFile:
         """A file to write frames to, part by part; at `path` it appears whole or not at all. Raises `FileError`."""
         with write_hdf5(path) as file:
             yield FramesWriter(file)
+
+
+def _response(file: Hdf5File) -> InstrumentResponse:
+    if "irf" in file:
+        times, values = file.array("irf", np.float64, (2, None))
+        return InstrumentResponse(times=times, values=values)
+    return InstrumentResponse(sigma=file.real("irf_sigma", "[0, inf)"), tail=file.real("irf_tail", "[0, inf)"))
+
+
+def _expectation(file: Hdf5File, name: str, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
+    """Expected detections `[H, W, T]`, or `[H, W, 1]`; None where the file has none."""
+    if name not in file:
+        return None
+    one = file.stored(name, np.float32, (*shape[:2], None)).shape[2] == 1 and name == "background"
+    values = file.array(name, np.float32, (*shape[:2], 1) if one else shape)
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        file.refuse(name, "is negative or not finite in some bins")
+    return values
 
 
 class FramesWriter:

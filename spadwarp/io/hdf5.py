@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.io.paths import existing_file
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["hdf5_format", "read_hdf5", "write_hdf5"]
+__all__ = ["hdf5_format", "open_hdf5", "read_hdf5", "write_hdf5"]
 
 
 class _Patient(io.RawIOBase):
@@ -72,7 +73,7 @@ def write_hdf5(path: str | Path, **options: Any) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def read_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Iterator[h5py.File]:
+def read_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Iterator[Hdf5File]:
     """An HDF5 file to read from, for the length of a block that does nothing else.
 
     Args:
@@ -82,25 +83,43 @@ def read_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
 
     Raises:
         FileError: No such file, not HDF5, of another format or a newer version, damaged, or without something that the
-            block looked for (KeyError, ValueError, TypeError, AttributeError, SpadwarpError); says which.
+            block looked for (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, SpadwarpError); says
+            which.
     """
-    import h5py
-
-    hdf5_format(path)
+    file = open_hdf5(path, format, version=version)
     try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format", "unknown")
-            if format not in (None, found):
-                raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}")
-            if version is not None and (newer := int(file.attrs["format_version"])) > version:
-                raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
-            yield file
+        yield file
     except FileError:
         raise
     except (OSError, RuntimeError) as error:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
-    except (KeyError, ValueError, TypeError, AttributeError, SpadwarpError) as error:
-        raise FileError(f"{path}: not a whole {format or 'HDF5 file of this kind'}: {error}") from error
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, SpadwarpError) as error:
+        raise FileError(f"{path}: not a whole {file.kind}: {error}") from error
+    finally:
+        file.close()
+
+
+def open_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Hdf5File:
+    """A file to read from until its `close`; arguments and errors of `read_hdf5`."""
+    import h5py
+
+    existing_file(path)
+    try:
+        opened = h5py.File(path, "r")
+    except (OSError, RuntimeError) as error:
+        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(path) else "not an HDF5 file"
+        raise FileError(f"{path}: {problem}") from error
+    file = Hdf5File(opened, path, format or "HDF5 file of this kind")
+    try:
+        found = file.attribute("format", "unknown")
+        if format is not None and not (isinstance(found, str) and found == format):
+            raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}")
+        if version is not None and (newer := file.integer("format_version")) > version:
+            raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
 def hdf5_format(path: str | Path) -> str | None:
@@ -109,12 +128,6 @@ def hdf5_format(path: str | Path) -> str | None:
     Raises:
         FileError: No such file, or not HDF5.
     """
-    import h5py
-
-    existing_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            return file.attrs.get("format")
-    except OSError as error:
-        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(path) else "not an HDF5 file"
-        raise FileError(f"{path}: {problem}") from error
+    with read_hdf5(path) as file:
+        found = file.attribute("format", None)
+        return found if isinstance(found, str) else None

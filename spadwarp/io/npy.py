@@ -45,7 +45,7 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     except FileError:
         raise
     except Exception as error:  # a damaged header is parsed by Python's own parser
-        raise FileError(f"{path}: damaged, or not a .npy file: {error}") from error
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
 def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-from spadwarp.io.parsing import parse_toml
+from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.result.merging import physics_of
+from spadwarp.result.photon_ids import Ranges, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
@@ -20,8 +23,10 @@ from spadwarp.scene.intrinsics import camera_attributes
 __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
+    "ResultHead",
     "load_result",
     "load_truth_maps",
+    "read_head",
     "save_depth_exr",
     "save_result",
     "save_truth_maps",
@@ -31,6 +36,8 @@ FORMAT = "spadwarp result"
 FORMAT_VERSION = 1
 
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
+_PHOTONS = f"[1, {2**64 - 1}]"
+_UNITS = "[1e-30, 1e30]"  # photons
 _RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
 _TRUTH = ("depth", "range", "normal", "reflectance")
 _OLDER_NAMES = {"second_moment": "squares", "importance_sampling_residual": "directed"}  # in files of format version 1
@@ -92,45 +99,106 @@ def load_result(path: str | Path) -> Result:
     """Reads what `save_result` wrote.
 
     Raises:
-        FileError: No such file, not a spadwarp result, of a newer format version, or damaged; says which.
+        FileError: No such file, not a spadwarp result, of a newer format version, damaged, or with arrays that are not
+            those of its scene; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
-        return Result(
-            scene=Scene.from_dict(parse_toml(file["config"].asstr()[()]), source=file.attrs.get("source")),
-            tallies=file["tallies"][...],
-            unit=float(file.attrs["unit"]),
-            photons=int(file.attrs["photons"]),
-            seed=int(file.attrs["seed"]),
-            ledger_unit=float(file.attrs["ledger_unit"]),
-            partial=bool(file.attrs["partial"]),
-            batch_size=int(file.attrs.get("batch_size", 0)),
-            second_moment=_second_moment(file),
-            photon_ranges=tuple((int(start), int(stop)) for start, stop in file["photon_ranges"][...]),
-            requested=_requested(file),
-            truth=Truth(**{name: file[f"truth/{name}"][...] for name in _TRUTH}),
+        head = _head(file)
+        scene, batch_size = head.scene, head.batch_size
+        height, width, bins = scene.camera.height, scene.camera.width, scene.gate.bins
+        tallies = file.array("tallies", np.int64, (len(COMPONENTS), height, width, bins))
+        if tallies.min() < 0:
+            file.refuse("tallies", "are negative in some bins")
+        moments = [name for name in ("second_moment", _OLDER_NAMES["second_moment"]) if name in file]
+        if bool(moments) != bool(batch_size):
+            file.refuse("second_moment", f"does not go with batches of {batch_size} photons")
+        result = Result(
+            **vars(head),
+            tallies=tallies,
+            second_moment=file.array(moments[0], np.uint64, (2, height, width, bins)) if moments else None,
+            truth=_truth(file, (height, width)),
             ledger=read_ledger(file),
-            **{name: json.loads(file[name].asstr()[()]) for name in _RECORDS if name != "ledger"},
+            counters=file.integers("counters"),
+            timing=file.numbers("timing"),
+            provenance=_provenance(file),
         )
+    return result
 
 
-def read_ledger(file: Any) -> dict[str, int]:
+@dataclass(frozen=True, kw_only=True)
+class ResultHead:
+    """Which photons of which run a file holds: the fields of `Result` without its arrays."""
+
+    scene: Scene
+    unit: float
+    photons: int
+    seed: int
+    ledger_unit: float
+    partial: bool
+    batch_size: int
+    photon_ranges: Ranges
+    requested: tuple[int, int]
+
+    def is_of_run(self, other: ResultHead) -> bool:
+        """Whether both hold photons of one run: the one with fewer is an earlier state of it."""
+        names = ("seed", "unit", "batch_size")
+        same = all(getattr(self, name) == getattr(other, name) for name in names)
+        same = same and self.requested[0] == other.requested[0]
+        return same and physics_of(self.scene) == physics_of(other.scene)
+
+
+def read_head(path: str | Path) -> ResultHead:
+    """Of the result in a file. Raises `FileError`."""
+    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+        return _head(file)
+
+
+def _head(file: Hdf5File) -> ResultHead:
+    ranges = tuple((int(start), int(stop)) for start, stop in file.array("photon_ranges", np.uint64, (None, 2)))
+    photons = file.integer("photons", _PHOTONS)
+    if not ranges or any(start >= stop for start, stop in ranges) or len(joined(ranges)) > len(ranges):
+        file.refuse("photon_ranges", "are not ranges of photon ids")
+    requested = (ranges[0][0], ranges[-1][1])
+    if "requested" in file:  # files of version 0.1.0 do not have it
+        start, stop = map(int, file.array("requested", np.uint64, (2,)))
+        if not start <= requested[0] < requested[1] <= stop:
+            file.refuse("requested", f"from {start} to {stop} does not hold the photons that were traced")
+        requested = start, stop
+    return ResultHead(
+        scene=Scene.from_toml(file.text("config"), source=file.text_attribute("source", None)),
+        unit=file.real("unit", _UNITS),
+        photons=photons,
+        seed=file.integer("seed"),
+        ledger_unit=file.real("ledger_unit", _UNITS),
+        partial=file.flag("partial"),
+        batch_size=file.integer("batch_size", _PHOTONS.replace("[1", "[0"), default=0),
+        photon_ranges=ranges,
+        requested=requested,
+    )
+
+
+def _truth(file: Hdf5File, shape: tuple[int, int]) -> Truth:
+    maps = {
+        name: file.array(f"truth/{name}", np.float32, (*shape, 3) if name == "normal" else shape) for name in _TRUTH
+    }
+    for name, values in maps.items():
+        if np.isinf(values).any():
+            file.refuse(f"truth/{name}", "is infinite in some pixels")
+    return Truth(**maps)
+
+
+def read_ledger(file: Hdf5File) -> dict[str, int]:
     """The ledger in an open file of a result or of photon records, its entries by the names of today."""
     newer = {older: name for name, older in _OLDER_NAMES.items()}
-    ledger: dict[str, int] = json.loads(file["ledger"].asstr()[()])
-    return {newer.get(name, name): value for name, value in ledger.items()}
+    return {newer.get(name, name): value for name, value in file.integers("ledger").items()}
 
 
-def _second_moment(file: Any) -> NDArray[np.uint64] | None:
-    names = [name for name in ("second_moment", _OLDER_NAMES["second_moment"]) if name in file]
-    return file[names[0]][...] if names else None
-
-
-def _requested(file: Any) -> tuple[int, int]:
-    """Files of version 0.1.0 do not have it."""
-    if "requested" not in file:
-        return 0, 0
-    start, stop = file["requested"][...]
-    return int(start), int(stop)
+def _provenance(file: Hdf5File) -> dict[str, Any]:
+    made = file.table("provenance")
+    parts = made.get("parts", [])
+    if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
+        file.refuse("provenance", "holds parts that are no tables")
+    return made
 
 
 def _attributes(result: Result) -> dict[str, Any]:

@@ -33,7 +33,10 @@ class Tallies:
         return cls(result.tallies.copy(), dict(result.ledger), dict(result.counters), second_moment)
 
     def add(self, other: Tallies | Result) -> None:
-        """Adds the tallies of other photons."""
+        """Adds the tallies of other photons; `ConfigError` where they count other things."""
+        for name in ("ledger", "counters"):
+            if strange := getattr(self, name).keys() ^ getattr(other, name).keys():
+                raise ConfigError(f"the results count different things in their {name}: {', '.join(sorted(strange))}")
         self.tallies += other.tallies
         self.ledger = {name: value + other.ledger[name] for name, value in self.ledger.items()}
         self.counters = {name: value + other.counters[name] for name, value in self.counters.items()}
@@ -122,12 +125,6 @@ def check_targets(a: Truth, b: Truth, action: str) -> None:
     """Raises `ConfigError` where two truth maps are not of the same targets."""
     if not np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True):
         raise ConfigError(f"{action}: the targets of the results differ, by their truth maps: was a mesh file changed?")
-
-
-def is_one_run(a: Result, b: Result) -> bool:
-    """Whether two results hold photons of one run: the one with fewer photons is an earlier state of the other."""
-    same = (a.seed, a.unit, a.batch_size, a.requested[0]) == (b.seed, b.unit, b.batch_size, b.requested[0])
-    return same and physics_of(a.scene) == physics_of(b.scene)
 
 
 def physics_of(scene: Scene) -> Scene:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import response_sigma
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-from spadwarp.io.parsing import parse_toml
 from spadwarp.scene import Scene
 
 if TYPE_CHECKING:
@@ -110,13 +109,16 @@ def _metadata(result: AnalyticResult) -> dict[str, Any]:
 def load_analytic(path: str | Path) -> FrameSequence:
     """The depth frames in a file of `save_analytic`. Raises `FileError`."""
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
-        config, source = file["config"].asstr()[()], file.attrs.get("source")
-        scene, truth = Scene.from_dict(parse_toml(config), source=source or None), file["truth/depth"][...]
-        count = len(file["depth"])
+        scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
+        shape = scene.camera.height, scene.camera.width
+        truth = file.array("truth/depth", np.float32, shape)
+        count = len(file.stored("depth", np.float32, (None, *shape)))
+        file.stored("labels", np.bool_, (count, *shape))
 
     def frame(number: int) -> SequenceFrame:
         with read_hdf5(path, FORMAT) as file:
-            depth, labels = file["depth"][number], file["labels"][number].astype(np.float32)
+            depth = file.stored("depth", np.float32, (count, *shape))[number]
+            labels = file.stored("labels", np.bool_, (count, *shape))[number].astype(np.float32)
         images = {"Z": depth, "background": labels, "truth.Z": truth}
         return SequenceFrame(images=images, scene=scene, depth=truth, content="Z by the analytic simulator")
 

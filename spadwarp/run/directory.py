@@ -6,6 +6,7 @@ import secrets
 import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from spadwarp.frames import detector_response
 from spadwarp.io.atomic import atomic_path, remove_temporaries
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
-from spadwarp.result.merging import is_one_run
+from spadwarp.result.file import read_head
 from spadwarp.scene import Scene
 
 __all__ = ["CHECKPOINT", "RUN_FILES", "RunFiles", "bytes_needed", "load_resumable", "remove_checkpoint"]
@@ -107,18 +108,19 @@ def load_resumable(path: str | Path) -> tuple[Result, Path]:
     if len(files) < 2:
         file = files[0] if files else file_within(folder, ("result.h5",))
         return load_result(file), file
-    found: list[tuple[Result, Path]] = []
-    for file in files:
-        try:
-            found.append((load_result(file), file))
-        except FileError as error:
-            if file == files[-1] and not found:
-                raise
-            warnings.warn(f"{error}; the other file of the run is resumed", RuntimeWarning, stacklevel=2)
-    first, last = (result for result, _ in (found[0], found[-1]))
-    if not is_one_run(first, last):
-        return found[0]
-    return max(found, key=lambda pair: pair[0].photons)
+    checkpoint, result = files
+    try:
+        heads = read_head(checkpoint), read_head(result)
+        if heads[0].is_of_run(heads[1]) and heads[1].photons >= heads[0].photons:
+            files = [result, checkpoint]
+        return load_result(files[0]), files[0]
+    except FileError as error:
+        for file in files:
+            with suppress(FileError):
+                earlier = load_result(file)
+                warnings.warn(f"{error}; {file} is resumed instead", RuntimeWarning, stacklevel=2)
+                return earlier, file
+        raise
 
 
 def remove_checkpoint(out: str | Path) -> None:

@@ -17,11 +17,9 @@ from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.frames.file import FORMAT, FramesFile
 from spadwarp.frames.frames import Frames
 from spadwarp.io.hdf5 import hdf5_format
-from spadwarp.io.parsing import parse_toml
 from spadwarp.result.file import load_result
 from spadwarp.result.result import Result
 from spadwarp.run import analytic_file
-from spadwarp.scene import Scene
 
 __all__ = ["open_source"]
 
@@ -44,8 +42,7 @@ def open_source(source: Any, *, result: Result | None = None, split: str = "all"
     elif isinstance(source, (str, Path)):
         path = Path(source)
         if path.is_dir():
-            with _of_dataset(path, split) as frames:
-                yield frames
+            yield _of_dataset(path, split)
         elif (kind := hdf5_format(path)) == FORMAT:
             yield _of_file(FramesFile.load(path))
         elif kind == analytic_file.FORMAT:
@@ -112,40 +109,36 @@ def _of_file(file: FramesFile) -> FrameSequence:
     return FrameSequence(name=str(file.path), count=file.frames, frame=frame, largest_count=most)
 
 
-@contextmanager
-def _of_dataset(folder: Path, split: str) -> Iterator[FrameSequence]:
-    import h5py
-
+def _of_dataset(folder: Path, split: str) -> FrameSequence:
     depth = FrameReader(folder, split, fields=("noisy", "clean", "label", "intensity", "bound"))
     histograms = FrameReader(folder, split, fields=("counts", "expected"))
-    with h5py.File(folder / "scenes.h5", "r") as scenes:
+    photons, pulses, backscatter = map(depth.scene_numbers, ("photons", "pulses", "backscatter"))
 
-        def frame(number: int) -> SequenceFrame:
-            item = depth[number]
-            row = int(item["scene"])
-            scene = Scene.from_dict(parse_toml(scenes["config"][row].decode()))
-            common: dict[str, Any] = {
-                "images": {name: item[field][0] for name, field in _DATASET_IMAGES.items()},
-                "scene": scene,
-                "depth": item["clean"][0],
-                "content": f"sample {int(item['sample'])}",
-            }
-            if not scenes["photons"][row]:
-                return SequenceFrame(**common)
-            cubes, pulses = histograms[number], int(scenes["pulses"][row])
-            noise = scene.detector.noise_rate * scene.gate.bins * scene.gate.bin_width
-            return SequenceFrame(
-                counts=np.moveaxis(cubes["counts"], 0, -1).astype(np.uint32),
-                expected=np.ascontiguousarray(np.moveaxis(cubes["expected"], 0, -1)),
-                background=(float(scenes["backscatter"][row]) + noise) * pulses,
-                pulses=pulses,
-                gate_start=scene.gate.start,
-                bin_width=scene.gate.bin_width,
-                period=1.0 / scene.laser.repetition_rate if scene.detector.wrap else None,
-                **common,
-            )
+    def frame(number: int) -> SequenceFrame:
+        item, scene = depth[number], depth.scene(number)
+        row = int(item["scene"])
+        common: dict[str, Any] = {
+            "images": {name: item[field][0] for name, field in _DATASET_IMAGES.items()},
+            "scene": scene,
+            "depth": item["clean"][0],
+            "content": f"sample {int(item['sample'])}",
+        }
+        if not photons[row]:
+            return SequenceFrame(**common)
+        cubes = histograms[number]
+        noise = scene.detector.noise_rate * scene.gate.bins * scene.gate.bin_width
+        return SequenceFrame(
+            counts=np.moveaxis(cubes["counts"], 0, -1).astype(np.uint32),
+            expected=np.ascontiguousarray(np.moveaxis(cubes["expected"], 0, -1)),
+            background=(float(backscatter[row]) + noise) * int(pulses[row]),
+            pulses=int(pulses[row]),
+            gate_start=scene.gate.start,
+            bin_width=scene.gate.bin_width,
+            period=1.0 / scene.laser.repetition_rate if scene.detector.wrap else None,
+            **common,
+        )
 
-        yield FrameSequence(name=str(folder), count=len(depth), frame=frame)
+    return FrameSequence(name=str(folder), count=len(depth), frame=frame)
 
 
 _DATASET_IMAGES = {

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, Valida
 
 from spadwarp.errors import ConfigError
 from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.io.parsing import parse_toml, read_toml
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.camera import Camera
@@ -67,6 +67,11 @@ class Scene(BaseModel):
         Raises `ConfigError` with a line for each problem.
         """
         return _build(dict(tables), source=source)
+
+    @classmethod
+    def from_toml(cls, text: str, *, source: str | os.PathLike[str] | None = None) -> Scene:
+        """A scene from the text that `to_toml` made, in a file of results or frames. Raises `ConfigError`."""
+        return _build(parse_toml(text), source=source)
 
     @property
     def source(self) -> Path | None:

@@ -26,7 +26,15 @@ __all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
 FORMAT = "spadwarp records"
 FORMAT_VERSION = 1
 
-_ARRAYS = ("id", "position", "direction", "weight", "path", "collisions", "reason")
+_ARRAYS: dict[str, tuple[Any, tuple[int, ...]]] = {
+    "id": (np.uint64, ()),
+    "position": (np.float32, (3,)),
+    "direction": (np.float32, (3,)),
+    "weight": (np.float32, ()),
+    "path": (np.float32, ()),
+    "collisions": (np.int32, ()),
+    "reason": (np.int32, ()),
+}
 _READ_ME = (
     "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
     "frame, +x right, +y down, +z forward), weight, geometric path [m], collisions (surfaces included), reason (index "
@@ -155,9 +163,16 @@ def load_records(path: str | Path) -> PhotonRecords:
         FileError: No such file, not photon records, or damaged; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+        count = len(file.stored("id", np.uint64, (None,)))
+        arrays = {name: file.array(name, kind, (count, *shape)) for name, (kind, shape) in _ARRAYS.items()}
+        reasons = np.ravel(file.attribute("reasons")).tolist()
+        if not all(isinstance(name, str) for name in reasons):
+            file.refuse("reasons", "are not names")
+        if count and not 0 <= arrays["reason"].min() <= arrays["reason"].max() < len(reasons):
+            file.refuse("reason", f"is outside [0, {len(reasons)}) for some photons")
         return PhotonRecords(
-            **{name: file[name][...] for name in _ARRAYS},
-            reasons=tuple(file.attrs["reasons"]),
+            **arrays,
+            reasons=tuple(reasons),
             ledger=read_ledger(file),
-            ledger_unit=float(file.attrs["ledger_unit"]),
+            ledger_unit=file.real("ledger_unit", "(0, inf)"),
         )

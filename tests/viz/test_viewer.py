@@ -121,7 +121,7 @@ def test_a_page_of_frames_holds_counts_to_the_last(frames):
     np.testing.assert_array_equal(unpacked(data["images"]["depth"], "<f4", depth.shape), depth)
     with pytest.raises(ValueError, match=r"frame = 2 is outside \[0, 2\)"):
         spadwarp.viz.view(frames, frame=2)
-    with pytest.raises(ValueError, match="method = 'likelihood' is not one of centroid, peak"):
+    with pytest.raises(ValueError, match="method = 'likelihood' is not one of peak, centroid"):
         spadwarp.viz.view(frames, method="likelihood")
 
 
