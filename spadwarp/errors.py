@@ -11,7 +11,16 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-__all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError", "in_words"]
+__all__ = [
+    "ArgumentError",
+    "ConfigError",
+    "DeviceError",
+    "FileError",
+    "MeshError",
+    "SpadwarpError",
+    "SpadwarpWarning",
+    "in_words",
+]
 
 
 class SpadwarpError(Exception):
@@ -48,6 +57,10 @@ class FileError(SpadwarpError):
 
 class DeviceError(SpadwarpError):
     """A device that does not exist, or has too little memory for what was asked."""
+
+
+class SpadwarpWarning(UserWarning):
+    """What succeeded and may still mislead; its text is meant for the user as it is."""
 
 
 @contextmanager

@@ -112,7 +112,7 @@ def pixel_maps(
         arrival_d,
         total_d,
         count_law=chosen.count_law,
-        acquisitions=chosen.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
+        acquisitions=scene.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
         outliers=outliers,
     )

@@ -41,6 +41,9 @@ class BudgetRow:
         optical_depth: Attenuation lengths, one way.
         gate_start, gate_stop: The gate [s]: the scene's where all ranges fall into it, else one of the same length
             around the return.
+        gate_moved: Whether it is not the scene's.
+        pulses: Of one depth frame, for which the bound holds: `Scene.pulses_per_depth_frame`, or those of
+            `analytic.frames` detector frames with a count law per frame.
         arrival: Of the return [s].
         signal: S, detections of the return per pulse.
         background: Detections of backscatter, dark counts and ambient light per pulse within the gate.
@@ -58,6 +61,8 @@ class BudgetRow:
     optical_depth: float
     gate_start: float
     gate_stop: float
+    gate_moved: bool
+    pulses: float
     arrival: float
     signal: float
     background: float
@@ -131,6 +136,10 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
         length = gate[1] - gate[0]
         starts = np.maximum(arrival - 0.5 * length, 0.0)
         gates = [((start, start + length), distances[i : i + 1]) for i, start in enumerate(starts)]
+    chosen = scene.analytic
+    pulses = float(scene.pulses_per_depth_frame)
+    if chosen.count_law != "per_pulse":
+        pulses = chosen.frames * chosen.exposure * scene.laser.repetition_rate
     rows: list[BudgetRow] = []
     for (start, stop), inside in gates:
         axis = np.tile([0.0, 0.0, 1.0], (inside.size, 1))
@@ -154,6 +163,8 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
                     optical_depth=float(distance * scene.medium.extinction),
                     gate_start=start,
                     gate_stop=stop,
+                    gate_moved=(start, stop) != gate,
+                    pulses=pulses,
                     background=float(background[i]),
                     pulses_for_1cm=float(needed[i]),
                     **{field: float(maps[field][i]) for field in _FROM_MAPS},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import source_name
 from spadwarp.analytic.photon_budget import BudgetRow, axis_rows
 from spadwarp.analytic.simulate import simulate_analytic
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.load import parse_key
@@ -53,6 +54,11 @@ class Sweep:
     values: tuple[Any, ...]
     rows: tuple[BudgetRow, ...] | tuple[DepthErrorRow, ...]
 
+    @property
+    def is_flat(self) -> bool:
+        """Whether different values gave the same numbers throughout."""
+        return len({repr(value) for value in self.values}) > 1 and len({repr(row) for row in self.rows}) == 1
+
     def column(self, name: str) -> NDArray[np.float64]:
         """One attribute of all rows."""
         return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
@@ -76,6 +82,8 @@ def sweep(
             `DepthErrorRow` over all pixels.
         device: Warp device; default: the first GPU, else the CPU.
 
+    Where no number depends on the field, a warning says so.
+
     Raises:
         ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
         ArgumentError: `vary` or `of` not of the form above.
@@ -89,7 +97,15 @@ def sweep(
     for value in values:
         changed = scene.with_overrides({field: value})
         rows.append(_central_row(changed, device) if of == "budget" else _depth_error(changed, device))
-    return Sweep(field=field, values=tuple(values), rows=tuple(rows))
+    found = Sweep(field=field, values=tuple(values), rows=tuple(rows))
+    if found.is_flat:
+        hint = ""
+        if field in ("detector.pulses_per_frame", "detector.pulses"):
+            hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
+        warnings.warn(
+            f"no number depends on {field}: the analytic model does not use it{hint}", SpadwarpWarning, stacklevel=2
+        )
+    return found
 
 
 def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:

@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 import spadwarp
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, in_words
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
 
 FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
@@ -73,6 +73,7 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), _resources:
             warnings.showwarning = _show_warning
+            warnings.filterwarnings("default", category=SpadwarpWarning)
             try:
                 answer = super().invoke(ctx)
                 if sys.stdout is not None:  # as in `spadwarp info out/ >&-`

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spadwarp.analytic import BudgetRow
+    from spadwarp.scene import Scene
 
 
 def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
@@ -17,16 +18,18 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
 
     table = new_table(
         title,
-        "range [m]",
+        "range\n[m]",
         "c·r",
+        "gate [ns]",
+        "pulses",
         "signal",
         "background",
         "α",
-        "signal/backscatter",
+        "signal/\nbackscatter",
         "σ* [ps]",
         "σ* [mm]",
         "outliers",
-        "pulses for 1 cm",
+        "pulses\nfor 1 cm",
     )
     before = None
     for name, row in zip(names, found, strict=True):
@@ -35,6 +38,8 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
             name if name != before else "",
             f"{row.range:.4g}",
             f"{row.optical_depth:.3g}",
+            f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
+            f"{row.pulses:.3g}",
             f"{row.signal:.3g}",
             f"{row.background:.3g}",
             f"{row.alpha:.3g}",
@@ -46,6 +51,24 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
         )
         before = name
     return table
+
+
+def table_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
+    """What the columns of a budget do not say by themselves."""
+    notes = []
+    if any(row.gate_moved for row in found):
+        gate = scene.gate
+        notes.append(
+            f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
+            "the ranges, but one as long around the return"
+        )
+    own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
+    if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:
+        notes.append(
+            f"pulses: analytic.pulses_per_depth_frame = {own}; without it, detector.pulses_per_frame = {detector} "
+            "would count"
+        )
+    return notes
 
 
 def new_table(first: str, *titles: str) -> Table:

@@ -11,7 +11,7 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
-from spadwarp.cli._tables import budget_table
+from spadwarp.cli._tables import budget_table, table_notes
 from spadwarp.errors import ArgumentError
 
 
@@ -39,8 +39,10 @@ def budget(
     """Photon budget of a surface on the optical axis.
 
     Signal and background per pulse and pixel, depth error, and pulses for a depth error of 1 cm, over range and water,
-    from the analytic model. Depth errors in brackets are not reached: more than 1 % of the fits would find a false
-    peak.
+    from the analytic model. Depth errors are those of one depth frame, of so many pulses as the table shows:
+    analytic.pulses_per_depth_frame if given, else detector.pulses_per_frame. In brackets they are not reached: more
+    than 1 % of the fits would find a false peak. Where a return misses the scene's gate, gates as long follow the
+    returns, marked *.
 
     \b
     Example:
@@ -67,6 +69,8 @@ def budget(
         ]
     if not quiet:
         opt.show_table(budget_table([row.medium for row in found], "water", found))
+        for text in table_notes(found, scene):
+            say(text)
         if written:
             say(f"written: {', '.join(path.name for path in written)} in {out}")
     outputs.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written})

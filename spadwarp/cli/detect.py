@@ -128,6 +128,7 @@ def _summary(recording: Recording, frames: int) -> dict[str, Any]:
         "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
         "bound": {"pixels": int(bound.size), "median_m": float(np.median(bound)) if bound.size else None},
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
+        "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
         "notes": list(recording.notes),
     }
 

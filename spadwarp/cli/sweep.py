@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from spadwarp import Scene
     from spadwarp.analytic import DepthErrorRow
-from spadwarp.cli._tables import budget_table, new_table, percent, short
+from spadwarp.cli._tables import budget_table, new_table, percent, short, table_notes
 
 
 class Quantity(enum.StrEnum):
@@ -48,7 +48,8 @@ def sweep(
 ) -> None:
     """Curves over any field of the scene, from the analytic model.
 
-    Writes sweep.png and sweep.csv. FIELD may be an item of a list, and values may have units.
+    Writes sweep.png and sweep.csv. FIELD may be an item of a list, and values may have units. Pulses of a depth frame
+    and gates as in `spadwarp budget`.
 
     \b
     Examples:
@@ -79,6 +80,9 @@ def sweep(
             if of is Quantity.budget
             else _error_table(names, curves.field, some)
         )
+        if of is Quantity.budget:
+            for text in table_notes(some, scene):
+                say(text)
         say(f"written: {', '.join(path.name for path in written)} in {out}")
     outputs.write_json({"field": curves.field, "values": values, "of": of.value, "rows": found, "files": written})
 

@@ -88,7 +88,7 @@ def _draw_frames(
     on = pick_device(device)
     shape, view = truth.depth.shape, pixel_directions(scene.camera).reshape(-1, 3)
     probability, flat, fractions = _background(scene, draw, maps)
-    speed, pulses = scene.medium.pulse_speed, scene.analytic.pulses_per_depth_frame
+    speed, pulses = scene.medium.pulse_speed, scene.pulses_per_depth_frame
 
     def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
@@ -129,7 +129,7 @@ def _background(
     dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
     noise = backscatter + dark
     # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
-    alone = -np.expm1(-scene.analytic.pulses_per_depth_frame * noise)
+    alone = -np.expm1(-scene.pulses_per_depth_frame * noise)
     probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
     flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
     return probability, flat, np.ones(len(draw.fractions))

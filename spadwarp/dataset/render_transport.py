@@ -36,7 +36,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
     seen = (returned > 0) & np.isfinite(result.truth.depth)
     scene = with_exposure(scene, draw, returned[seen], most=_MOST_PULSES)
-    pulses = min(scene.analytic.pulses_per_depth_frame, _MOST_PULSES)
+    pulses = min(scene.pulses_per_depth_frame, _MOST_PULSES)
     frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
     time_bound = crlb(result, pulses=pulses, device=device)
     view = pixel_directions(scene.camera)

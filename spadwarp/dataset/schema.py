@@ -130,7 +130,7 @@ def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
         "gate_near": range_from_time(scene.gate.start, medium.group_index),
         "gate_far": range_from_time(scene.gate.stop, medium.group_index),
         "reflectance": getattr(placed, "reflectance", np.nan),
-        "pulses": scene.analytic.pulses_per_depth_frame,
+        "pulses": scene.pulses_per_depth_frame,
         "photons": draw.photons or 0,
         "signal": rendered.signal,
         "backscatter": rendered.backscatter,

@@ -151,7 +151,7 @@ def _frame_rows(plan: Plan, shard: Shard, rendered: RenderedScene) -> dict[str, 
         "target": np.int32(draw.target),
         "attenuation_lengths": np.float32(draw.attenuation_lengths),
         "distance": np.float32(draw.distance),
-        "pulses": np.int64(rendered.scene.analytic.pulses_per_depth_frame),
+        "pulses": np.int64(rendered.scene.pulses_per_depth_frame),
         "intensity_step": np.float32(rendered.frames.intensity_step),
     }
     return {

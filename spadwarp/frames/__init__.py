@@ -6,6 +6,7 @@ from spadwarp.frames.estimators import METHODS, Method, arrival_time
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.measured import Histograms, read_histograms
+from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.pile_up import coates, first_photon_probabilities
 from spadwarp.frames.record import FrameErrors, Recording, record_frames
 from spadwarp.frames.response import InstrumentResponse, detector_response, instrument_response, response_matrix
@@ -19,6 +20,7 @@ __all__ = [
     "Histograms",
     "InstrumentResponse",
     "Method",
+    "MonteCarloNoise",
     "Recording",
     "Reduction",
     "TimeTags",
@@ -33,6 +35,7 @@ __all__ = [
     "first_photon_probabilities",
     "instrument_response",
     "is_frames_file",
+    "monte_carlo_noise",
     "read_histograms",
     "record_frames",
     "response_matrix",

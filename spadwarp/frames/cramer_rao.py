@@ -98,7 +98,7 @@ def crlb(
 
     Args:
         result: Of `spadwarp.simulate`.
-        pulses: Of one depth frame; default: the scene's `analytic.pulses_per_depth_frame`.
+        pulses: Of one depth frame; default: the scene's, `Scene.pulses_per_depth_frame`.
         law, device: See `crlb_from_histogram`.
     """
     scene = result.scene
@@ -109,7 +109,7 @@ def crlb(
         signal,
         background,
         bin_width=scene.gate.bin_width,
-        pulses=scene.analytic.pulses_per_depth_frame if pulses is None else pulses,
+        pulses=scene.pulses_per_depth_frame if pulses is None else pulses,
         irf=detector_response(scene.detector, scene.laser),
         law=law,
         device=device,

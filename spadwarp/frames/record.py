@@ -14,6 +14,7 @@ from spadwarp.frames.cramer_rao import crlb
 from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
+from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.response import detector_response
 from spadwarp.frames.spad import detect
 from spadwarp.result.result import Result
@@ -53,6 +54,7 @@ class Recording:
         bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m].
         detections: Counts of all frames.
         notes: What the simulation could not give, in words.
+        monte_carlo: Its noise against the shot noise of one frame; None if the result keeps no standard errors.
     """
 
     path: Path
@@ -63,6 +65,7 @@ class Recording:
     bound_depth: Map
     detections: int
     notes: tuple[str, ...]
+    monte_carlo: MonteCarloNoise | None
 
 
 def record_frames(
@@ -127,6 +130,7 @@ def record_frames(
                     bound_depth=bound_depth,
                     detections=0,
                     notes=part.notes,
+                    monte_carlo=monte_carlo_noise(result, pulses=pulses),
                 )
             file.add(part, depth)
             detections += int(part.intensity.sum())

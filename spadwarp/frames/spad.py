@@ -7,14 +7,16 @@ dark counts, ambient light, crosstalk → hazard λ per detector bin → counts,
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, output_tensor, tensor_of
-from spadwarp.errors import ArgumentError, kernel_errors
+from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
+from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
 from spadwarp.frames.response import InstrumentResponse, detector_response, response_matrix
 from spadwarp.frames.window import Window, detector_window, missing_light
 from spadwarp.scene import Detector, Laser
@@ -51,6 +53,9 @@ def detect(
     detection. Crosstalk enters as a mean: λ gains `crosstalk_probability` times the expected detections of each of the
     four neighbours in the same bin; that its counts come in pairs is left out. Dead time acts in free-running mode.
 
+    The light of a Result has the noise of the simulation, which is drawn as if it were light, the same in every frame:
+    a warning says by how much it exceeds the shot noise (see `monte_carlo_noise`), a note that it is unknown.
+
     Args:
         source: A `Result` or `TorchResult`, or expected detections per pulse `[H, W, T]` (PDE included, noise not;
             NumPy, torch, Warp). From torch tensors come torch tensors, on their device.
@@ -76,7 +81,7 @@ def detect(
     Raises:
         ArgumentError: Names the argument, its value and what is allowed.
     """
-    scene = getattr(source, "scene", None)
+    result, scene = source, getattr(source, "scene", None)
     if scene is not None:
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
@@ -112,9 +117,22 @@ def detect(
         period=time_axis.period if detector.wrap else None,
         irf=irf,
         tags=None if drawn.events is None else _time_tags(drawn.events, light.image, first_frame),
-        notes=missing_light(time_axis, gate_start) if detector.wrap else (),
+        notes=(
+            *(missing_light(time_axis, gate_start) if detector.wrap else ()),
+            *(_noise_of_simulation(result, pulses, detector, laser) if scene is not None else ()),
+        ),
         **numbers,
     )
+
+
+def _noise_of_simulation(result: Any, pulses: int, detector: Detector, laser: Laser | None) -> tuple[str, ...]:
+    """Warns where frames show the noise of the simulation; a note where nobody knows whether they do."""
+    noise = monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
+    if noise is None:
+        return (UNKNOWN,)
+    if noise.exceeds:
+        warnings.warn(str(noise), SpadwarpWarning, stacklevel=4)
+    return ()
 
 
 def _check_integers(**numbers: int) -> None:

@@ -23,8 +23,8 @@ class Analytic(Section):
     """part of the pixels that report backscatter (BS); from the rates if not given"""
     count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = "per_pulse"
     """at most one count a pulse, or a frame"""
-    pulses_per_depth_frame: Whole = Field(20_000, ge=1, le=2**63 - 1)
-    """pulses of one depth frame, for per_pulse"""
+    pulses_per_depth_frame: Whole | None = Field(None, ge=1, le=2**63 - 1)
+    """pulses of one depth frame, for per_pulse; if not given those of one frame of the detector, pulses_per_frame"""
     frames: Whole = Field(1000, ge=1, le=2**63 - 1)
     """detector frames of one depth frame, for per_frame"""
     exposure: float = Field(1e-5, gt=0)

@@ -101,6 +101,12 @@ class Scene(BaseModel):
         moved = {"position": tuple(map(float, position)), "direction": tuple(map(float, axis)), "frame": "camera"}
         return laser.model_copy(update=moved)
 
+    @property
+    def pulses_per_depth_frame(self) -> int:
+        """Pulses of one depth frame of the analytic model: `analytic.pulses_per_depth_frame`, else those of the
+        detector's frame."""
+        return self.analytic.pulses_per_depth_frame or self.detector.pulses_per_frame
+
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds along the straight line between two points of the camera frame [m]."""
         if self.medium.layers and self.camera.is_posed:

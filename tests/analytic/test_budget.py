@@ -8,7 +8,7 @@ import pytest
 from helpers.scenes import scene
 from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_vary, simulate_analytic, sweep
 from spadwarp.analytic.photon_budget import budget
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ConfigError, SpadwarpWarning
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},
@@ -67,6 +67,25 @@ def test_the_pulses_needed_are_enough_and_not_too_many(count_law):
         assert enough.sigma_depth <= 0.0101 and enough.outlier_probability <= 0.0101
         if needed > 20 * per_frame:
             assert scarce.sigma_depth > 0.01 or scarce.outlier_probability > 0.01
+
+
+def test_pulses_of_a_depth_frame_are_those_of_the_detector_unless_given():
+    """The bound falls with the square root of either; the table and its row say which counted."""
+    one, four = (budget(SCENE.with_overrides({"detector.pulses_per_frame": n}), ranges=[2.0])[0] for n in (500, 2000))
+    assert (one.pulses, four.pulses) == (500, 2000)
+    assert one.sigma_depth == pytest.approx(2 * four.sigma_depth)
+    own = SCENE.with_overrides({"detector.pulses_per_frame": 500, "analytic.pulses_per_depth_frame": 2000})
+    assert budget(own, ranges=[2.0])[0] == four and own.pulses_per_depth_frame == 2000
+    frames = SCENE.with_overrides({"analytic.count_law": "per_frame", "analytic.frames": 7, "analytic.exposure": 1e-5})
+    assert budget(frames, ranges=[2.0])[0].pulses == pytest.approx(7 * 1e-5 * 20e6)
+    with pytest.warns(SpadwarpWarning, match="no number depends on detector.pulses_per_frame: .* takes its place"):
+        assert sweep(own, vary="detector.pulses_per_frame=100,200").is_flat
+    assert not sweep(SCENE, vary="detector.pulses_per_frame=100,200").is_flat
+
+
+def test_a_gate_that_was_moved_is_said():
+    inside, outside = (budget(SCENE, ranges=[r])[0] for r in (2.2, 9.0))
+    assert not inside.gate_moved and outside.gate_moved
 
 
 def test_where_nothing_comes_back_no_number_of_pulses_is_enough():

@@ -8,6 +8,9 @@ import spadwarp
 from helpers.cli import DEVICE, run, tables
 from spadwarp.io.exr import read_exr
 
+# The shared run has few photons on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")
+
 
 def test_frames_are_those_of_detect(done, tmp_path):
     out = tmp_path / "out"
@@ -29,6 +32,8 @@ def test_frames_are_those_of_detect(done, tmp_path):
     assert 0.3 * np.median(bound) < np.median(error) < 10 * np.median(bound)
     plain = tables(tmp_path / "printed.json")
     assert plain["depth"]["likelihood"]["median"] == pytest.approx(np.median(error), rel=1e-3)
+    assert printed.stderr.count("warning: Monte Carlo noise, the same in every frame") == 1
+    assert plain["monte_carlo_noise"]["ratio"] > 0.5
     assert "Cramér–Rao" in printed.stdout and printed.stdout.count("% of the target's pixels") == 4
 
 

@@ -53,7 +53,8 @@ def test_budget_is_that_of_python(spad_scene, tmp_path):
     )
     twin = spadwarp.budget(spadwarp.load_scene(spad_scene), [1, 2, 3], ["uwoc-clear", "uwoc-harbour"], device="cpu")
     assert [row["signal"] for row in tables(summary)["rows"]] == [row.signal for row in twin]
-    assert "uwoc-harbour" in printed.stdout and "range [m]" in printed.stdout and "σ* [mm]" in printed.stdout
+    assert "uwoc-harbour" in printed.stdout and "gate [ns]" in printed.stdout and "σ* [mm]" in printed.stdout
+    assert "* not the scene's gate, 6-21 ns" in printed.stdout and "5e+03" in printed.stdout
     csv = (tmp_path / "out" / "budget.csv").read_text().splitlines()
     assert len(csv) == 7 and csv[0].startswith("medium,extinction,range")
     assert (tmp_path / "out" / "budget.png").is_file()
