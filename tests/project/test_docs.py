@@ -219,6 +219,7 @@ def test_ballistic_light_of_the_figure_is_the_analytic_signal():
     assert 1.2 < mean[target] < np.exp(2.0 * figure.ALBEDO * 0.4)
 
 
+@pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # 2000 photons
 def test_formats_page_names_everything_in_the_files(tmp_path):
     """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
     from spadwarp.frames import record_frames
