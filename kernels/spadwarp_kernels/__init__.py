@@ -82,7 +82,7 @@ from .surface import (
     surface_choices,
     unshadowed,
 )
-from .tally import COMPONENTS, COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, to_fixed_point
+from .tally import COMPONENTS, COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, has_overflowed, to_fixed_point
 from .transport import (
     Data,
     Model,
@@ -145,6 +145,7 @@ __all__ = [
     "ggx_brdf",
     "ggx_normals",
     "ggx_pdf",
+    "has_overflowed",
     "henyey_greenstein_density",
     "henyey_greenstein_pdf",
     "interpolated_density",

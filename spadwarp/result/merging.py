@@ -39,7 +39,8 @@ class Tallies:
                 raise ConfigError(f"the results count different things in their {name}: {', '.join(sorted(strange))}")
         self.tallies += other.tallies
         self.ledger = {name: value + other.ledger[name] for name, value in self.ledger.items()}
-        self.counters = {name: value + other.counters[name] for name, value in self.counters.items()}
+        names = dict.fromkeys([*self.counters, *other.counters])  # older results have fewer
+        self.counters = {name: self.counters.get(name, 0) + other.counters.get(name, 0) for name in names}
         if self.second_moment is not None:
             assert other.second_moment is not None
             low, high = self.second_moment
@@ -80,7 +81,7 @@ def merge(results: Iterable[Result]) -> Result:
         raise ConfigError(f"merge: {error}") from error
     for other in parts[1:]:
         check_targets(first.truth, other.truth, "merge")
-    check_capacity(np.sum([part.tallies.sum(axis=0, dtype=np.float64) for part in parts], axis=0))
+    check_capacity(*(part.tallies for part in parts))
     total = Tallies.of(first)
     for other in parts[1:]:
         total.add(other)
@@ -112,13 +113,17 @@ def join_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) 
     return head if len(each) == 1 else {**head, "parts": each}
 
 
-def check_capacity(total: NDArray[np.float64]) -> None:
-    """Raises `SpadwarpError` where a bin's sum over components leaves the range of its 64-bit integer."""
-    if total.size and (total.max() >= 2.0**62 or total.min() < 0.0):
-        raise SpadwarpError(
-            "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at "
-            "a time and add up their histograms"
-        )
+def check_capacity(*tallies: NDArray[np.int64]) -> None:
+    """Raises `SpadwarpError` where a bin's sum over components and parts leaves the range of its 64-bit integer."""
+    total = np.sum([part.sum(axis=0, dtype=np.float64) for part in tallies], axis=0)
+    if total.size and (total.max() >= 2.0**62 or min(part.min() for part in tallies) < 0):
+        raise SpadwarpError(OVERFLOW)
+
+
+OVERFLOW = (
+    "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at a time "
+    "and average their histograms"
+)
 
 
 def check_targets(a: Truth, b: Truth, action: str) -> None:

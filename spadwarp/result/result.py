@@ -61,8 +61,9 @@ class Result:
         ledger: Where the emitted weight went, in units of `ledger_unit` photons. Entries are differences of fixed-point
             weights (before − after; a gain is negative), so that their sum is exactly the emitted weight.
         ledger_unit: Photons per ledger unit, a power of two.
-        counters: Numbers of events and of contributions that were clipped; light before and after the gate in tally
-            units (`guided` aims inside the gate and counts there what its surfaces score alone).
+        counters: Numbers of events, of contributions that were clipped or not a number, and by component of those of
+            less than one tally unit, see `rounding_error`; light before and after the gate in tally units (`guided`
+            aims inside the gate and counts there what its surfaces score alone).
         truth: Depth, range, normal and reflectance at pixel centres.
         timing: Seconds of each stage.
         provenance: Versions, device and date.
@@ -185,6 +186,18 @@ class Result:
         returned = value > 0
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
+    @property
+    def rounding_error(self) -> dict[str, float]:
+        """What rounding to the tally's unit adds to the relative standard error of an average lit bin, at most, by
+        component; infinite where light came but none was left. Values of one unit or more round without notice."""
+        errors: dict[str, float] = {}
+        for name, tally in zip(COMPONENTS, self.tallies, strict=True):
+            small, total = self.counters.get(f"below_unit_{name}", 0), float(tally.sum(dtype=np.float64))
+            # A value f < 1 has the variance f (1 - f), of at most 1/4 and f.
+            variance = min(0.25 * small, total) * np.count_nonzero(tally)
+            errors[name] = math.sqrt(variance) / total if total else math.inf if small else 0.0
+        return errors
+
     # The time axis
 
     @property
@@ -279,6 +292,7 @@ class Result:
             },
             "ledger": self.ledger_report(),
             "counters": dict(self.counters),
+            "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }

@@ -2,7 +2,7 @@
 
 from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
 from spadwarp.transport.simulation import Progress, provenance, simulate
-from spadwarp.transport.tally_unit import PHOTON_CAPACITY, tally_scale
+from spadwarp.transport.tally_unit import PHOTON_CAPACITY, photon_capacity, tally_scale
 from spadwarp.transport.truth import truth_maps
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "PhotonRecords",
     "Progress",
     "load_records",
+    "photon_capacity",
     "provenance",
     "save_records",
     "simulate",

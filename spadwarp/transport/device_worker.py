@@ -12,8 +12,9 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
-from spadwarp.errors import DeviceError, kernel_errors
+from spadwarp.errors import DeviceError, SpadwarpError, kernel_errors
 from spadwarp.result import COMPONENTS, Tallies
+from spadwarp.result.merging import OVERFLOW
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
 
 __all__ = ["DeviceWorker", "device_errors"]
@@ -76,7 +77,9 @@ class DeviceWorker:
             report: Called with the photons of each launch, from the thread that ran it.
         """
         if self._batches is None:
-            return self._trace(block, stopped, report)
+            traced = self._trace(block, stopped, report)
+            self._check_overflow(self.data.tally)
+            return traced
         done: list[Range] = []
         for first in range(*block, self._batch_size):
             batch = first, first + self._batch_size
@@ -86,7 +89,15 @@ class DeviceWorker:
                 break
             self._close_batch()
             done.append(batch)
+        self._check_overflow(self._batches.total)
         return joined(done)
+
+    def _check_overflow(self, tally: wp.array) -> None:
+        """After every block of photons, long before an integer could go round and look right again."""
+        with device_errors(self.model.device):
+            overflowed = sk.has_overflowed(tally)
+        if overflowed:
+            raise SpadwarpError(OVERFLOW)
 
     def _trace(self, ids: Range, stopped: threading.Event, report: Callable[[int], None]) -> Ranges:
         waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()

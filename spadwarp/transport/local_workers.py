@@ -58,7 +58,7 @@ class LocalWorkers:
         models = []
         for device in devices:
             with device_errors(device):
-                models.append(build_model(plan.scene, device, plan.mesh, copies=copies))
+                models.append(build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale))
         built = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh)
         settings: dict[str, Any] = {

@@ -32,7 +32,13 @@ _UNLIMITED = 1.0e30
 
 
 def build_model(
-    scene: Scene, device: wp.Device, mesh: TriangleMesh | None, *, camera: bool = True, copies: float = 1
+    scene: Scene,
+    device: wp.Device,
+    mesh: TriangleMesh | None,
+    *,
+    camera: bool = True,
+    copies: float = 1,
+    scale: float | None = None,
 ) -> sk.Model:
     """The scene on a device.
 
@@ -41,6 +47,7 @@ def build_model(
         device: From `spadwarp.device.pick_device`.
         mesh: From `spadwarp.mesh.build_mesh`.
         copies: Histograms that the run will hold on the device, for the check of its memory.
+        scale: Tally units per emitted photon; None: `tally_scale(scene, mesh)`.
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
     Raises:
@@ -53,6 +60,8 @@ def build_model(
     if camera:
         _check_gate(scene)
     lens, limits = _camera(scene), _limits(scene, camera)
+    if scale is None:
+        scale = tally_scale(scene, mesh) if camera else 1.0
     device_mesh, surfaces = _surfaces(mesh, lens if camera else None, device)
     model = sk.Model(
         device=device,
@@ -64,7 +73,7 @@ def build_model(
         guiding=_guiding(scene, limits.max_path),
         mesh=device_mesh,
         surfaces=surfaces,
-        scale=tally_scale(scene, mesh),
+        scale=scale,
     )
     if scene.medium.layers:
         model = dataclasses.replace(model, layers=_layers(scene, device))

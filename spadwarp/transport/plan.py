@@ -11,6 +11,7 @@ from spadwarp.result import Result
 from spadwarp.result.merging import physics_of
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.scene import Scene
+from spadwarp.transport.tally_unit import scale_and_capacity
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
@@ -35,6 +36,7 @@ class Plan:
         seed: 64-bit.
         ids: Of the photons, [start, stop).
         batch_size: Photons of a batch, for the error of every bin; 0: no batches.
+        scale: Tally units per emitted photon.
         launch_size: Photons in one launch; None: what suits the device.
     """
 
@@ -42,6 +44,7 @@ class Plan:
     mesh: TriangleMesh | None
     seed: int
     ids: Range
+    scale: float
     batch_size: int = 0
     launch_size: int | None = None
 
@@ -86,10 +89,22 @@ def make_plan(
             raise ConfigError(
                 f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
             )
+    mesh = build_mesh(scene)
+    scale, capacity = scale_and_capacity(scene, mesh)
+    _check_capacity(photons, capacity)
     ids = first_photon, first_photon + photons
     if shard is not None:
         ids = shard_of(ids, shard, batch_size or 1)
-    return Plan(scene, build_mesh(scene), seed, ids, batch_size, launch_size)
+    return Plan(scene, mesh, seed, ids, scale, batch_size, launch_size)
+
+
+def _check_capacity(photons: int, capacity: int) -> None:
+    if photons > capacity:
+        raise ConfigError(
+            f"photons = {photons} is outside [1, {capacity}]: the unit of this scene's histogram is fine enough for "
+            "its furthest target, and more photons might overflow its brightest bin; average runs with other seeds "
+            "instead, or start the gate later"
+        )
 
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:

@@ -6,6 +6,7 @@ import datetime
 import platform
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,18 +18,22 @@ import numpy as np
 from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.parallel import Ray, interruptible
-from spadwarp.result import Result, Tallies
+from spadwarp.result import COMPONENTS, Result, Tallies
 from spadwarp.result.merging import add_timing, check_capacity, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
 from spadwarp.scene import Scene
 from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, make_plan
-from spadwarp.transport.tally_unit import tally_scale
 
 __all__ = ["Progress", "provenance", "simulate"]
 
 Progress = Callable[[str, int, int], None]
+
+# Rounding is worth a warning where it adds more than this to the relative error of a bin, and where contributions are
+# so small, in numbers of them to one unit, that their own scatter is less.
+_LARGEST_ROUNDING_ERROR = 0.05
+_MANY = 10
 
 
 def simulate(
@@ -120,12 +125,29 @@ def simulate(
             note = None if progress is None else lambda text: progress(text, 0, 0)
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
         try:
-            return _Run(plan, workers, resume, progress, writer).result(stopped, relative_error)
+            result = _Run(plan, workers, resume, progress, writer).result(stopped, relative_error)
         except DeviceError as error:
             if writer.photons:
                 kept = f"{writer.path}: the {writer.photons} photons that were done are here; resume it"
                 raise DeviceError(f"{error}\n{kept}") from error
             raise
+    _warn_of_rounding(result)
+    return result
+
+
+def _warn_of_rounding(result: Result) -> None:
+    """Warns where contributions are so small that rounding them to the tally's unit decides the error."""
+    for name, error in result.rounding_error.items():
+        small = result.counters.get(f"below_unit_{name}", 0)
+        total = int(result.tallies[COMPONENTS.index(name)].sum(dtype=np.float64))
+        if error > _LARGEST_ROUNDING_ERROR and small > _MANY * max(total, 1):
+            text = f"adds {100 * error:.2g} % to the error of an average lit bin" if total else "left none of it"
+            warnings.warn(
+                f"{name}: rounding to the histogram's unit {text}: {small} contributions of less than one unit came to "
+                f"{total} units in all; more photons help, and a later gate.start or narrower bins make the unit finer",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
 
 class _Run:
@@ -136,7 +158,7 @@ class _Run:
     ) -> None:
         self._plan, self._workers, self._resumed, self._checkpoint = plan, workers, resumed, checkpoint
         self._report = (lambda stage, done, total: None) if progress is None else progress
-        self._unit = 1.0 / tally_scale(plan.scene, plan.mesh)
+        self._unit = 1.0 / plan.scale
         if resumed is not None and resumed.unit != self._unit:
             raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
         began = time.perf_counter()
@@ -200,10 +222,12 @@ class _Run:
         total, timing, made = self._workers.tallies(), dict(self._workers.timing), provenance()
         timing |= {"truth": self._truth_seconds, "trace": time.perf_counter() - self._began}
         made |= self._workers.metadata()
-        if self._resumed is not None:
+        if self._resumed is None:
+            check_capacity(total.tallies)
+        else:
+            check_capacity(total.tallies, self._resumed.tallies)
             total = Tallies.of(total)
             total.add(self._resumed)
-        check_capacity(total.tallies.sum(axis=0, dtype=np.float64))
         result = Result(
             scene=self._plan.scene,
             **vars(total),

@@ -1,4 +1,4 @@
-"""The unit of a scene's tallies, from an upper bound of its brightest bin."""
+"""The unit of a scene's tallies, between the brightest bin that they hold and the faintest light that they resolve."""
 
 from __future__ import annotations
 
@@ -7,27 +7,107 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spadwarp.scene import Laser, Scene
+from spadwarp.scene import Laser, Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.frustum import view_planes
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["PHOTON_CAPACITY", "tally_scale"]
+__all__ = ["PHOTON_CAPACITY", "photon_capacity", "tally_scale"]
 
-# Photons that a tally can hold: the unit is chosen so that the brightest bin stays below 2^62 after this many.
 PHOTON_CAPACITY = 2**40
+"""Photons that a tally holds, where the faintest light does not ask for a finer unit; else `photon_capacity`, which is
+at least 1/16 of it."""
+
+_LEAST_CAPACITY = 2**36
+
+# A single contribution of the faintest light has this many units at least, if the least capacity allows it: rounding
+# adds 2 % to the variance then.
+_FAINT_UNITS = 4.0
+
+_LARGEST_BIN = 2.0**62
 
 
 def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
-    """Tally units per emitted photon, a power of two: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62.
+    """Tally units per emitted photon, a power of two; a function of the scene alone, so that parts of a run add up.
 
-    The brightest bin is bounded from above by the lidar equation at the near end of the gate, for light scattered
-    evenly in all directions, or off the nearest point of a target, all of it within one bin, shared by the pixels that
-    the beam spans; for a laser away from the lens also where its beam, narrow near its exit, crosses the view. Times 16
-    for multiple scattering.
+    From both ends: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62; or fewer, down to 1/16, where a finer
+    unit is needed to resolve the faintest light, the next event of one photon on the furthest target.
+    """
+    return scale_and_capacity(scene, mesh)[0]
+
+
+def photon_capacity(scene: Scene, mesh: TriangleMesh | None) -> int:
+    """Photons, in all parts of a run together, that keep the brightest bin of a scene's tally below 2^62."""
+    return scale_and_capacity(scene, mesh)[1]
+
+
+def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, int]:
+    """`tally_scale` and `photon_capacity`, which share their work."""
+    density = _phase_density(scene)
+    brightest, faintest = (min(max(bound(scene, mesh, density), 1e-30), 1.0) for bound in (_brightest, _faintest))
+    coarsest, finest = (
+        math.floor(math.log2(_LARGEST_BIN / (photons * brightest))) for photons in (PHOTON_CAPACITY, _LEAST_CAPACITY)
+    )
+    wanted = math.ceil(math.log2(_FAINT_UNITS / faintest))
+    # Finer than 2^-52, light that by chance scatters right before the lens would not fit into one contribution.
+    scale = 2.0 ** min(max(coarsest, min(wanted, finest)), 52)
+    return scale, min(PHOTON_CAPACITY, int(_LARGEST_BIN / (brightest * scale)))
+
+
+Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _phase_density(scene: Scene) -> Density:
+    """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
+    import spadwarp_kernels as sk
+
+    medium = scene.medium
+    common = phase_function(medium).over_t
+    own = _own_anisotropies(scene)
+    return lambda t: np.max([common(t), *(sk.henyey_greenstein_density(t, g) for g in own)], axis=0)
+
+
+def _own_anisotropies(scene: Scene) -> list[float]:
+    """Of layers that share the phase function's form alone."""
+    if scene.medium.has_phase_table:
+        return []
+    return [layer.anisotropy for layer in scene.medium.layers if layer.anisotropy is not None]
+
+
+def _backward(scene: Scene, density: Density) -> float:
+    """Density [1/sr] with which light is thrown back: the largest of the phase function beyond 90°, or what many
+    small deflections come to, isotropic scattering of (1 - <cos>) times the light."""
+    turned = 1.0 - min([phase_function(scene.medium).mean_cosine, *_own_anisotropies(scene)])
+    return max(float(density(np.linspace(1.0, 2.0, 181)).max()), turned / (4.0 * math.pi))
+
+
+def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
+    """Next event of a photon of full weight at the far end of the scene: on the furthest target, or in the water."""
+    furthest = 0.5 * scene.path_limit
+    scattered = max(_largest_albedo(scene), 1e-3) * float(density(np.array([2.0]))[0])
+    if mesh is not None:
+        furthest = min(furthest, float(np.linalg.norm(np.abs(mesh.bounds).max(axis=0))))
+        scattered = max(float(mesh.reflectance.max()), 1e-3) / math.pi
+    through = math.exp(-scene.optical_depth([0.0, 0.0, 0.0], [0.0, 0.0, furthest]))
+    return scattered * through * scene.camera.aperture_area / furthest**2
+
+
+def _largest_albedo(scene: Scene) -> float:
+    return max(water.scattering / max(water.extinction, 1e-30) for water in scene.medium.waters)
+
+
+def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
+    """The brightest bin's share of the light.
+
+    It is bounded from above by the lidar equation at the near end of the gate, for light scattered back in the water,
+    or off the nearest point of a target, all of it within one bin, shared by the pixels that the beam spans; for a
+    laser away from the lens also where its beam, narrow near its exit, crosses the view, and for light that scatters
+    into the view before the beam reaches it. Times 16 for multiple scattering, and lost by absorption alone, since what
+    scatters may still arrive.
     """
     camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
     speed = medium.pulse_speed
@@ -45,29 +125,49 @@ def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
     baseline = math.hypot(laser.position[0], laser.position[1])
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
     scattering = max(water.scattering for water in medium.waters)
-    extinction = min(water.extinction for water in medium.waters)
-    water = scattering * 0.5 * gate.bin_width * speed / (4.0 * math.pi * nearest**2)
-    surface, bistatic = 0.0, _crossing(scene, illuminated_pixels)
+    absorption = _absorption(scene)
+    reach = 0.5 * gate.bin_width * speed
+    # The integral of 1/r^2 over the bin.
+    backward = scattering * _backward(scene, density) * reach
+    water = backward / (nearest * (nearest + reach))
+    surface, bistatic = 0.0, _crossing(scene, illuminated_pixels, density)
     if mesh is not None:
-        lower, upper = mesh.bounds.astype(float)
-        gap = float(np.linalg.norm(np.maximum(np.maximum(lower, -upper), 0.0)))
+        gap = _distance(np.zeros(3), mesh)
         white = 1.0
         if mesh.specular is not None and mesh.roughness is not None:
             # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
             white = max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
         surface = white / (math.pi * max(gap, nearest) ** 2)
         if math.hypot(*laser.position) > 0.25 * gap:
-            exit_point = np.array(laser.position)
-            reach = float(np.linalg.norm(np.maximum(np.maximum(lower - exit_point, exit_point - upper), 0.0)))
-            spot = illuminated_pixels(min(1.0, reach / max(gap, 1e-3)))
-            through = math.exp(-extinction * (gap + reach))
+            thrown = _distance(np.array(laser.position), mesh)
+            spot = illuminated_pixels(min(1.0, thrown / max(gap, 1e-3)))
+            through = math.exp(-absorption * (gap + thrown))
             bistatic = max(bistatic, white * through / (math.pi * max(gap, camera.aperture_radius, 0.01) ** 2 * spot))
-    coaxial = max(water, surface) * math.exp(-extinction * 2.0 * nearest) / illuminated_pixels(1.0)
-    brightest = 16.0 * camera.aperture_area * max(coaxial, bistatic)
-    brightest = min(max(brightest, 1e-30), 1.0)
-    exponent = math.floor(62 - math.log2(PHOTON_CAPACITY) - math.log2(brightest))
-    # Beyond 2^52 an analog photon of weight 1 would not fit into one contribution.
-    return 2.0 ** min(exponent, 52)
+    coaxial = max(water, surface) * math.exp(-absorption * 2.0 * nearest) / illuminated_pixels(1.0)
+    aside = 0.0
+    if baseline > camera.aperture_radius:
+        view = min(4.0 * half_field**2 * camera.height / camera.width, 2.0 * math.pi) / (4.0 * math.pi)
+        longest = max(gate.start * speed, baseline)
+        aside = min(scattering * baseline, 1.0) * backward * view * math.exp(-absorption * longest) / baseline**2
+        aside /= share if share > 1 else pixels
+    return 16.0 * camera.aperture_area * max(coaxial, bistatic, aside)
+
+
+def _absorption(scene: Scene) -> float:
+    return max(0.0, min(water.extinction - water.scattering for water in scene.medium.waters))
+
+
+def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
+    """From a point to the nearest face [m]."""
+    from trimesh.triangles import closest_point
+
+    vertices, faces = mesh.vertices - point.astype(np.float32), mesh.faces
+    nearest = (vertices**2).sum(axis=1).min()
+    corners = [vertices[faces[:, k]] for k in range(3)]
+    # The boxes about the faces leave few of them.
+    box = np.maximum(np.minimum.reduce(corners), -np.maximum.reduce(corners)).clip(min=0.0)
+    near = vertices[faces[(box**2).sum(axis=1) <= 1.001 * nearest]].astype(np.float64)
+    return float(np.linalg.norm(closest_point(near, np.zeros((len(near), 3))), axis=1).min())
 
 
 def _spread(laser: Laser) -> float:
@@ -81,7 +181,7 @@ def _spread(laser: Laser) -> float:
     return math.tan(min(laser.half_angle, 1.5))
 
 
-def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float]) -> float:
+def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float], density: Density) -> float:
     """Largest share of the light per area of the lens [1/m^2] that one bin of one pixel gets where the beam's axis is
     in view, by single scattering; 0 if it never is, or starts at the lens."""
     camera, laser, gate = scene.camera, scene.beam, scene.gate
@@ -96,15 +196,17 @@ def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float]) -> flo
     seen = (points @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)
     seen &= (along + away >= gate.start * speed) & (along + away <= gate.stop * speed)
     brightest = 0.0
-    g, scattering = scene.medium.anisotropy, max(water.scattering for water in scene.medium.waters)
-    extinction = min(water.extinction for water in scene.medium.waters)
+    scattering = max(water.scattering for water in scene.medium.waters)
+    absorption = _absorption(scene)
     for distance, point, r in zip(along[seen], points[seen], away[seen], strict=True):
         one_minus_cosine = 1.0 + float(point @ laser.axis) / r
-        phase = (1.0 - g * g) / (4.0 * math.pi * ((1.0 - g) ** 2 + 2.0 * g * one_minus_cosine) ** 1.5)
+        # A peak that is narrower than half the lens lights a part of it.
+        narrowest = 0.5 * (0.25 * camera.aperture_radius / r) ** 2
+        phase = float(density(np.array([np.clip(one_minus_cosine, narrowest, 2.0)]))[0])
         # The part of the beam that arrives within a bin; light that comes straight at the lens arrives all at once.
         part = min(gate.bin_width * speed / max(one_minus_cosine, 1e-6), distance + r)
         r = max(r, camera.aperture_radius, 0.01)
-        value = scattering * part * phase * math.exp(-extinction * (distance + r)) / r**2
+        value = scattering * part * phase * math.exp(-absorption * (distance + r)) / r**2
         value /= illuminated_pixels(distance / r)
         brightest = max(brightest, value)
     return brightest

@@ -2,7 +2,7 @@
 
 from .batches import Batches
 from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
-from .tally import COMPONENTS, Contribution, deposit, tally_index, to_fixed_point
+from .tally import COMPONENTS, Contribution, deposit, has_overflowed, tally_index, to_fixed_point
 
 __all__ = [
     "COMPONENTS",
@@ -15,6 +15,7 @@ __all__ = [
     "Contribution",
     "add_to_ledger",
     "deposit",
+    "has_overflowed",
     "tally_index",
     "to_fixed_point",
     "to_ledger",

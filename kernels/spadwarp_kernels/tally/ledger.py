@@ -34,6 +34,9 @@ COUNTERS = (
     "after_gate",
     "clipped",
     "invalid",
+    "below_unit_ballistic",
+    "below_unit_forward_scattered",
+    "below_unit_backscatter",
 )
 LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS)
 
@@ -51,7 +54,8 @@ ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT,
     AFTER_GATE,
     CLIPPED,
     INVALID,
-) = (wp.constant(len(LEDGER_ENTRIES) + i) for i in range(len(COUNTERS)))
+    BELOW_UNIT,
+) = (wp.constant(len(LEDGER_ENTRIES) + i) for i in range(len(COUNTERS) - 2))
 
 
 @wp.func_native("""

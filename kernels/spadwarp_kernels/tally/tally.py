@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_array
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import BEFORE, Gate, gate_bin
 
-from .ledger import AFTER_GATE, BEFORE_GATE, CLIPPED, INVALID, OUTSIDE_SHIFT, add_to_ledger
+from .ledger import AFTER_GATE, BEFORE_GATE, BELOW_UNIT, CLIPPED, INVALID, OUTSIDE_SHIFT, add_to_ledger
 
 # What a history's events make of its light: the first axis of the tally.
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
@@ -27,8 +28,8 @@ class Contribution:
     rounding_sample: float
 
 
-# Largest single contribution, in tally units; what is above it is clipped and counted.
-_DEPOSIT_LIMIT = wp.constant(9.007199254740992e15)
+# Largest single contribution, in tally units, 2^58: what is above it is clipped and counted.
+_DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
 
 
 @wp.func_native("""
@@ -63,6 +64,32 @@ def to_fixed_point(value: float, scale: float, rounding_sample: float) -> wp.int
     return wp.int64(-2)
 
 
+# A voxel's sum beyond this has used up its 64 bits, or soon will.
+VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
+
+
+@wp.kernel(enable_backward=False)
+def find_overflow_kernel(tally: wp.array(dtype=wp.int64), found: wp.array(dtype=int)):
+    """Launch: voxels."""
+    voxel = wp.tid()
+    if tally[voxel] < wp.int64(0) or tally[voxel] >= VOXEL_LIMIT:
+        found[0] = 1
+
+
+def has_overflowed(tally: wp.array) -> bool:
+    """Whether a voxel has left [0, 2^62); waits for the device.
+
+    Asked often enough, before a voxel can go round, this leaves no overflow unnoticed.
+
+    Raises:
+        ArgumentError: `tally` is not an array of int64 with one axis.
+    """
+    check_array("tally", tally, wp.int64, (None,))
+    found = wp.zeros(1, dtype=int, device=tally.device)
+    wp.launch(find_overflow_kernel, dim=tally.size, inputs=[tally], outputs=[found], device=tally.device)
+    return bool(found.numpy()[0])
+
+
 @wp.func
 def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
     """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
@@ -81,7 +108,7 @@ def deposit(
     scale: float,
     c: Contribution,
 ) -> wp.vec2l:
-    """Adds a contribution to its voxel of the tally; BEFORE or AFTER is counted in the ledger.
+    """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit.
 
     Returns what `add_pending` returns, which the next call takes as `pending`.
     """
@@ -91,6 +118,10 @@ def deposit(
     elif c.index >= 0:
         if units > wp.int64(0):
             pending = add_pending(tally, pending, c.index, units)
+        if c.value * scale < 1.0:
+            voxels = tally.shape[0] // wp.static(len(COMPONENTS))
+            component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
+            add_to_ledger(ledger, thread, BELOW_UNIT + component, wp.int64(1))
     else:
         # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
         entry = wp.where(c.index == BEFORE, BEFORE_GATE, AFTER_GATE)

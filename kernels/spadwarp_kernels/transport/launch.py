@@ -167,9 +167,12 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device."""
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
-    totals = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS).sum(axis=1)
-    names = LEDGER_ENTRIES + COUNTERS
-    values = {name: int(total) for name, total in zip(names, totals, strict=True)}
+    slots = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS)
+    # In halves: light outside the gate may exceed 64 bits in all.
+    high, low = (slots >> 32).sum(axis=1).tolist(), (slots & 0xFFFFFFFF).sum(axis=1).tolist()
+    values = {
+        name: (upper << 32) + lower for name, upper, lower in zip(LEDGER_ENTRIES + COUNTERS, high, low, strict=True)
+    }
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
     return {n: values[n] for n in LEDGER_ENTRIES}, {n: values[n] for n in COUNTERS}
