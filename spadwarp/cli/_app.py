@@ -79,8 +79,8 @@ class _Commands(TyperGroup):
                 if sys.stdout is not None:  # as in `spadwarp info out/ >&-`
                     sys.stdout.flush()  # a full disk shows here, not when Python ends
                 return answer
-            except KeyboardInterrupt:
-                fail("interrupted; unfinished files were not written", INTERRUPTED)
+            except KeyboardInterrupt as stop:
+                fail(str(stop) or "interrupted; unfinished files were not written", INTERRUPTED)
 
 
 def _exit_code(error: Exception) -> int:

@@ -33,8 +33,9 @@ def train(
 ) -> None:
     """Train a denoiser on the clean scenes of a dataset.
 
-    New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; the same
-    command resumes an interrupted training. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; Ctrl-C or
+    SIGTERM keep a checkpoint of the last step, and the same command resumes the training. On several GPUs: torchrun
+    --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

@@ -26,6 +26,7 @@ from spadwarp.denoise.recipe import Noise, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.parallel.worker import interruptible
 
 __all__ = ["LEVELS", "Trained", "fit"]
 
@@ -72,7 +73,9 @@ def fit(
         training, validation: Clean scenes, on any device.
         out: Folder for `checkpoint.pt`, `log.jsonl` and the weights.
         device: "cpu", "cuda" or "cuda:N"; default: the GPU of this process, else the CPU.
-        progress: Called with ("steps", done, total).
+        progress: Called with ("steps", done, total) after every step.
+
+    Ctrl-C or SIGTERM end the run after the step at hand with a checkpoint and a KeyboardInterrupt that names it.
 
     Each process draws crops and noise of its own. A run of N processes equals, to the rounding of sums, a run of a
     single process whose batches are the N parts together; only batch normalisation, in DnCNN, sees its own part alone.
@@ -91,34 +94,29 @@ def fit(
     Path(out).mkdir(parents=True, exist_ok=True)
     training, validation = training.to(workers.device), validation.to(workers.device)
     run = _Run(recipe, Path(out), workers)
-    precision = torch.bfloat16 if settings.precision == "bfloat16" and workers.is_cuda else torch.float32
-    loss_sum = torch.zeros((), device=workers.device)
     psnr: dict[float, float] = {}
 
-    while run.step < settings.steps:
-        for group in run.optimiser.param_groups:
-            group["lr"] = _learning_rate(run.step, recipe)
-        run.learner.train()
-        batch = draw_batch(
-            training, recipe.noise, size=settings.batch // workers.size, crop=settings.crop, generator=run.generator,
-            histograms=reads_histograms(run.network),
-        )  # fmt: skip
-        with torch.autocast(workers.device.type, dtype=precision, enabled=precision != torch.float32):
-            output = run.learner(batch.frame.contiguous(memory_format=torch.channels_last))
-        loss = loss_of(output.float(), batch, kind=settings.loss)
-        run.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(run.network.parameters(), 1.0)
-        run.optimiser.step()
-        _update_mean(run.average, run.network, settings.averaging if run.step > settings.warm_up else 0.0)
-        run.step += 1
-        loss_sum += loss.detach()
-        if run.step % settings.report_every == 0 or run.step == settings.steps:
-            psnr = validation_psnr(run.average, validation, recipe)
-            run.report(float(loss_sum), psnr)
-            loss_sum.zero_()
+    with interruptible() as interrupted:
+        while run.step < settings.steps and not workers.any(interrupted.is_set()):
+            for group in run.optimiser.param_groups:
+                group["lr"] = _learning_rate(run.step, recipe)
+            batch = draw_batch(
+                training, recipe.noise, size=settings.batch // workers.size, crop=settings.crop,
+                generator=run.generator, histograms=reads_histograms(run.network),
+            )  # fmt: skip
+            run.update(batch)
+            if run.step % settings.report_every == 0 or run.step == settings.steps:
+                psnr = validation_psnr(run.average, validation, recipe)
+                run.report(psnr)
             if progress is not None and workers.rank == 0:
                 progress("steps", run.step, settings.steps)
+
+        if run.step < settings.steps:
+            run.save_checkpoint()
+            workers.close()
+            raise KeyboardInterrupt(
+                f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}"
+            )
 
     trained = run.finish(psnr or validation_psnr(run.average, validation, recipe))
     workers.close()
@@ -230,6 +228,15 @@ class _Workers:
             torch.cuda.set_device(self.device)
         if self.size > 1:
             torch.distributed.init_process_group("nccl" if self.is_cuda else "gloo")
+            self._on_host = torch.distributed.new_group(backend="gloo")
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in any of the processes; asked on the host, so that no GPU has to wait."""
+        if self.size == 1:
+            return flag
+        flags = torch.tensor(int(flag))
+        torch.distributed.all_reduce(flags, torch.distributed.ReduceOp.MAX, group=self._on_host)
+        return bool(flags)
 
     def close(self) -> None:
         if self.size > 1:
@@ -262,8 +269,9 @@ class _Run:
         )
         self.generator = torch.Generator(workers.device).manual_seed(recipe.seed * 1009 + workers.rank)
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
+        self.loss_sum = torch.zeros((), device=workers.device)  # of the steps since the last report
         self.step, spent = self._resume()
-        self.last_report = time.monotonic()
+        self.last_report, self.timed_from = time.monotonic(), self.step
         self.began = self.last_report - spent
 
     def _resume(self) -> tuple[int, float]:
@@ -285,36 +293,60 @@ class _Run:
             self.generator.set_state(kept["random"][rank])
         if rank == 0 and self.log.is_file():  # a line is written before its checkpoint
             lines = self.log.read_text().splitlines(keepends=True)
-            lines = lines[: math.ceil(kept["step"] / self.recipe.optimiser.report_every)]
+            settings = self.recipe.optimiser
+            reports = kept["step"] // settings.report_every
+            lines = lines[
+                : reports if kept["step"] < settings.steps else math.ceil(kept["step"] / settings.report_every)
+            ]
             with atomic_path(self.log) as temporary:
                 temporary.write_text("".join(lines))
+        self.loss_sum += kept.get("loss_sum", 0.0)
         return int(kept["step"]), float(kept["seconds"])
 
-    def report(self, loss: float, psnr: dict[float, float]) -> None:
-        """Writes a line of the log and a checkpoint. `loss`: sum since the last report."""
+    def update(self, batch: Batch) -> None:
+        """One step of the optimiser."""
+        settings, device = self.recipe.optimiser, self.workers.device
+        lower = settings.precision == "bfloat16" and self.workers.is_cuda
+        self.learner.train()
+        with torch.autocast(device.type, dtype=torch.bfloat16 if lower else torch.float32, enabled=lower):
+            output = self.learner(batch.frame.contiguous(memory_format=torch.channels_last))
+        loss = loss_of(output.float(), batch, kind=settings.loss)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
+        self.step += 1
+        self.loss_sum += loss.detach()
+
+    def report(self, psnr: dict[float, float]) -> None:
+        """Writes a line of the log and a checkpoint."""
         settings, now = self.recipe.optimiser, time.monotonic()
         line = {
             "step": self.step,
-            "loss": loss / (self.step % settings.report_every or settings.report_every),
+            "loss": float(self.loss_sum) / (self.step % settings.report_every or settings.report_every),
             "psnr": {f"{level:.3f}": round(value, 3) for level, value in psnr.items()},
             "mean_psnr": round(sum(psnr.values()) / len(psnr), 3),
-            "pairs_per_second": round(settings.report_every * settings.batch / (now - self.last_report)),
+            "pairs_per_second": round((self.step - self.timed_from) * settings.batch / (now - self.last_report)),
             "seconds": round(now - self.began, 1),
         }
         if self.workers.rank == 0:
             with self.log.open("a") as file:
                 file.write(json.dumps(line) + "\n")
-        self._save_checkpoint(now - self.began)
-        self.last_report = time.monotonic()
+        self.loss_sum.zero_()
+        self.save_checkpoint()
+        self.last_report, self.timed_from = time.monotonic(), self.step
 
-    def _save_checkpoint(self, seconds: float) -> None:
+    def save_checkpoint(self) -> None:
+        """Writes all from which the run can be resumed; every process has to call it."""
         random: list[Any] = [self.generator.get_state()]
         if self.workers.size > 1:
             random = [None] * self.workers.size
             torch.distributed.all_gather_object(random, self.generator.get_state())
         if self.workers.rank == 0:
             kept = {name: part.state_dict() for name, part in self.state.items()}
-            kept.update(recipe=self.recipe.model_dump_json(), random=random, step=self.step, seconds=seconds)
+            kept.update(recipe=self.recipe.model_dump_json(), random=random, step=self.step)
+            kept.update(loss_sum=float(self.loss_sum), seconds=time.monotonic() - self.began)
             with atomic_path(self.checkpoint) as temporary:
                 torch.save(kept, temporary)
 

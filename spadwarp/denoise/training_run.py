@@ -34,13 +34,14 @@ def train(
 ) -> Trained:
     """Trains a denoiser, or resumes an interrupted training.
 
-    Writes `MODEL.safetensors`, `log.jsonl`, `curves.png` and `checkpoint.pt` to the folder `out`.
+    Writes `MODEL.safetensors`, `log.jsonl`, `curves.png` and `checkpoint.pt` to the folder `out`. Ctrl-C or SIGTERM
+    keep a checkpoint of the last step and raise KeyboardInterrupt.
 
     Args:
         recipe: From `spadwarp.denoise.load_training_recipe`, or the recipe's path.
         out: The run's folder; new, or with an interrupted run of the same recipe.
         device: torch device; default: the GPU of this process (torchrun gives one each), else the CPU.
-        progress: Called with ("steps", done, total).
+        progress: Called with ("steps", done, total) after every step.
 
     Raises:
         ConfigError: A recipe that cannot be used, or a run of another recipe in the folder.

@@ -1,6 +1,7 @@
 """Networks, the noise that they are trained on, and their training."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -188,21 +189,32 @@ def train(folder, *, progress=None, **changes):
 
 
 def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path):
-    class Interruption(Exception):
+    """After a checkpoint of the first step (Ctrl-C), one between two reports (SIGTERM), and one that died after it."""
+
+    class Death(Exception):
         pass
 
-    def interrupt(stage, done, total):
-        raise Interruption
+    def at(step, action):
+        return lambda stage, done, total: action() if done == step else None
+
+    def die():
+        raise Death
 
     whole = train(tmp_path / "whole")
-    with pytest.raises(Interruption):
-        train(tmp_path / "parts", progress=interrupt)
+    for step, number in ((1, signal.SIGINT), (4, signal.SIGTERM)):
+        with pytest.raises(KeyboardInterrupt, match=rf"interrupted at step {step} of 6; .*checkpoint\.pt"):
+            train(tmp_path / "parts", progress=at(step, lambda n=number: signal.raise_signal(n)))
+        assert torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["step"] == step
+    with pytest.raises(Death):
+        train(tmp_path / "parts", progress=at(5, die))
     parts = train(tmp_path / "parts")
     for name, values in load_file(whole.weights).items():
         assert torch.equal(values, load_file(parts.weights)[name]), name
     lines = [json.loads(line) for line in parts.log.read_text().splitlines()]
     assert [line["step"] for line in lines] == [3, 6]
     assert lines[-1]["mean_psnr"] == pytest.approx(whole.psnr, abs=1e-3)
+    reference = [json.loads(line) for line in whole.log.read_text().splitlines()]
+    assert [line["loss"] for line in lines] == pytest.approx([line["loss"] for line in reference], rel=1e-5)
 
 
 @pytest.mark.slow
