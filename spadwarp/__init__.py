@@ -30,6 +30,7 @@ _ROOMS = {
     "benchmark": (),
     "doctor": (),
     "device": (),
+    "interop": ("data_frame",),
     "io": (),
     "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from spadwarp.checks import check
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.frames import Frames, arrival_time, crlb, detect
+    from spadwarp.interop import data_frame
     from spadwarp.parallel import Ray
     from spadwarp.result import Result, load_result, merge
     from spadwarp.run import export

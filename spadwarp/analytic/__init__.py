@@ -3,6 +3,7 @@
 from spadwarp.analytic.experiment import Proposal, plan
 from spadwarp.analytic.exposure_proposal import PILE_UP, Exposure
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, permissible_exposure
+from spadwarp.analytic.labelled import to_xarray
 from spadwarp.analytic.model import pixel_maps
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budget
 from spadwarp.analytic.pilot import Pilot
@@ -32,4 +33,5 @@ __all__ = [
     "plan",
     "simulate_analytic",
     "sweep",
+    "to_xarray",
 ]

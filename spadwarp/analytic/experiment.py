@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Proposal", "plan"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Proposal(Exposure):
     """A proposed experiment: an `Exposure`, and
 
@@ -51,6 +51,15 @@ class Proposal(Exposure):
     irradiance: float
     largest_range: float
     range_limit: str
+
+    def __repr__(self) -> str:
+        error, pulses = 1e3 * self.terms["total"], self.pulses
+        return f"Proposal({error:.3g} mm with {pulses} pulses, {self.frame_time:.3g} s; limit: {self.limit})"
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
 
     @property
     def values(self) -> dict[str, float | int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ __all__ = ["AnalyticResult", "background_photons"]
 _PART_PIXELS = 1 << 28  # of frames that a GPU holds at a time: 1.3 GB
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class AnalyticResult:
     """Maps of a scene by the analytic model, and depth frames drawn from them.
 
@@ -65,8 +65,30 @@ class AnalyticResult:
     labels: NDArray[np.bool_]
     seed: int
     # When background photons arrive: the part that is flat over the gate, and the table of the rest.
-    _flat_share: NDArray[np.float32] = field(repr=False)
-    _table: BackscatterTable = field(repr=False)
+    _flat_share: NDArray[np.float32]
+    _table: BackscatterTable
+
+    def __repr__(self) -> str:
+        name = self.scene.source.stem if self.scene.source else "Python"
+        height, width = self.truth.depth.shape
+        return f"AnalyticResult({name}: {width} x {height} pixels, {len(self.depth)} depth frames, seed {self.seed})"
+
+    def plot(self, **options: Any) -> Any:
+        """A figure of the maps and a frame; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    def to_xarray(self) -> Any:
+        """Maps, truth and frames with coordinates and units: see `spadwarp.analytic.to_xarray`."""
+        import spadwarp
+
+        return spadwarp.analytic.to_xarray(self)
 
     @kernel_errors()
     def sample(

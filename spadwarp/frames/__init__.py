@@ -5,6 +5,7 @@ from spadwarp.frames.depth import Reduction, depth_frame, depth_of
 from spadwarp.frames.estimators import METHODS, Method, arrival_time
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.frames import Frames, TimeTags
+from spadwarp.frames.labelled import to_xarray
 from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.pile_up import coates, first_photon_probabilities
@@ -39,4 +40,5 @@ __all__ = [
     "read_histograms",
     "record_frames",
     "response_matrix",
+    "to_xarray",
 ]

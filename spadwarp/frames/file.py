@@ -45,7 +45,7 @@ def is_frames_file(path: str | Path) -> bool:
     return hdf5_format(path) == FORMAT
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FramesFile:
     """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory.
 
@@ -75,6 +75,10 @@ class FramesFile:
     scene: Scene
     truth_depth: NDArray[np.float32]
     methods: tuple[Method, ...]
+
+    def __repr__(self) -> str:
+        height, width = self.truth_depth.shape
+        return f"FramesFile({self.path}: {self.frames} frames of {self.pulses} pulses, {width} x {height} pixels)"
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

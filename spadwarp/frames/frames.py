@@ -26,7 +26,7 @@ class TimeTags(NamedTuple):
     bin: NDArray[np.int32]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Frames:
     """What the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
 
@@ -62,6 +62,28 @@ class Frames:
     seed: int
     tags: TimeTags | None = None
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        height, width, bins = self.counts.shape[-3:]
+        frames = f"{self.frames} frames" + (" added up" if self.summed else "")
+        return f"Frames({frames} of {self.pulses} pulses, seed {self.seed}, {width} x {height} pixels x {bins} bins)"
+
+    def plot(self, frame: int = 0, **options: Any) -> Any:
+        """A figure of one frame: intensity, and the counts of a pixel; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, frame=frame, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    def to_xarray(self) -> Any:
+        """Counts and what they were drawn from, with coordinates and units: see `spadwarp.frames.to_xarray`."""
+        import spadwarp
+
+        return spadwarp.frames.to_xarray(self)
 
     @property
     def summed(self) -> bool:

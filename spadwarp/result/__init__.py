@@ -1,6 +1,7 @@
 """The result of a simulation as plain data, its files, the sum of results, and truth maps from other programs."""
 
 from spadwarp.result.file import load_result, load_truth_maps, save_depth_exr, save_result, save_truth_maps
+from spadwarp.result.labelled import to_xarray
 from spadwarp.result.merging import Tallies, merge
 from spadwarp.result.rendered_truth import EXR_PRESETS, ExrPreset, load_truth_exr
 from spadwarp.result.result import COMPONENTS, Component, Result, Truth
@@ -24,4 +25,5 @@ __all__ = [
     "save_result",
     "save_truth_maps",
     "to_torch",
+    "to_xarray",
 ]

@@ -24,7 +24,7 @@ Component = Literal["ballistic", "forward_scattered", "backscatter"]
 COMPONENTS: tuple[Component, ...] = ("ballistic", "forward_scattered", "backscatter")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Truth:
     """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing.
 
@@ -47,8 +47,14 @@ class Truth:
             if len(shape) != 2 or array.shape != expected or array.dtype != np.float32:
                 raise ArgumentError(f"truth.{name} is {array.dtype} {array.shape}; float32 {expected} is needed")
 
+    def __repr__(self) -> str:
+        height, width = self.depth.shape
+        known = self.depth[np.isfinite(self.depth)]
+        depth = f"{known.min():.4g} to {known.max():.4g} m in {known.size}" if known.size else "nothing is hit, 0"
+        return f"Truth({width} x {height} pixels: depth {depth} pixels)"
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Result:
     """Expected photon histograms of one scene in fixed point, and all that is needed to interpret them.
 
@@ -118,6 +124,12 @@ class Result:
             value = getattr(self, name)
             if not (value > 0 and math.frexp(value)[0] == 0.5):
                 raise ArgumentError(f"{name} = {value} is not a power of two")
+
+    def __repr__(self) -> str:
+        name = self.scene.source.stem if self.scene.source else "Python"
+        height, width, bins = self.tallies.shape[1:]
+        photons = f"{self.photons} photons" + (", interrupted" if self.partial else "")
+        return f"Result({name}: {photons}, seed {self.seed}, {width} x {height} pixels x {bins} bins)"
 
     # Histograms
 
@@ -296,6 +308,23 @@ class Result:
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
+
+    def plot(self, kind: Any = None, **options: Any) -> Any:
+        """A figure: "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, kind, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    def to_xarray(self) -> Any:
+        """Histograms, depth and truth with coordinates and units: see `spadwarp.result.to_xarray`."""
+        import spadwarp
+
+        return spadwarp.result.to_xarray(self)
 
     def save(self, path: str | Path) -> Path:
         """Writes everything to one HDF5 file that `spadwarp.load_result` reads back bit for bit; returns its path."""

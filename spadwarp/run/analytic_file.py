@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.analytic.labelled import MAP_UNITS
 from spadwarp.analytic.model import response_sigma
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
@@ -23,19 +24,6 @@ FORMAT_VERSION = 1
 
 _PART_BYTES = 1 << 28  # of frames that are held at a time
 _PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
-_MAP_UNITS = {
-    "signal": "1",
-    "arrival": "s",
-    "backscatter": "1",
-    "alpha": "1",
-    "fisher": "s^-2",
-    "sigma_time": "s",
-    "sigma_depth": "m",
-    "signal_to_backscatter": "1",
-    "background_level": "1",
-    "outlier_probability": "1",
-    "background_probability": "1",
-}
 _TRUTH_UNITS = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
 _READ_ME = (
     "Depth frames [frame, height, width] in metres along z, NaN for no estimate; labels: the pixel reports background "
@@ -64,7 +52,7 @@ def save_analytic(result: AnalyticResult, path: str | Path, *, frames: int | Non
     with write_hdf5(path) as file:
         file.attrs.update(_metadata(result))
         file.create_dataset("config", data=result.scene.to_toml())
-        for name, unit in _MAP_UNITS.items():
+        for name, unit in MAP_UNITS.items():
             write(f"maps/{name}", getattr(result, name), unit)
         for name, unit in _TRUTH_UNITS.items():
             write(f"truth/{name}", getattr(result.truth, name), unit)

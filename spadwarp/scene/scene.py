@@ -143,6 +143,30 @@ class Scene(BaseModel):
                 changed = _build(changed.to_dict(), overrides=layer, source=self.source, resolve=False)
         return changed
 
+    def plot(self, **options: Any) -> Any:
+        """A figure of what the camera sees through clear water; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    def __repr__(self) -> str:
+        name = self.source.stem if self.source else "Python"
+        targets = ", ".join(target.builtin or Path(target.mesh or "").name for target in self.targets[:3])
+        targets += f" and {len(self.targets) - 3} more" if len(self.targets) > 3 else ""
+        camera, gate = self.camera, self.gate
+        return (
+            f"Scene({name}: {targets or 'no target'}, extinction {self.medium.extinction:.4g} 1/m, "
+            f"{camera.width} x {camera.height} pixels x {gate.bins} bins)"
+        )
+
+    def __str__(self) -> str:
+        return repr(self)
+
     def __eq__(self, other: object) -> bool:
         """Equal in every field; where it came from does not matter."""
         return isinstance(other, Scene) and self.__dict__ == other.__dict__

@@ -5,6 +5,7 @@ from spadwarp.viz.contact_sheet import draw_dataset
 from spadwarp.viz.depth import draw_denoised, draw_depth
 from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.learning_curves import draw_learning_curves
+from spadwarp.viz.notebook import html, plot
 from spadwarp.viz.result import draw_result
 from spadwarp.viz.targets import describe_targets, draw_mesh, draw_targets
 from spadwarp.viz.transient_video import video
@@ -21,4 +22,4 @@ __all__ += [
     "draw_targets",
     "draw_validation",
 ]
-__all__ += ["video", "view"]
+__all__ += ["html", "plot", "video", "view"]

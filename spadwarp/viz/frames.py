@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from spadwarp.frames import first_photon_probabilities
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from spadwarp.frames import Frames, Recording
     from spadwarp.result import Result
 
-__all__ = ["draw_analytic", "draw_recording"]
+__all__ = ["analytic_figure", "draw_analytic", "draw_recording"]
 
 
 def draw_recording(recording: Recording, result: Result, path: str | Path) -> Path:
@@ -75,6 +76,11 @@ def _mean_counts(
 
 def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
     """Maps of the model and a frame, its first one or one that is drawn now; returns the path."""
+    return save(analytic_figure(result), path)
+
+
+def analytic_figure(result: AnalyticResult) -> Figure:
+    """The figure of `draw_analytic`."""
     if len(result.depth):
         frame, labels = result.depth[0], result.labels[0]
     else:
@@ -95,4 +101,4 @@ def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
         f"analytic, {analytic.form} form; water c = {result.scene.medium.extinction:.3g} 1/m; "
         f"backscatter {analytic.backscatter.replace('_', ' ')}; seed {result.seed}"
     )
-    return save(panels.figure, path)
+    return panels.figure

@@ -19,7 +19,10 @@ from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limit
 from spadwarp.viz.style import COMPONENTS as STYLES
 from spadwarp.viz.style import GRID, INTENSITY_MAP, MISSING, TEXT, new_figure, save, spaced
 
-__all__ = ["draw_result"]
+__all__ = ["KINDS", "draw_result", "result_figure"]
+
+KINDS = ("depth", "intensity", "histogram", "truth")
+"""Figures of a result."""
 
 
 def draw_result(
@@ -42,15 +45,24 @@ def draw_result(
     Raises:
         FileError: The folder or a file cannot be written.
     """
-    frame = result.depth(method=method) if depth is None else np.asarray(depth, dtype=np.float64)
-    figures = {
-        "depth": _depth_figure(result, frame, method),
-        "intensity": _intensity_figure(result),
-        "histogram": _histogram_figure(result),
-        "truth": _truth_figure(result),
-    }
     folder = Path(directory)
+    figures = {name: result_figure(result, name, depth=depth, method=method) for name in KINDS}
     return [save(figure, folder / f"{name}.{ending}") for name, figure in figures.items() for ending in formats]
+
+
+def result_figure(
+    result: Result,
+    kind: str,
+    *,
+    depth: NDArray[np.float64] | None = None,
+    method: Method = "centroid",
+    device: Any = None,
+) -> Figure:
+    """One of the figures of `draw_result`, of `KINDS`."""
+    if kind == "depth":
+        frame = result.depth(method=method, device=device) if depth is None else np.asarray(depth, dtype=np.float64)
+        return _depth_figure(result, frame, method)
+    return {"intensity": _intensity_figure, "histogram": _histogram_figure, "truth": _truth_figure}[kind](result)
 
 
 def _panels(result: Result, columns: int) -> Panels:

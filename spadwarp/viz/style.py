@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import textwrap
 from pathlib import Path
@@ -54,9 +55,18 @@ def colour_map(name: str, *, missing: str = MISSING) -> Colormap:
     return matplotlib.colormaps[name].with_extremes(bad=missing)
 
 
+class NotebookFigure(Figure):
+    """A figure that notebooks show although pyplot does not know it."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=96)
+        return buffer.getvalue()
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure [inch]."""
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    return NotebookFigure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def plain_axis(axis: Axes, *, grid: str = "major") -> None:

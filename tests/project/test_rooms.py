@@ -22,7 +22,7 @@ LEVELS = (
     ("mesh", "result"),
     ("scene",),
     ("water",),
-    ("parallel", "arrays"),
+    ("parallel", "interop", "arrays"),
     ("io", "device"),
     ("limits",),
     ("units", "errors"),
@@ -30,7 +30,7 @@ LEVELS = (
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 
 # One-line methods of data classes, which call a public name of `spadwarp`: the one exception.
-ONE_LINE_METHODS = {"depth", "save", "plot", "_repr_html_"}
+ONE_LINE_METHODS = {"depth", "save", "plot", "_repr_html_", "to_xarray"}
 
 MODULES = sorted(path for path in SPADWARP.rglob("*.py") if path.parent != SPADWARP or path.stem in LEVEL)
 

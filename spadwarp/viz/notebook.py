@@ -1,0 +1,217 @@
+"""Results, frames and scenes in notebooks: a figure by `plot`, a picture with numbers by `html`."""
+
+from __future__ import annotations
+
+import base64
+import html as markup
+import io
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from spadwarp.analytic import AnalyticResult, Proposal
+from spadwarp.checks import summary
+from spadwarp.errors import ArgumentError, SpadwarpError
+from spadwarp.frames import Frames
+from spadwarp.mesh import build_mesh
+from spadwarp.result import Result
+from spadwarp.scene import Scene
+from spadwarp.transport import truth_maps
+from spadwarp.units import with_prefix
+from spadwarp.viz.frames import analytic_figure
+from spadwarp.viz.panels import Panels, median_pixel, shown_limits
+from spadwarp.viz.result import KINDS, result_figure
+from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, spaced
+
+__all__ = ["html", "plot"]
+
+_HTML_DPI = 72
+
+
+def plot(
+    shown: Result | Frames | Scene | AnalyticResult,
+    kind: Literal["depth", "intensity", "histogram", "truth"] | None = None,
+    *,
+    method: Any = "centroid",
+    frame: int = 0,
+    device: Any = None,
+) -> Figure:
+    """A figure of a result, of frames or of a scene; notebooks show it, `savefig` writes it.
+
+    Args:
+        shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: the counts of one.
+            An analytic result: its maps and a frame. A scene: true depth and reflectance, by ray casting.
+        kind: Of a result's figure.
+        method: Estimator of a result's depth.
+        frame: Number of the frame.
+        device: Warp device.
+
+    Raises:
+        ArgumentError: Another kind, or a frame that is not there.
+        MeshError: A target of the scene cannot be read.
+    """
+    if isinstance(shown, Result):
+        if kind not in (None, *KINDS):
+            raise ArgumentError(f"kind = {kind!r} is not one of {', '.join(map(repr, KINDS))}")
+        return result_figure(shown, kind or "depth", method=method, device=device)
+    if kind is not None:
+        raise ArgumentError(f"kind = {kind!r} goes with results only, not with {type(shown).__name__}")
+    if isinstance(shown, AnalyticResult):
+        return analytic_figure(shown)
+    return _frames_figure(shown, frame) if isinstance(shown, Frames) else _scene_figure(shown, device)
+
+
+def html(shown: Result | Frames | Scene | AnalyticResult | Proposal) -> str:
+    """A picture, but not of a proposal, and a table of numbers as HTML, for `_repr_html_`."""
+    rows = next(of(shown) for kind, of in _ROWS.items() if isinstance(shown, kind))
+    cells = "".join(
+        f"<tr><th style='text-align:left'>{markup.escape(name)}</th>"
+        f"<td style='text-align:left'>{markup.escape(value)}</td></tr>"
+        for name, value in rows.items()
+    )
+    if isinstance(shown, Proposal):
+        return f"<div><b>{markup.escape(repr(shown))}</b><table>{cells}</table></div>"
+    try:
+        picture = f"<img src='data:image/png;base64,{_png(plot(shown))}' style='max-width:100%'>"
+    except SpadwarpError as error:  # a mesh that is not there, no device: the numbers are still of use
+        picture = f"<p>{markup.escape(str(error))}</p>"
+    name = markup.escape(repr(shown))
+    return f"<div><b>{name}</b>{picture}<table>{cells}</table></div>"
+
+
+def _png(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_HTML_DPI)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+# Figures
+
+
+def _scene_figure(scene: Scene, device: Any) -> Figure:
+    truth = truth_maps(scene, device=device)
+    panels = Panels(truth.depth.shape, 2)
+    panels.show_depth(truth.depth, "Truth", shown_limits(truth.depth))
+    panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
+    panels.caption(repr(scene))
+    return panels.figure
+
+
+def _frames_figure(frames: Frames, number: int) -> Figure:
+    if not 0 <= number < (1 if frames.summed else frames.frames):
+        raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
+    counts = np.asarray(frames.counts if frames.summed else frames.counts[number])
+    intensity = counts.sum(axis=-1)
+    row, column = median_pixel(intensity, intensity > 0)
+    edges = 1e9 * (frames.gate_start + frames.edges)
+    panels = Panels(intensity.shape, 2, below=2.4)
+    panels.show_intensity(intensity, "Intensity", "counts in a frame")
+    fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
+    panels.show_depth(fullest, "Fullest bin", shown_limits(fullest), "time of flight [ns]")
+    axis = panels.below()
+    pulses = frames.exposure
+    axis.stairs(counts[row, column], edges, fill=True, color="0.72", label="counts")
+    for name, values, colour in (("expected", frames.expected, BLUE), ("background", frames.background, GREEN)):
+        curve = np.broadcast_to(np.asarray(values)[row, column], counts.shape[-1:]) * pulses
+        axis.stairs(curve, edges, baseline=None, color=colour, label=f"{name}, before pile-up")
+    axis.set(xlabel="time of flight [ns]", ylabel="counts per bin", xlim=edges[[0, -1]])
+    axis.set_title(f"Pixel in row {row}, column {column}", fontsize=10)
+    axis.legend(frameon=False, fontsize=8)
+    panels.caption(_frames_rows(frames)["frames"] + f", seed {frames.seed}")
+    return panels.figure
+
+
+# Numbers
+
+
+def _result_rows(result: Result) -> dict[str, str]:
+    numbers = result.summary()
+    gate, depth = numbers["gate"], numbers["truth"]["depth_m"]
+    fractions = ", ".join(
+        f"{name.replace('_', '-')} {part:.3g}" for name, part in numbers["collected_fraction"].items()
+    )
+    return {
+        "photons": f"{spaced(result.photons)}, seed {result.seed}" + (", interrupted" if result.partial else ""),
+        "image": f"{numbers['image']['width']} x {numbers['image']['height']} pixels",
+        "gate": f"{gate['bins']} bins of {gate['bin_width_ps']:.5g} ps from {gate['start_ns']:.5g} ns",
+        "truth": "no target" if depth is None else f"{depth[0]:.4g} to {depth[1]:.4g} m",
+        "collected": f"{fractions} of the emitted light",
+        "detections": f"{numbers['detections_per_pulse']:.4g} a pulse, all pixels",
+        "energy balance": "exact" if numbers["ledger"]["exact"] else f"off by {numbers['ledger']['difference']} units",
+    }
+
+
+def _frames_rows(frames: Frames) -> dict[str, str]:
+    counts = np.asarray(frames.intensity)
+    return {
+        "frames": f"{frames.frames} of {spaced(frames.pulses)} pulses" + (", added up" if frames.summed else ""),
+        "counts": f"{float(counts.mean()):.4g} a pixel, at most {int(counts.max())}",
+        "gate": f"{frames.expected.shape[-1]} bins of {1e12 * frames.bin_width:.5g} ps from "
+        f"{1e9 * frames.gate_start:.5g} ns",
+        "pulse period": "time does not wrap" if frames.period is None else with_prefix(frames.period, "s"),
+        "response": f"{1e12 * frames.irf.fwhm:.4g} ps FWHM",
+        "seed": str(frames.seed),
+        **{f"note {number}": note for number, note in enumerate(frames.notes, 1)},
+    }
+
+
+def _scene_rows(scene: Scene) -> dict[str, str]:
+    laser, camera, gate = scene.laser, scene.camera, scene.gate
+    rows = {
+        "water": f"extinction {scene.medium.extinction:.4g} 1/m, attenuation length "
+        f"{scene.medium.attenuation_length:.4g} m, {scene.medium.phase_function.replace('_', ' ')}",
+        "laser": f"{with_prefix(laser.pulse_energy, 'J')} at {with_prefix(laser.repetition_rate, 'Hz')}, "
+        f"{laser.wavelength_nm:g} nm, {laser.pulse_fwhm_ps:g} ps",
+        "camera": f"{camera.width} x {camera.height} pixels, {math.degrees(camera.horizontal_fov):.3g}° across, "
+        f"aperture {2e3 * camera.aperture_radius:.3g} mm",
+        "detector": f"efficiency {100 * scene.detector.pde:.3g} %, jitter {scene.detector.jitter_fwhm_ps:g} ps, "
+        f"{scene.detector.dark_count_rate:g} dark counts per second",
+        "gate": f"{gate.bins} bins of {gate.bin_width_ps:g} ps from {gate.start_ns:g} ns",
+    }
+    try:
+        numbers = summary(scene, build_mesh(scene))
+    except SpadwarpError:
+        return rows
+    if numbers["target_range"] is not None:
+        rows["target"] = (
+            f"{numbers['target_range'][0]:.4g} to {numbers['target_range'][1]:.4g} m, optical depth "
+            f"{numbers['optical_depth']:.3g}, {numbers['signal_per_pulse']:.3g} unscattered detections a "
+            "pulse and pixel"
+        )
+    return rows
+
+
+def _analytic_rows(result: AnalyticResult) -> dict[str, str]:
+    estimated = result.fisher > 0
+    if not estimated.any():
+        return {"pixels": "none has an estimate"}
+    chosen = result.scene.analytic
+    return {
+        "pixels": f"{np.count_nonzero(estimated)} of {estimated.size} have an estimate",
+        "signal": f"{float(np.median(result.signal[estimated])):.4g} detections a pulse and pixel, median",
+        "bound": f"{1e3 * float(np.median(result.sigma_depth[estimated])):.4g} mm of depth, median",
+        "outliers": f"{100 * float(np.mean(result.outlier_probability[estimated])):.3g} %, mean",
+        "model": f"form {chosen.form}, backscatter {chosen.backscatter}, {chosen.count_law}",
+    }
+
+
+def _proposal_rows(found: Proposal) -> dict[str, str]:
+    rows = {name: f"{value:.6g}" for name, value in found.values.items()}
+    rows |= {name: with_prefix(value, "m") for name, value in found.terms.items()}
+    rows["reached"] = f"{'yes' if found.reached else 'no'}: asked for {with_prefix(found.depth_error, 'm')}"
+    rows |= {"limit": found.limit, "what would help": found.advice}
+    if math.isfinite(found.largest_range):
+        rows["largest range"] = f"{found.largest_range:.3g} m; {found.range_limit}"
+    return rows
+
+
+_ROWS: dict[Any, Callable[[Any], dict[str, str]]] = {
+    Result: _result_rows,
+    Frames: _frames_rows,
+    Scene: _scene_rows,
+    AnalyticResult: _analytic_rows,
+    Proposal: _proposal_rows,
+}

@@ -1,0 +1,126 @@
+"""Notebooks: short names, pictures with numbers, labelled arrays, tables."""
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import spadwarp
+from helpers.scenes import scene as make_scene
+
+SCENE = make_scene(gate={"start_ns": 0.0, "bin_width_ps": 400.0, "bins": 64})
+
+
+@pytest.fixture(scope="module")
+def result():
+    return spadwarp.simulate(SCENE, photons=20_000, device="cpu", uncertainty=True)
+
+
+@pytest.fixture(scope="module")
+def frames(result):
+    return spadwarp.detect(result, pulses=500, frames=3, seed=2, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def analytic():
+    return spadwarp.simulate_analytic(SCENE, frames=2, seed=1, device="cpu")
+
+
+@pytest.fixture(params=["scene", "result", "frames", "analytic"])
+def shown(request):
+    return SCENE if request.param == "scene" else request.getfixturevalue(request.param)
+
+
+def test_names_are_short_and_say_what_it_is(shown):
+    text = repr(shown)
+    assert len(text) < 160 and text.startswith(f"{type(shown).__name__}(") and "4 x 4 pixels" in text
+    assert str(shown) == text
+
+
+def test_a_picture_with_numbers(shown):
+    page = shown._repr_html_()
+    assert page.count("<tr>") >= 5 and "data:image/png;base64," in page and len(page) < 200_000
+
+
+def test_plot_gives_a_figure_that_a_notebook_shows(shown):
+    figure = shown.plot()
+    assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_each_kind_of_picture_of_a_result(result):
+    titles = {kind: result.plot(kind).axes[0].get_title() for kind in ("depth", "intensity", "histogram", "truth")}
+    assert len(set(titles.values())) == 4
+    assert "peak" in result.plot("depth", method="peak").axes[0].get_title()
+    with pytest.raises(spadwarp.ArgumentError, match="kind = 'film' is not one of 'depth'"):
+        result.plot("film")
+
+
+def test_a_frame_that_is_not_there(frames):
+    with pytest.raises(spadwarp.ArgumentError, match=r"frame = 3 is outside \[0, 3\)"):
+        frames.plot(3)
+
+
+def test_a_scene_whose_mesh_is_missing_still_has_numbers(tmp_path):
+    scene = make_scene(targets=[{"mesh": str(tmp_path / "nothing.stl")}])
+    page = scene._repr_html_()
+    assert "no such file" in page and "extinction" in page and "<img" not in page
+
+
+def test_text_is_escaped():
+    scene = make_scene(targets=[{"mesh": "<b>.stl"}])
+    page = scene._repr_html_()
+    assert "<b>.stl" not in page and "&lt;b&gt;.stl" in page
+
+
+def test_a_proposal_is_a_table():
+    proposal = spadwarp.plan(SCENE, photons=20_000, largest_range=False, device="cpu")
+    assert len(repr(proposal)) < 160
+    page = proposal._repr_html_()
+    assert "gate.start_ns" in page and "forward scattering" in page and proposal.limit in page
+
+
+# xarray
+
+
+def test_a_result_as_labelled_arrays(result):
+    data = result.to_xarray()
+    assert dict(data.sizes) == {"component": 3, "y": 4, "x": 4, "time": 64, "axis": 3}
+    assert np.array_equal(data.histogram.sel(component="backscatter"), result.component("backscatter"))
+    assert np.allclose(data.histogram.sum("component"), result.histogram, rtol=1e-12)
+    assert np.array_equal(data.standard_error, result.standard_error)
+    assert data.time.attrs["units"] == "s" and data.depth.attrs["units"] == "m"
+    assert np.allclose(data.path, data.time * result.pulse_speed)
+    nearest = data.histogram.sum(("component", "x", "y")).sel(time=9e-9, method="nearest")
+    assert nearest.time == result.bin_centres[np.abs(result.bin_centres - 9e-9).argmin()]
+    assert spadwarp.Scene.from_dict(tomllib.loads(data.attrs["scene"])) == result.scene
+
+
+def test_frames_and_maps_as_labelled_arrays(frames, analytic):
+    data = frames.to_xarray()
+    assert np.array_equal(data.counts, frames.counts) and data.counts.dims == ("frame", "y", "x", "time")
+    assert data.attrs["pulses"] == 500 and math.isclose(float(data.bin_width.sum()), 64 * 400e-12)
+    maps = analytic.to_xarray()
+    assert np.array_equal(maps.sigma_depth, analytic.sigma_depth, equal_nan=True)
+    assert maps.sigma_depth.attrs["units"] == "m" and maps.depth.dims == ("frame", "y", "x")
+
+
+def test_labelled_arrays_go_into_a_file(result, tmp_path):
+    result.to_xarray().to_netcdf(tmp_path / "result.nc", engine="scipy")
+
+
+# Data frames
+
+
+def test_tables_as_data_frames():
+    rows = spadwarp.budget(SCENE, [1.0, 2.0])
+    table = spadwarp.data_frame(rows)
+    assert list(table.range) == [1.0, 2.0] and "sigma_depth" in table.columns
+    curves = spadwarp.sweep(SCENE, vary="medium.extinction=0.1:0.3:3", device="cpu")
+    swept = spadwarp.data_frame(curves)
+    assert swept.index.name == "medium.extinction" and list(swept.index) == pytest.approx([0.1, 0.2, 0.3])
+    assert np.array_equal(swept.signal, curves.column("signal"))
+    assert spadwarp.data_frame(spadwarp.scene.presets("medium")).name[0] == "petzold-autec-8"
+    with pytest.raises(spadwarp.ArgumentError, match="data classes or dicts"):
+        spadwarp.data_frame([1, 2])
