@@ -46,6 +46,7 @@ def camera_on(mesh):
     laser.position, laser.axis, laser.spread = wp.vec3(0.1, 0.0, 0.0), wp.vec3(0.0, 0.0, 1.0), 1.0 - math.cos(0.4)
     camera.width, camera.height, camera.pixel_tangent = WIDTH, HEIGHT, 0.7 / WIDTH
     camera.aperture_radius, camera.aperture_area = 0.01, math.pi * 0.01**2
+    camera.inverse_focus = 1.0 / DISTANCE
     gate.start, gate.stop, gate.bins, gate.bins_per_metre = *GATE, BINS, BINS / (GATE[1] - GATE[0])
     limits.lower, limits.upper, limits.lateral = wp.vec3(-1e30), wp.vec3(1e30), 1e30
     limits.max_path, limits.max_collisions, limits.weight_cutoff = GATE[1], 64, 2e-4

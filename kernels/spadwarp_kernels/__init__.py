@@ -51,7 +51,7 @@ from .ray_cast import truth_kernel
 from .sensor import (
     C0,
     CALIBRATED,
-    PINHOLE,
+    PLAIN,
     Camera,
     Gate,
     Lens,
@@ -108,7 +108,7 @@ __all__ = [
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
-    "PINHOLE",
+    "PLAIN",
     "TABULATED",
     "ArgumentError",
     "Batches",

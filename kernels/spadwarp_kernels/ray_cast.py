@@ -22,8 +22,8 @@ def truth_kernel(
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
     width).
 
-    Rays go along `directions` (unit vectors through the pixel centres); where there are none, the camera is a pinhole
-    with square pixels about its axis.
+    Rays go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
+    square pixels about its axis.
     """
     row, column = wp.tid()
     u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)

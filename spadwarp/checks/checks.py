@@ -36,11 +36,12 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
     """Numbers that follow from a scene; lengths in m, None where there is no target in the view and the beam.
 
     `attenuation_length` and `albedo` are those of the water before the first layer; `layers` has those of each layer,
-    with its start. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected number
-    of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how many
-    it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered.
-    `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
-    [W/m²]. `histogram_bytes` is one set of tallies.
+    with its start. `focus_distance` is the depth that the lens images sharply, None for a pinhole. `optical_depth` is
+    one-way to the nearest visible point. `signal_per_pulse` is the expected number of unscattered target photons that
+    one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how many it receives; `samples_per_pixel` how
+    many of the traced photons reach a pixel's part of the target unscattered. `irradiance` is that of unscattered light
+    at the nearest visible point's range on the beam's axis, mean over time [W/m²]. `histogram_bytes` is one set of
+    tallies.
     Raises `MeshError`.
     """
     survey = Survey(scene, mesh)
@@ -63,6 +64,7 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
         "horizontal_fov_deg": math.degrees(camera.horizontal_fov),
         "vertical_fov_deg": math.degrees(camera.vertical_fov),
         "aperture_area": camera.aperture_area,
+        "focus_distance": survey.focus_distance,
         "photons_per_pulse": laser.photons_per_pulse,
         "average_power": laser.average_power,
         "peak_power": laser.peak_power,

@@ -11,19 +11,20 @@ from spadwarp.scene import Laser
 
 
 def check_focus(survey: Survey) -> Iterator[CheckMessage]:
-    """How far a thin lens is out of focus on what it sees."""
+    """How far the lens is out of focus on what it sees."""
     camera = survey.scene.camera
-    if camera.focus_distance is None or survey.target_range is None or survey.distance is None:
+    focus = survey.focus_distance
+    if focus is None or survey.target_range is None or survey.distance is None:
         return
     blur = {
-        distance: 2.0 * camera.aperture_radius * abs(1.0 / distance - camera.inverse_focus) / camera.pixel_tangent
+        distance: 2.0 * camera.aperture_radius * abs(1.0 / distance - 1.0 / focus) / camera.pixel_tangent
         for distance in survey.target_range
     }
     worst = max(blur, key=blur.__getitem__)
     if blur[worst] > 1.0:
         text = (
-            f"a point at {worst:.4g} m is blurred over {blur[worst]:.3g} pixels; truth maps and the analytic simulator "
-            "are sharp"
+            f"a point at {worst:.4g} m is blurred over {blur[worst]:.3g} pixels by a lens focused at "
+            f"{focus:.4g} m; truth maps and the analytic simulator are sharp"
         )
         yield note("camera.focus_distance", text, distance=worst, pixels=blur[worst])
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic import axis_fluence
-from spadwarp.mesh import TriangleMesh, build_mesh
+from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.beam_profile import profile_extent
 from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
@@ -26,6 +26,7 @@ class Survey:
     Attributes:
         triangles, target, reflectance: The faces `[F, 3, 3]` [m] in the camera frame, their targets and reflectances.
         view, beam: Planes around the view and the beam, as in `spadwarp.scene.frustum`.
+        focus_distance: Depth that the lens images sharply [m]; None for a pinhole.
         illuminated: Points of the targets in both, `[N, 3]` [m].
         target_range: Nearest and farthest of them from the lens [m]; None if there are none.
         target_path: Shortest and longest path from the laser by them to the lens [m], likewise.
@@ -39,6 +40,7 @@ class Survey:
         self.target = np.zeros(0, dtype=np.int32) if mesh is None else mesh.target
         self.reflectance = np.zeros(0) if mesh is None else mesh.reflectance
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
+        self.focus_distance = focus_distance(scene, mesh)
         self.view = view_planes(scene.camera)
         # A scan brings its beam to all that is in view.
         self.beam = beam_planes(scene.beam) if scene.scan_positions == 1 else np.zeros((0, 4))

@@ -69,6 +69,7 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
         "returns": between(numbers["target_arrival_ns"], "ns"),
         "gate": f"{between(numbers['gate_range'], 'm')}, a bin {1000 * numbers['bin_range']:.3g} mm",
         "unambiguous": f"to {numbers['unambiguous_range']:.4g} m",
+        "focus": "all depths" if numbers["focus_distance"] is None else f"{numbers['focus_distance']:.4g} m",
         "view": f"{numbers['horizontal_fov_deg']:.3g} x {numbers['vertical_fov_deg']:.3g} degrees",
         "laser": f"{numbers['photons_per_pulse']:.3g} photons a pulse, {with_prefix(numbers['average_power'], 'W')} on "
         f"average, {with_prefix(numbers['peak_power'], 'W')} at the peak",

@@ -246,7 +246,7 @@ def _metadata(result: Result, part: Frames, frames: int) -> dict[str, Any]:
         "group_index": scene.medium.group_index,
         "laser_position": scene.beam.position,
         "pixel_tangent": scene.camera.pixel_tangent,
-        **camera_attributes(scene.camera),
+        **camera_attributes(scene.camera, result.focus_distance),
         "irf_sigma": part.irf.sigma,
         "irf_tail": part.irf.tail,
         "notes": list(part.notes),

@@ -138,10 +138,11 @@ class ResultHead:
     batch_size: int
     photon_ranges: Ranges
     requested: tuple[int, int]
+    focus_distance: float | None
 
     def is_of_run(self, other: ResultHead) -> bool:
         """Whether both hold photons of one run: the one with fewer is an earlier state of it."""
-        names = ("seed", "unit", "batch_size")
+        names = ("seed", "unit", "batch_size", "focus_distance")
         same = all(getattr(self, name) == getattr(other, name) for name in names)
         same = same and self.requested[0] == other.requested[0]
         return same and physics_of(self.scene) == physics_of(other.scene)
@@ -174,6 +175,7 @@ def _head(file: Hdf5File) -> ResultHead:
         batch_size=file.integer("batch_size", _PHOTONS.replace("[1", "[0"), default=0),
         photon_ranges=ranges,
         requested=requested,
+        focus_distance=_focus_distance(file),
     )
 
 
@@ -199,6 +201,12 @@ def _provenance(file: Hdf5File) -> dict[str, Any]:
     if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
         file.refuse("provenance", "holds parts that are no tables")
     return made
+
+
+def _focus_distance(file: Hdf5File) -> float | None:
+    """NaN in files stands for all depths; files of version 0.1.0 do not have it."""
+    value = file.attribute("camera_focus_distance", np.nan)
+    return None if isinstance(value, float) and np.isnan(value) else file.real("camera_focus_distance", "(0, inf]")
 
 
 def _attributes(result: Result) -> dict[str, Any]:
@@ -232,7 +240,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "laser_photons_per_pulse": laser.photons_per_pulse,
         "laser_pulse_fwhm": laser.pulse_fwhm_ps * 1e-12,
         "camera_pixel_tangent": camera.pixel_tangent,
-        **camera_attributes(camera),
+        **camera_attributes(camera, result.focus_distance),
         "scan": scene.scan.mode,
         "camera_aperture_area": camera.aperture_area,
         "detector_pde": detector.pde,

@@ -81,6 +81,7 @@ def merge(results: Iterable[Result]) -> Result:
         raise ConfigError(f"merge: {error}") from error
     for other in parts[1:]:
         check_targets(first.truth, other.truth, "merge")
+        check_focus(first.focus_distance, other.focus_distance, "merge")
     check_capacity(*(part.tallies for part in parts))
     total = Tallies.of(first)
     for other in parts[1:]:
@@ -130,6 +131,12 @@ def check_targets(a: Truth, b: Truth, action: str) -> None:
     """Raises `ConfigError` where two truth maps are not of the same targets."""
     if not np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True):
         raise ConfigError(f"{action}: the targets of the results differ, by their truth maps: was a mesh file changed?")
+
+
+def check_focus(a: float | None, b: float | None, action: str) -> None:
+    """Raises `ConfigError` where two lenses are not focused at the same depth [m], or one images all depths sharply."""
+    if a != b and (a is None or b is None or not np.isclose(a, b, rtol=1e-4, atol=0.0)):
+        raise ConfigError(f"{action}: the lenses of the results differ: focus_distance is {a} and {b} m")
 
 
 def physics_of(scene: Scene) -> Scene:

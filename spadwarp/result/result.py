@@ -64,6 +64,8 @@ class Result:
         unit: Fraction of one emitted photon per tally unit, a power of two.
         photons: Emitted photons, > 0.
         seed: 64-bit seed of the run.
+        focus_distance: Depth that the lens images sharply [m], None if it is all of them: for a pinhole, and for the
+            disc that was the default of older versions.
         ledger: Where the emitted weight went, in units of `ledger_unit` photons. Entries are differences of fixed-point
             weights (before − after; a gain is negative), so that their sum is exactly the emitted weight.
         ledger_unit: Photons per ledger unit, a power of two.
@@ -97,6 +99,7 @@ class Result:
     batch_size: int = 0
     second_moment: NDArray[np.uint64] | None = None
     requested: tuple[int, int] = (0, 0)
+    focus_distance: float | None = None
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:

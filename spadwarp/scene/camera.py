@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from spadwarp.scene import intrinsics
 from spadwarp.scene.calibration import load_calibration
 from spadwarp.scene.sections import Brown, Section, Vector, Whole
 
 
+def _infinite(value: Any) -> Any:
+    """The word for what TOML writes as inf."""
+    return math.inf if value == "infinity" else value
+
+
 class Camera(Section):
-    """A view through a round aperture: a pinhole's, or a thin lens's where `focus_distance` is given.
+    """A view through a thin lens, which fills a round aperture, or through a point with the aperture's area.
 
     The view is given by `horizontal_fov_deg`, by `focal_length` with `pixel_pitch_um`, or by OpenCV's `fx` (with `fy`,
     `cx`, `cy`), which `calibration` reads from a file; the aperture by `aperture_diameter`, or by `f_number` with
@@ -50,8 +55,12 @@ class Camera(Section):
     """diameter of the entrance aperture [m]"""
     f_number: float | None = Field(None, gt=0)
     """focal length over aperture diameter"""
-    focus_distance: float | None = Field(None, gt=0, le=math.inf, allow_inf_nan=True)
-    """thin lens: depth that is imaged sharply [m], inf is infinity; not given: pinhole, all of it sharp"""
+    focus_distance: Annotated[
+        Annotated[float, Field(gt=0, le=math.inf, allow_inf_nan=True)] | Literal["target"], BeforeValidator(_infinite)
+    ] = "target"
+    """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
+    pinhole: bool = False
+    """whether the lens is a point, which images all depths sharply and collects the light of the aperture's area"""
     position: Vector = (0.0, 0.0, 0.0)
     """lens centre in the world [m]"""
     rotation_deg: Vector = (0.0, 0.0, 0.0)
@@ -85,7 +94,7 @@ class Camera(Section):
         for name in ("fy", "cx", "cy"):
             if self.fx is None and getattr(self, name) is not None:
                 raise ValueError(f"{name} = {getattr(self, name)} goes with fx only")
-        if self.focus_distance is not None and self.focus_distance <= (self.focal_length or 0.0):
+        if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
             raise ValueError(
                 f"focus_distance = {self.focus_distance} is outside ({self.focal_length}, inf], beyond the focal length"
             )
@@ -116,19 +125,16 @@ class Camera(Section):
     def pixel_tangent(self) -> float:
         """Pixel pitch over image distance; the geometric mean of both directions where fx and fy differ.
 
-        The image distance is the focal length or, where a thin lens is focused nearer than infinity, 1/(1/f − 1/d).
+        The image distance is 1/(1/f − 1/d) for a `focus_distance` d in metres, else the focal length f: with "target"
+        the field of view does not depend on where the targets are.
         """
         if self.horizontal_fov_deg is not None:
             return 2.0 * math.tan(math.radians(self.horizontal_fov_deg) / 2.0) / self.width
         if self.fx is not None:
             return 1.0 / math.sqrt(self.fx * (self.fy or self.fx))
         assert self.pixel_pitch_um is not None and self.focal_length is not None
-        return self.pixel_pitch_um * 1e-6 / self.focal_length * (1.0 - self.focal_length * self.inverse_focus)
-
-    @property
-    def inverse_focus(self) -> float:
-        """1 over the depth that is imaged sharply [1/m]; 0 for a pinhole, and for a lens focused at infinity."""
-        return 0.0 if self.focus_distance is None else 1.0 / self.focus_distance
+        pitch = self.pixel_pitch_um * 1e-6
+        return pitch / self.focal_length - (0.0 if self.focus_distance == "target" else pitch / self.focus_distance)
 
     @property
     def is_posed(self) -> bool:
@@ -137,10 +143,10 @@ class Camera(Section):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is a pinhole with square pixels about the optical axis and without distortion."""
+        """Whether it has square pixels about the optical axis and no distortion."""
         fx, fy = self.focal_pixels
         middle = (self.width / 2.0, self.height / 2.0)
-        return fx == fy and self.principal_point == middle and not any(self.distortion) and self.focus_distance is None
+        return fx == fy and self.principal_point == middle and not any(self.distortion)
 
     @property
     def view_box(self) -> tuple[float, float, float, float]:

@@ -60,6 +60,15 @@ class Scene(BaseModel):
             raise ValueError(f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold") from None
         return self
 
+    @model_validator(mode="after")
+    def _lens_that_photons_can_hit(self) -> Self:
+        if self.camera.pinhole and self.transport.estimator == "analog":
+            raise ValueError(
+                "camera.pinhole = true does not go with transport.estimator = 'analog', whose photons cannot hit a "
+                "point: take a small aperture_diameter, or next_event or guided"
+            )
+        return self
+
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Scene:
         """A scene from tables as TOML gives them; relative paths in them start at `source`'s folder.

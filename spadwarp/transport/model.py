@@ -12,6 +12,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory
 from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.mesh import focus_distance
 from spadwarp.result import COMPONENTS
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
@@ -59,7 +60,7 @@ def build_model(
     _check_domain(scene, camera)
     if camera:
         _check_gate(scene)
-    lens, limits = _camera(scene), _limits(scene, camera)
+    lens, limits = _camera(scene, mesh), _limits(scene, camera)
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
     device_mesh, surfaces = _surfaces(mesh, lens if camera else None, device)
@@ -200,7 +201,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         pattern=mesh is not None and mesh.pattern is not None,
         specular=mesh is not None and mesh.specular is not None,
         layered=bool(scene.medium.layers),
-        lens=sk.PINHOLE if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED,
+        lens=sk.PLAIN if _has_plain_lens(scene) else sk.CALIBRATED,
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode == "confocal",
         rotated_domain=_has_rotated_domain(scene),
@@ -228,19 +229,25 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     return laser
 
 
-def _camera(scene: Scene) -> Any:
+def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
     camera = scene.camera
-    k1, k2, p1, p2, k3 = camera.distortion
     lens = sk.Camera()
     lens.width, lens.height = camera.width, camera.height
     lens.pixel_tangent = camera.pixel_tangent
-    lens.aperture_radius, lens.aperture_area = camera.aperture_radius, camera.aperture_area
-    lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
-    lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
-    lens.view = wp.vec4(*view_box(camera))
-    lens.thin = 0.0 if camera.focus_distance is None else 1.0
-    lens.inverse_focus = camera.inverse_focus
+    lens.aperture_area = camera.aperture_area
+    if (focus := focus_distance(scene, mesh)) is not None:
+        lens.aperture_radius, lens.inverse_focus = camera.aperture_radius, 1.0 / focus
+    if not _has_plain_lens(scene):
+        k1, k2, p1, p2, k3 = camera.distortion
+        lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
+        lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
+        lens.view = wp.vec4(*view_box(camera))
     return lens
+
+
+def _has_plain_lens(scene: Scene) -> bool:
+    """Whether the image needs no intrinsics and no view of its own for each photon."""
+    return scene.camera.is_plain and scene.scan.mode == "none"
 
 
 def _scan(scene: Scene, device: wp.Device) -> Any:

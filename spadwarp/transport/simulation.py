@@ -17,9 +17,10 @@ import numpy as np
 
 from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, Tallies
-from spadwarp.result.merging import add_timing, check_capacity, check_targets, join_provenance
+from spadwarp.result.merging import add_timing, check_capacity, check_focus, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
 from spadwarp.scene import Scene
 from spadwarp.transport.checkpoint import Checkpoint
@@ -161,12 +162,14 @@ class _Run:
         self._unit = 1.0 / plan.scale
         if resumed is not None and resumed.unit != self._unit:
             raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
+        self._focus_distance = focus_distance(plan.scene, plan.mesh)
         began = time.perf_counter()
         self._truth = workers.truth()
         self._began = time.perf_counter()
         self._truth_seconds = self._began - began
         if resumed is not None:
             check_targets(resumed.truth, self._truth, "resume")
+            check_focus(resumed.focus_distance, self._focus_distance, "resume")
         self._earlier: Ranges = () if resumed is None else joined(resumed.photon_ranges)
 
     def result(self, stopped: threading.Event, relative_error: float | None) -> Result:
@@ -232,6 +235,7 @@ class _Run:
             scene=self._plan.scene,
             **vars(total),
             unit=self._unit,
+            focus_distance=self._focus_distance,
             photons=count(done),
             seed=self._plan.seed,
             ledger_unit=sk.LEDGER_UNIT,

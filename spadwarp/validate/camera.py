@@ -15,7 +15,7 @@ from spadwarp.validate import references
 from spadwarp.validate.case import Case, Run, point_source, scene
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, quantities
 
-__all__ = ["CASES", "scattered_once"]
+__all__ = ["CASES", "scattered_once", "vessel_reading", "white_vessel"]
 
 _WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924}
 _CAMERA = {
@@ -23,6 +23,16 @@ _CAMERA = {
     "height": 32,
     "horizontal_fov_deg": 10.0,
     "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
+}
+
+# A cube of white walls around a wide lens, whose gate opens when the light has become even.
+_VESSEL_SIDE, _VESSEL_GATE = 2.0, (6.0, 10.0)
+_VESSEL_CAMERA = {
+    "width": 2,
+    "height": 2,
+    "horizontal_fov_deg": 40.0,
+    "aperture_diameter": 1.0,
+    "focus_distance": math.inf,
 }
 
 _SIGNED = ("roulette", "importance_sampling_residual")  # entries of the ledger whose mean is 0
@@ -174,6 +184,41 @@ def _mean_path(run: Run) -> list[Quantity]:
     return measured
 
 
+def white_vessel(estimator: str) -> dict[str, Any]:
+    """A closed vessel that loses no light, with water that scatters before and behind the lens.
+
+    The water within 10 cm of the lens is clear: otherwise next_event would have no finite variance.
+    """
+    water = {"extinction": 0.6, "albedo": 1.0, "anisotropy": 0.5}
+    clear = {"start": -0.1, "extinction": 1e-6, "albedo": 1.0}
+    behind = {"start": 0.1, "extinction": 0.6, "albedo": 1.0}
+    walls = {"builtin": "box", "size": [_VESSEL_SIDE] * 3, "reflectance": 1.0}
+    return scene(
+        {**water, "layers": [clear, behind]},
+        point_source(0.3, -0.2, 0.4),
+        camera=_VESSEL_CAMERA,
+        path_edges=(*_VESSEL_GATE, 4),
+        targets=[walls],
+        estimator=estimator,
+    )
+
+
+def vessel_reading() -> float:
+    """What the camera in `white_vessel` reads: A·Δs/(4πV)·∫cosψ dΩ over its field, of even light in all directions."""
+    half = math.tan(math.radians(0.5 * _VESSEL_CAMERA["horizontal_fov_deg"]))
+    area = math.pi * (0.5 * _VESSEL_CAMERA["aperture_diameter"]) ** 2
+    side = half / math.hypot(1.0, half)
+    return area * (_VESSEL_GATE[1] - _VESSEL_GATE[0]) / _VESSEL_SIDE**3 / math.pi * side * math.atan(side)
+
+
+def _white_vessel(run: Run) -> list[Quantity]:
+    measured = []
+    for estimator in ("analog", "next_event", "guided"):
+        sums = [result.histogram.sum() for result in run.results(white_vessel(estimator))]
+        measured += quantities([f"light in the lens, {estimator}"], batch_means(sums), [vessel_reading()])
+    return measured
+
+
 def _rotation_onto_z(direction: NDArray) -> NDArray:
     """A rotation matrix that takes a unit vector to +z."""
     right = np.cross([0.0, 1.0, 0.0], direction)
@@ -198,6 +243,11 @@ CASES = (
     Case("lambertian", "Light reflected once by a plane, by pixel: quadrature", _lambertian),
     Case("ledger", "Emitted weight is accounted for to the last unit; signed entries have mean zero", _ledger),
     Case("reciprocity", "Laser and camera change places before a target in turbid water", _reciprocity),
+    Case(
+        "white-vessel",
+        "Even light in a closed vessel that loses none, into a wide lens: energy over volume",
+        _white_vessel,
+    ),
     Case(
         "mean-path",
         "Mean path 4V/S in a closed convex mesh, whatever the scattering (Blanco & Fournier 2003)",

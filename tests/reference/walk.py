@@ -147,3 +147,11 @@ def scatter(u: NDArray, g: float, rng: np.random.Generator, axis_threshold: floa
     sign = np.where(z < 0, -1.0, 1.0)
     rotated = np.where(vertical[:, None], np.stack([a, sign * b, sign * cosine], 1), rotated)
     return rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+
+
+def cosine_law(normal: NDArray, rng: np.random.Generator) -> NDArray:
+    """Directions [N, 3] by the cosine law about unit normals: a point on the unit sphere added to each."""
+    cosine, phi = 2.0 * rng.random(len(normal)) - 1.0, 2.0 * math.pi * rng.random(len(normal))
+    sine = np.sqrt(1.0 - cosine**2)
+    direction = normal + np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], 1)
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True)

@@ -161,8 +161,13 @@ def test_fournier_forand_references():
 
 @pytest.fixture(scope="module")
 def results():
-    """A short run of all cases but the two that trace most."""
-    return run([name for name in CASES if name not in ("ledger", "mean-path")], photons=10_000, seed=3, device="cpu")
+    """A short run of all cases but the three that trace most."""
+    return run(
+        [name for name in CASES if name not in ("ledger", "mean-path", "white-vessel")],
+        photons=10_000,
+        seed=3,
+        device="cpu",
+    )
 
 
 @pytest.mark.physics
@@ -170,7 +175,7 @@ def results():
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
     assert not failed
-    assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path"}
+    assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path", "white-vessel"}
 
 
 @pytest.mark.physics

@@ -12,9 +12,8 @@ from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import u01, u01_fine, u01_high, u01_low
-from spadwarp_kernels.sensor.camera import Camera, lens_point, project
+from spadwarp_kernels.sensor.camera import Camera, in_view, lens_point
 from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.projection import PINHOLE
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.ggx import ggx_brdf
 from spadwarp_kernels.surface.lambert import lambert_brdf
@@ -109,17 +108,13 @@ def next_event_value(
 @functools.cache
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
-    pinhole = spec.lens.name == PINHOLE.name
+    view_of = spec.lens.view
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
         q = Request()
         if wp.static(not flights) or s.hit.face >= 0:
-            pixel = int(0)
-            if wp.static(pinhole):
-                # Whatever the lens point; other lenses need it.
-                pixel = project(camera, s.x)
-            if pixel >= 0:
+            if in_view(camera, view_of(camera, s.view), s.x):
                 q.wanted = True
                 q.x = s.x
                 q.u = s.u

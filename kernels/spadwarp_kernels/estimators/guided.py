@@ -19,7 +19,7 @@ from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
-from spadwarp_kernels.sensor.camera import Camera, lens_point
+from spadwarp_kernels.sensor.camera import Camera, clip_to_view, in_view, lens_point, toward_axis
 from spadwarp_kernels.sensor.gate import Gate, clip_to_gate
 from spadwarp_kernels.surface.ggx import reflection_pdf
 from spadwarp_kernels.surface.lambert import sample_cosine_law
@@ -45,7 +45,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
 
 def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
-    clip_to_view = spec.lens.clip
+    view_of = spec.lens.view
     layered, bounded = spec.layered, spec.bounded
     to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
 
@@ -59,7 +59,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         limit = limits.max_path - s.path
         if wp.static(bounded):
             limit = wp.min(limit, to_exit(limits, s.x, s.u))
-        plan.interval = clip_to_view(camera, s.view, s.x, s.u, plan.lens, limit)
+        plan.interval = clip_to_view(camera, view_of(camera, s.view), s.x, s.u, plan.lens, limit)
         plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
         if not (wp.static(layered) or medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
@@ -100,7 +100,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
-    in_view, toward_axis = spec.lens.in_view, spec.lens.toward_axis
+    view_of = spec.lens.view
     has_mesh, specular = spec.mesh, spec.specular
 
     @wp.func
@@ -127,10 +127,11 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
             v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
-        to_axis = toward_axis(s.view, s.x)
+        view = view_of(camera, s.view)
+        to_axis = toward_axis(view, s.x)
         to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
         to_view_chance = float(0.0)
-        if wp.dot(to_axis, to_axis) > 0.0 and not in_view(camera, s.view, s.target, s.x):
+        if wp.dot(to_axis, to_axis) > 0.0 and not in_view(camera, view, s.x):
             to_view_chance = guiding.return_probability
             to_axis = wp.normalize(to_axis)
         choice = u01(s.flight.block[3])

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import PhaseFunction
-from spadwarp_kernels.sensor.projection import PINHOLE, Lens
+from spadwarp_kernels.sensor.projection import PLAIN, Lens
 
 # Meshes of at most this many faces need no BVH.
 BRUTE_FORCE_FACES = 12
@@ -42,7 +42,7 @@ class TransportSpec(NamedTuple):
     layered: bool = False
     pattern: bool = False
     specular: bool = False
-    lens: Lens = PINHOLE
+    lens: Lens = PLAIN
     measured_beam: bool = False
     confocal: bool = False
     rotated_domain: bool = False

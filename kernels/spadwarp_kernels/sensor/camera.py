@@ -13,20 +13,19 @@ from spadwarp_kernels.math.rotations import cos_sin_turn
 
 @wp.struct
 class Camera:
-    """A camera with a finite aperture disc in the plane z = 0.
+    """A camera with a thin lens: a disc in the plane z = 0 that images one depth sharply.
 
     Attributes:
         width, height: Image size [pixels].
-        pixel_tangent: Pixel pitch over focal length.
-        aperture_radius: Radius of the entrance pupil [m].
-        aperture_area: Its area [m^2].
+        pixel_tangent: Pixel pitch over image distance.
+        aperture_radius: Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply.
+        aperture_area: The area that collects light [m^2], also where the lens is a point.
+        inverse_focus: 1 over the depth that is imaged sharply [1/m]; 0 is infinity.
         focal: Focal length in pixels along rows and columns; this and what follows is read by `CALIBRATED` alone.
         principal: Image coordinates of the optical axis.
         radial: k1, k2, k3 of Brown's model.
         tangential: p1, p2 of Brown's model.
         view: Least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it.
-        thin: 1 for a thin lens, 0 for a pinhole that images everything sharply.
-        inverse_focus: 1 over the depth that the thin lens images sharply [1/m]; 0 is infinity.
     """
 
     width: int
@@ -34,35 +33,40 @@ class Camera:
     pixel_tangent: float
     aperture_radius: float
     aperture_area: float
+    inverse_focus: float
     focal: wp.vec2
     principal: wp.vec2
     radial: wp.vec3
     tangential: wp.vec2
     view: wp.vec4
-    thin: float
-    inverse_focus: float
 
 
 @wp.func
-def project(camera: Camera, x: wp.vec3) -> int:
-    """Row-major index of the pixel that images the point x (line through x and the lens centre), or -1 outside the
-    view."""
+def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
+    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
+
+    The line through x and o meets the focus plane at a point that the lens centre sees in this direction,
+    x/z + o (1/focus - 1/z).
+    """
+    inverse = 1.0 / x[2]
+    return wp.vec2(
+        (x[0] - o[0]) * inverse + camera.inverse_focus * o[0], (x[1] - o[1]) * inverse + camera.inverse_focus * o[1]
+    )
+
+
+@wp.func
+def project(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images the point x by way of the lens point o, or -1 outside the view."""
     if x[2] <= 0.0:
         return -1
-    scale = 1.0 / (x[2] * camera.pixel_tangent)
-    column = x[0] * scale + 0.5 * float(camera.width)
-    row = x[1] * scale + 0.5 * float(camera.height)
-    # Compared as floats: a float beyond the int range has no defined int value.
-    if column < 0.0 or row < 0.0 or column >= float(camera.width) or row >= float(camera.height):
+    t = image_tangents(camera, x, o)
+    scale = 1.0 / camera.pixel_tangent
+    column = t[0] * scale + 0.5 * float(camera.width)
+    row = t[1] * scale + 0.5 * float(camera.height)
+    # Compared as floats: a float beyond the int range has no defined int value. Also false for what is not a number.
+    if not (column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)):
         return -1
     return int(row) * camera.width + int(column)
-
-
-@wp.func
-def in_view(camera: Camera, x: wp.vec3) -> bool:
-    """Whether a pinhole camera has the point x in its field of view, up to rounding at its edge."""
-    half = 0.5 * camera.pixel_tangent * x[2]
-    return wp.abs(x[0]) < half * float(camera.width) and wp.abs(x[1]) < half * float(camera.height)
 
 
 @wp.func
@@ -77,18 +81,6 @@ def distort(camera: Camera, t: wp.vec2) -> wp.vec2:
     column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     row = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return wp.vec2(column * camera.focal[0] + camera.principal[0], row * camera.focal[1] + camera.principal[1])
-
-
-@wp.func
-def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
-    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
-
-    Thin lens: the line through x and o meets the focus plane at a point that the lens centre sees in that direction,
-    x/z + o (1/focus - 1/z). Pinhole: x/z.
-    """
-    inverse = 1.0 / x[2]
-    shift = camera.thin * (camera.inverse_focus - inverse)
-    return wp.vec2(x[0] * inverse + shift * o[0], x[1] * inverse + shift * o[1])
 
 
 @wp.func
@@ -133,10 +125,9 @@ def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
 
 @wp.func
 def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.vec2:
-    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, in front of the origin and between the side planes
-    through it with the given tangents (left, top, right, bottom); empty where s0 >= s1."""
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, between the side planes through the origin with the
+    given tangents (left, top, right, bottom), which meet there: all of it has z > 0; empty where s0 >= s1."""
     interval = wp.vec2(0.0, limit)
-    interval = _clip(x[2], u[2], interval)
     interval = _clip(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
     interval = _clip(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
     interval = _clip(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
@@ -155,10 +146,44 @@ def _clip(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
 
 @wp.func
 def field(camera: Camera) -> wp.vec4:
-    """Tangents (left, top, right, bottom) of what the image of a pinhole camera shows."""
+    """Tangents (left, top, right, bottom) of what the image shows, for square pixels about the optical axis."""
     half_width = 0.5 * float(camera.width) * camera.pixel_tangent
     half_height = 0.5 * float(camera.height) * camera.pixel_tangent
     return wp.vec4(-half_width, -half_height, half_width, half_height)
+
+
+@wp.func
+def clip_to_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, that lies in the view as the lens point o sees it;
+    empty where s0 >= s1."""
+    # Sheared so that the side planes, which go through o and the view on the focus plane, go through the origin.
+    slope_x = camera.inverse_focus * o[0]
+    slope_y = camera.inverse_focus * o[1]
+    start = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
+    along = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
+    return clip_to_planes(view, start, along, limit)
+
+
+@wp.func
+def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+    """Whether any point of the lens may image x into the view; False is certain, up to rounding at its edge."""
+    z = x[2]
+    # Radius of the circle of confusion, at the distance of x.
+    blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
+    return (
+        z > 0.0
+        and x[0] > view[0] * z - blur
+        and x[0] < view[2] * z + blur
+        and x[1] > view[1] * z - blur
+        and x[1] < view[3] * z + blur
+    )
+
+
+@wp.func
+def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec3:
+    """Vector across the optical axis from x towards the middle of the view."""
+    depth = 0.5 * wp.max(x[2], 0.0)
+    return wp.vec3(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1], 0.0)
 
 
 def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
@@ -166,9 +191,8 @@ def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     check_struct(name, camera, Camera)
     for field_name in ("width", "height"):
         check_integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
-    check_fields(
-        name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)", "aperture_area": "(0, inf)"}
-    )
+    check_fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
+    check_fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
     if not calibrated:
         return
     for focal in camera.focal:
@@ -180,4 +204,3 @@ def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     check_vector(f"{name}.view", camera.view, size=4)
     check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
     check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
-    check_fields(name, camera, {"thin": "[0, 1]", "inverse_focus": "[0, inf)"})

@@ -16,6 +16,15 @@ def _texel(tangent: float, low: float, high: float) -> float:
     return (tangent - low) / (high - low) * float(_TEXELS)
 
 
+@wp.func
+def _map_view(camera: Camera) -> wp.vec4:
+    """Tangents (left, top, right, bottom) of the map: those of the camera's view, or its field where that is empty."""
+    view = camera.view
+    if view[2] == view[0]:
+        view = field(camera)
+    return view
+
+
 @wp.kernel(enable_backward=False)
 def _near_depth_kernel(camera: Camera, mesh: wp.uint64, near_depth: wp.array2d(dtype=float)):
     """Lowers each texel to the least depth of the faces that may cover it. Launch: faces."""
@@ -25,9 +34,7 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, near_depth: wp.array2d(d
     q = m.points[m.indices[3 * face + 1]]
     r = m.points[m.indices[3 * face + 2]]
     depth = wp.min(p[2], wp.min(q[2], r[2]))
-    view = camera.view
-    if view[2] == view[0]:
-        view = field(camera)
+    view = _map_view(camera)
     first_column = int(0)
     first_row = int(0)
     last_column = int(_TEXELS - 1)
@@ -68,24 +75,15 @@ def near_depth_map(mesh: wp.Mesh, camera: Camera) -> wp.array:
 
 @wp.func
 def may_be_hidden(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
-    """Whether something may stand between the point x, inside the view, and the lens; False is certain."""
+    """Whether something may stand between the point x, x[2] > 0, and the lens; False is certain.
+
+    True for points beside the view, which the lens sees out of focus.
+    """
     if near_depth.shape[0] == 0:
         return True
-    scale = 2.0 / (x[2] * camera.pixel_tangent)
-    column = (x[0] * scale / float(camera.width) + 1.0) * 0.5 * float(_TEXELS)
-    row = (x[1] * scale / float(camera.height) + 1.0) * 0.5 * float(_TEXELS)
-    edge = float(_TEXELS) - 1.0
-    return x[2] >= near_depth[int(wp.clamp(row, 0.0, edge)), int(wp.clamp(column, 0.0, edge))]
-
-
-@wp.func
-def may_be_hidden_in(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
-    """As `may_be_hidden`, for a camera with a `view`; True for points beside it, which a thin lens sees out of
-    focus."""
-    if near_depth.shape[0] == 0:
-        return True
-    column = _texel(x[0] / x[2], camera.view[0], camera.view[2])
-    row = _texel(x[1] / x[2], camera.view[1], camera.view[3])
+    view = _map_view(camera)
+    column = _texel(x[0] / x[2], view[0], view[2])
+    row = _texel(x[1] / x[2], view[1], view[3])
     edge = float(_TEXELS)
     if not (column >= 0.0 and row >= 0.0 and column < edge and row < edge):
         return True

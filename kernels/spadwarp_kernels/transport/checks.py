@@ -29,7 +29,7 @@ from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
 from spadwarp_kernels.random.density_tables import TABLE_CELLS
 from spadwarp_kernels.sensor.camera import Camera, check_camera
 from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.projection import PINHOLE, Lens
+from spadwarp_kernels.sensor.projection import PLAIN, Lens
 from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
@@ -73,7 +73,7 @@ def check_spec(spec: Any) -> None:
     for name in _CHOICES:
         if not isinstance(getattr(spec, name), bool):
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
-    if spec.confocal and spec.lens.name == PINHOLE.name:
+    if spec.confocal and spec.lens.name == PLAIN.name:
         raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
 
 
@@ -97,10 +97,12 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
     _check_laser(spec, model)
     _check_limits(spec, model)
     if estimator.scores:
-        check_camera("model.camera", model.camera, calibrated=spec.lens.name != PINHOLE.name)
+        check_camera("model.camera", model.camera, calibrated=spec.lens.name != PLAIN.name)
         check_integer("model.gate.bins", model.gate.bins, 1)
         check_fields("model.gate", model.gate, {"start": "(-inf, inf)", "bins_per_metre": "(0, inf)"})
         check_number("model.gate.stop", model.gate.stop, f"({float(model.gate.start)}, inf)")
+    if estimator.cross is not None:
+        check_fields("model.camera", model.camera, {"aperture_radius": "(0, inf)"})
     if estimator.direct is not None:
         check_fields("model.guiding", model.guiding, _GUIDING)
     if spec.confocal:

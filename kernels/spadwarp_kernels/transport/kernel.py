@@ -85,7 +85,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     On CUDA they must be a multiple of the block size, since whole warps vote.
 
     Raises:
-        ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with a pinhole.
+        ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
     """
     check_spec(spec)
     estimator = ESTIMATORS[spec.estimator](spec)

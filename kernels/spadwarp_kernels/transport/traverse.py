@@ -10,6 +10,7 @@ from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SHADOW_RAY, PhotonState
 from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.visibility import may_be_hidden
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
 
@@ -48,7 +49,6 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(found, camera, surfaces) -> Scored``: whether a shadow ray is needed; by brute force it is
     traced here."""
     has_mesh = spec.mesh
-    may_be_hidden = spec.lens.may_be_hidden
 
     @wp.func
     def look(found: Scored, camera: Camera, surfaces: Surfaces) -> Scored:
