@@ -28,7 +28,6 @@ CAMERAS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
-    # What next_event has not yet seen often has no normal mean: it is left out.
     cells = agreeing_cells(scene(**CAMERAS[camera]), device, pixels=True, converged=0.1)
     # Every component and pixel is seen.
     pixels = cells["guided"][:, -16:]

@@ -33,7 +33,8 @@ def test_squares_are_exact_to_128_bits(device):
 @pytest.mark.slow
 def test_standard_error_is_the_spread_between_seeds(device):
     """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
-    one = scene(transport={"estimator": "guided"})
+    # A lens of 0.4 m, as in the other tests, sees much light from next to it, whose sums are skewed.
+    one = scene(transport={"estimator": "guided"}, camera={"aperture_diameter": 0.05})
     runs = [spadwarp.simulate(one, photons=2**15, seed=seed, device=device, uncertainty=True) for seed in range(64)]
     values = np.array([run.histogram for run in runs])
     bright = values.mean(axis=0) > 0.05 * values.mean(axis=0).max()
