@@ -37,11 +37,11 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """
     import warp as wp
 
-    from spadwarp.device import start_warp
+    from spadwarp.device import pick_device, start_warp
 
     start_warp()
     if isinstance(array, wp.array):
-        result = array if device is None else array.to(device)
+        result = array if device is None else array.to(pick_device(device))
     elif is_torch(array):
         tensor = array.detach().contiguous()
         if not tensor.is_floating_point() and tensor.element_size() < 4:
@@ -49,7 +49,7 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
         elif tensor.element_size() < 4:
             tensor = tensor.float()
         result = wp.from_torch(tensor)
-        result = result if device is None else result.to(device)
+        result = result if device is None else result.to(pick_device(device))
     else:
         values = np.asarray(array)
         if values.dtype.kind in "bui":
@@ -59,7 +59,7 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
             values = values.astype(np.float64 if values.dtype.itemsize >= 8 else np.float32, copy=False)
         else:
             raise TypeError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
-        device = wp.get_preferred_device() if device is None else wp.get_device(device)
+        device = pick_device(device)
         result = wp.array(np.ascontiguousarray(values), device=device, copy=device.is_cuda)
     if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
         raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spadwarp.errors import DeviceError
+from spadwarp.limits import shown
 
 if TYPE_CHECKING:
     import warp as wp
@@ -39,11 +40,11 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
     start_warp()
     if names == "cuda:all":
         return wp.get_cuda_devices() or [pick_device("cuda:0")]
-    return [pick_device(name) for name in ([None] if names is None else names.split(","))]
+    return [pick_device(name) for name in (names.split(",") if isinstance(names, str) else [names])]
 
 
-def pick_device(name: str | None = None) -> wp.Device:
-    """The Warp device of that name; by default the first GPU, else the CPU.
+def pick_device(name: str | wp.Device | None = None) -> wp.Device:
+    """The Warp device of that name, or as it is; by default the first GPU, else the CPU.
 
     Raises:
         DeviceError: There is no such device; the text names those that exist.
@@ -51,6 +52,8 @@ def pick_device(name: str | None = None) -> wp.Device:
     import warp as wp
 
     start_warp()
+    if isinstance(name, wp.Device):
+        return name
     names = [device.alias for device in wp.get_devices()]
     if name is None:
         name = next((alias for alias in names if alias.startswith("cuda")), "cpu")
@@ -58,7 +61,7 @@ def pick_device(name: str | None = None) -> wp.Device:
         name = "cuda:0"
     if name not in names:
         hint = "" if len(names) > 1 else "; Warp sees no NVIDIA GPU with driver R580 or newer"
-        raise DeviceError(f"device = {name!r} is not one of {', '.join(names)}{hint}")
+        raise DeviceError(f"device = {shown(name)} is not one of {', '.join(names)}{hint}")
     return wp.get_device(name)
 
 

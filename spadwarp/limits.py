@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import math
 import operator
 import re
 import reprlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 
 from spadwarp.errors import ArgumentError
 
-__all__ = ["Interval", "check_integer", "check_real", "parse_number", "shown"]
+__all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "check_choice", "check_integer"]
+__all__ += ["check_part", "check_real", "parse_number", "shown", "suggestion"]
+
+SEED = "[0, 18446744073709551615]"
+"""Range of seeds: 64 bits."""
+BIN_WIDTH, TIME = "[1e-18, 1e6] s", "[-1e6, 1e6] s"
+"""Ranges of the width of a bin and of a time, beyond which squares leave those of single precision."""
 
 _NUMBER = re.compile(
     r"[+-]?(?:\d+(?:_\d+)*(?:\.(?:\d+(?:_\d+)*)?)?|\.\d+(?:_\d+)*)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE
 )
-_INTERVAL = re.compile(r"([\[(])(.+), (.+)([])])")
+_INTERVAL = re.compile(r"([\[(])(.+), (.+)([])])(?: \S+)?")
 _LONGEST = 60  # characters of a value in a message
 
 
@@ -31,7 +39,7 @@ class Interval(NamedTuple):
     @classmethod
     @functools.cache
     def read(cls, text: str) -> Interval:
-        """From "(0, 1]"; only "inf]" includes infinity."""
+        """From "(0, 1]", or with a unit "(0, 1] m"; only "inf]" includes infinity."""
         match = _INTERVAL.fullmatch(text)
         assert match is not None, text
         low, high = (int(end) if end.lstrip("-").isdecimal() else float(end) for end in match.group(2, 3))
@@ -84,6 +92,33 @@ def check_integer(name: str, value: Any, within: str) -> int:
     if number not in Interval.read(within):
         raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
     return number
+
+
+def check_part(name: str, value: Any) -> tuple[int, int]:
+    """An argument as (k, n), the k-th of n parts, counted from 1. Raises `ArgumentError`."""
+    if not (isinstance(value, tuple | list) and len(value) == 2):
+        raise ArgumentError(f"{name} = {shown(value)} is not a pair such as (3, 64)")
+    number, parts = (check_integer(f"{name}: an item", one, "[0, 1000000000]") for one in value)
+    if not 1 <= number <= parts:
+        raise ArgumentError(f"{name} = {number}/{parts} is outside [1/{parts}, {parts}/{parts}]")
+    return number, parts
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
+    """An argument that is one of some words. Raises `ArgumentError`, with the word that was probably meant."""
+    if isinstance(value, str) and value in choices:
+        return value
+    listed = ", ".join(map(repr, choices))
+    raise ArgumentError(f"{name} = {shown(value)} is not one of {listed}{suggestion(str(value), choices)}")
+
+
+def suggestion(word: str, known: Sequence[str]) -> str:
+    """What to add to an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
+    if not 0 < len(word) <= 100:  # the time to compare words grows as the product of their lengths
+        return ""
+    close = [one for one in known if one.lower().startswith(word.lower())]
+    close = close or difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {' or '.join(map(repr, close[:2]))}?" if close else ""
 
 
 def _is_single(value: Any) -> bool:

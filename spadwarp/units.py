@@ -98,7 +98,8 @@ def _unit_table() -> dict[str, tuple[str, str, Fraction]]:
 
 UNITS = _unit_table()
 """Units that `quantity` reads: their kind, an example, and the factor to the unit of the kind."""
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", re.DOTALL)
+_LONGEST = 60  # characters
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*?)\s*", re.DOTALL | re.ASCII)
 
 
 def quantity(text: str, unit: str) -> float:
@@ -111,7 +112,7 @@ def quantity(text: str, unit: str) -> float:
     kind, example, factor = UNITS[unit]
     if factor not in (1, UNITS[example.partition(" ")[2]][2]):
         example = f"50 {unit}"
-    found = _NUMBER.fullmatch(text)
+    found = _NUMBER.fullmatch(text) if len(text) <= _LONGEST else None
     if found is None:
         raise ValueError(f"is not {kind}, such as {example!r}")
     number, given = found.groups()
@@ -126,7 +127,10 @@ def quantity(text: str, unit: str) -> float:
     other, _, given_factor = UNITS[given]
     if other != kind:
         raise ValueError(f"is {other}; {kind} is needed, such as {example!r}")
-    return float(Fraction(number) * given_factor / factor)
+    try:
+        return float(Fraction(number) * given_factor / factor)
+    except OverflowError:
+        raise ValueError("is beyond the largest number, 1.8e308") from None
 
 
 def with_prefix(value: float, unit: str, *, digits: int = 3) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from spadwarp.analytic.exposure_proposal import Exposure, Progress, Question, propose_exposure
 from spadwarp.analytic.eye_safety import axis_fluence
@@ -14,10 +14,9 @@ from spadwarp.analytic.largest_range import largest_range as find_largest_range
 from spadwarp.analytic.largest_range import with_plane
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Method
+from spadwarp.limits import SEED, check_choice, check_integer, check_real
+from spadwarp.scene import SceneLike, as_scene
 from spadwarp.units import range_from_time
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["Proposal", "plan"]
 
@@ -86,7 +85,7 @@ class Proposal(Exposure):
 
 
 def plan(
-    scene: Scene,
+    scene: SceneLike,
     *,
     depth_error: float = 0.01,
     time: float = 1.0,
@@ -130,11 +129,12 @@ def plan(
         ConfigError: No target in view, or no light from it.
         ArgumentError: An argument out of range.
     """
-    _check(depth_error=depth_error, time=time, photons=photons, eye_exposure=eye_exposure)
-    if not (margin >= 0 and math.isfinite(margin)):
-        raise ArgumentError(f"margin = {margin} m is outside [0, inf)")
-    if method not in METHODS:
-        raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
+    scene = as_scene(scene)
+    for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
+        check_real(name, value, "[1e-9, 1e9]")
+    photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)
+    margin = check_real("margin", margin, "[0, 1e6] m")
+    check_choice("method", method, METHODS)
     if ranges is not None:
         if not 0 < ranges[0] <= ranges[1] < math.inf:
             raise ArgumentError(f"ranges = {ranges} m: 0 < least <= largest < inf is needed")
@@ -163,9 +163,3 @@ def plan(
         largest_range=farthest[0],
         range_limit=farthest[1],
     )
-
-
-def _check(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if not (value > 0 and math.isfinite(value)):
-            raise ArgumentError(f"{name} = {value} is outside (0, inf)")

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_real
 from spadwarp.scene.beam_profile import load_profile
 
 if TYPE_CHECKING:
@@ -90,10 +91,8 @@ def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -
         ArgumentError: A value out of its range, or a wavelength outside 400 to 1050 nm.
         FileError: The image of a measured beam.
     """
-    if not (distance >= 0.0 and math.isfinite(distance)):
-        raise ArgumentError(f"distance = {distance} m is outside [0, inf)")
-    if not 1e-6 <= exposure <= 3e4:
-        raise ArgumentError(f"exposure = {exposure} s is outside [1e-6, 3e4]")
+    distance = check_real("distance", distance, "[0, 1e9] m")
+    exposure = check_real("exposure", exposure, "[1e-6, 3e4] s")
     limit, criterion = _pulse_limit(laser, exposure)
     densest = _densest(laser)
     energy = limit * _AREA / _share(laser, distance, densest)

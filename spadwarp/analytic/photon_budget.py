@@ -9,21 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spadwarp.analytic.model import Map, pixel_maps, response_sigma
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.limits import check_integer, check_real, shown
+from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import path_from_range
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
-
-__all__ = ["OUTLIERS", "TOLERANCE", "BudgetRow", "axis_rows", "budget"]
+__all__ = ["LONGEST", "OUTLIERS", "TOLERANCE", "BudgetRow", "axis_rows", "budget"]
 
 RANGES = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0)
+LONGEST = 10_000
+"""Most values of a budget or a sweep."""
 TOLERANCE = 0.01
 """Depth error of `pulses_for_1cm` [m]."""
 OUTLIERS = 0.01
@@ -75,7 +76,7 @@ class BudgetRow:
 
 
 def budget(
-    scene: Scene,
+    scene: SceneLike,
     ranges: Iterable[float] | None = None,
     media: Iterable[str] | Mapping[str, Mapping[str, Any]] | None = None,
     *,
@@ -86,7 +87,7 @@ def budget(
 
     Args:
         scene: Laser, camera, detector, gate and `[analytic]` settings are taken from it; the target's shape is not.
-        ranges: Distances on the optical axis [m], > 0; default 1 to 50 m.
+        ranges: Distances on the optical axis [m], 1e-6 to 1e6; default 1 to 50 m.
         media: Names of presets, or name → fields of `[medium]`; default: the scene's water alone.
         reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
         device: Warp device; default: the first GPU, else the CPU.
@@ -98,20 +99,26 @@ def budget(
         ConfigError: A water or scene that the model does not cover.
         ArgumentError: Ranges or reflectance out of range.
     """
-    distances = np.array(sorted(RANGES if ranges is None else ranges), np.float64)
-    if distances.size == 0 or not ((distances > 0) & np.isfinite(distances)).all():
-        raise ArgumentError(f"ranges = {distances.tolist()} are not all in (0, inf)")
+    scene = as_scene(scene)
+    distances = _distances(RANGES if ranges is None else ranges)
     if reflectance is None:
         given = scene.targets[0].reflectance if scene.targets else 0.5
         reflectance = 0.5 if given == "from_file" else given
-    if not 0 <= reflectance <= 1:
-        raise ArgumentError(f"reflectance = {reflectance} is outside [0, 1]")
+    reflectance = check_real("reflectance", reflectance, "[0, 1]")
     if scene.analytic.backscatter == "monte_carlo":
         raise ConfigError("analytic.backscatter = 'monte_carlo' belongs to one range; a budget takes 'single_scatter'")
     rows: list[BudgetRow] = []
     for name, changed in _waters(scene, media):
         rows += axis_rows(changed, name, distances, reflectance, device)
     return rows
+
+
+def _distances(ranges: Any) -> Map:
+    if isinstance(ranges, str | bytes) or not isinstance(ranges, Iterable):
+        raise ArgumentError(f"ranges = {shown(ranges)} is not a list of distances [m]")
+    distances = sorted(check_real("ranges: an item", one, "[1e-6, 1e6] m") for one in ranges)
+    check_integer("number of ranges", len(distances), f"[1, {LONGEST}]")
+    return np.array(distances)
 
 
 def _waters(scene: Scene, media: Iterable[str] | Mapping[str, Mapping[str, Any]] | None) -> Iterable[tuple[str, Scene]]:

@@ -5,8 +5,9 @@ Maps of the model (`spadwarp.analytic.model`), then frames of arrival + noise wi
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,24 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.analytic.model import Map, pixel_maps, source_name
 from spadwarp.analytic.result import AnalyticResult, background_photons
 from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.limits import SEED, check_integer
+from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
+from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.transport import truth_maps
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["simulate_analytic"]
 
 
 def simulate_analytic(
-    scene: Scene,
+    scene: SceneLike,
     *,
     truth: Truth | None = None,
     frames: int = 1,
     seed: int = 0,
     device: Any = None,
-    backscatter_profile: Result | ArrayLike | None = None,
+    backscatter_profile: Result | str | os.PathLike[str] | ArrayLike | None = None,
 ) -> AnalyticResult:
     """Simulates depth frames of a scene by eq 3–11, without tracing photons.
 
@@ -44,17 +45,17 @@ def simulate_analytic(
         frames: Depth frames to draw, ≥ 0.
         seed: 64-bit seed of the frames.
         device: Warp device; default: the first GPU, else the CPU.
-        backscatter_profile: For `backscatter = "monte_carlo"`: a `Result` of the same scene, or expected backscatter
-            detections per pulse and bin over the scene's gate, `[T]` for all pixels or `[H, W, T]`.
+        backscatter_profile: For `backscatter = "monte_carlo"`: a `Result` of the same scene, its path, or expected
+            backscatter detections per pulse and bin over the scene's gate, `[T]` for all pixels or `[H, W, T]`.
 
     Raises:
         ConfigError: A scene that the model does not cover, or whose gate holds no return.
         ArgumentError: A truth or profile of the wrong shape, or with impossible values.
     """
+    scene = as_scene(scene)
+    frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)
     truth = truth_maps(scene) if truth is None else truth
     _check_truth(truth, scene)
-    if frames < 0:
-        raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     shape = truth.depth.shape
     maps, table = pixel_maps(
         scene,
@@ -92,12 +93,13 @@ def _background(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
     return np.where(estimated & (maps["backscatter"] > 0), fraction, 0.0), np.zeros(estimated.shape)
 
 
-def _profile(scene: Scene, given: Result | ArrayLike | None) -> NDArray[np.float32] | None:
+def _profile(scene: Scene, given: Any) -> NDArray[np.float32] | None:
     """Backscatter detections per pulse and bin, `[1 or P, T]`."""
     if given is None:
         return None
     camera, bins = scene.camera, scene.gate.bins
-    if isinstance(given, Result):
+    if isinstance(given, str | os.PathLike | Result):
+        given = as_result(given, "backscatter_profile")
         values = given.component("backscatter") * (scene.laser.photons_per_pulse * scene.detector.pde)
     else:
         values = np.asarray(given, np.float64)

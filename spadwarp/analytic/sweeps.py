@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import tomllib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import source_name
-from spadwarp.analytic.photon_budget import BudgetRow, axis_rows
+from spadwarp.analytic.photon_budget import LONGEST, BudgetRow, axis_rows
 from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
-from spadwarp.scene import Scene, parse_override
+from spadwarp.io.parsing import parse_toml
+from spadwarp.limits import check_choice, check_integer, parse_number, shown
+from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.load import parse_key
 from spadwarp.scene.messages import locate
@@ -65,7 +66,7 @@ class Sweep:
 
 
 def sweep(
-    scene: Scene,
+    scene: SceneLike,
     *,
     vary: str | tuple[str, Sequence[Any]],
     of: Literal["budget", "depth-error"] = "budget",
@@ -88,11 +89,15 @@ def sweep(
         ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
         ArgumentError: `vary` or `of` not of the form above.
     """
-    if of not in ("budget", "depth-error"):
-        raise ArgumentError(f"of = {of!r} is not one of 'budget', 'depth-error'")
-    field, values = parse_vary(vary) if isinstance(vary, str) else (vary[0], list(vary[1]))
-    if not values:
-        raise ArgumentError(f"vary = {vary!r} holds no value")
+    scene = as_scene(scene)
+    check_choice("of", of, ("budget", "depth-error"))
+    if isinstance(vary, str):
+        field, values = parse_vary(vary)
+    elif isinstance(vary, tuple | list) and len(vary) == 2 and isinstance(vary[1], Iterable):
+        field, values = str(vary[0]), list(vary[1])
+    else:
+        raise ArgumentError(f"vary = {shown(vary)} is neither 'section.field=from:to:count' nor (field, values)")
+    check_integer("number of values to vary", len(values), f"[1, {LONGEST}]")
     rows: list[Any] = []
     for value in values:
         changed = scene.with_overrides({field: value})
@@ -116,30 +121,29 @@ def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:
     """
     field, equals, spec = (part.strip() for part in text.partition("="))
     if not field or not equals or not spec:
-        raise ArgumentError(f"vary = {text!r} is not of the form section.field=from:to:count")
+        raise ArgumentError(f"vary = {shown(text)} is not of the form section.field=from:to:count")
     info = locate(Scene, parse_key(field))[1] if unit is None else None
     unit = (field_unit(info) if info is not None else None) or unit
     if ":" not in spec:
         try:
-            values = tomllib.loads(f"values = [{spec}]")["values"]
-        except tomllib.TOMLDecodeError:  # bare words
+            values = parse_toml(f"values = [{spec}]")["values"]
+        except ConfigError:  # bare words
             values = [parse_override(f"{field}={value}")[1] for value in spec.split(",")]
         return field, [_number(value, unit, text) for value in values]
     parts = spec.split(":")
     try:
         low, high = (float(_number(_bare(part), unit, text)) for part in parts[:2])
-        count = int(parts[2])
+        count = parse_number(parts[2])
         geometric = len(parts) == 4 and parts[3] == "log"
-        if count < 1 or len(parts) > 3 + geometric or not (math.isfinite(low) and math.isfinite(high)):
-            raise ValueError
-        if geometric and not (low > 0 and high > 0):
+        if len(parts) > 3 + geometric or not math.isfinite(high - low) or (geometric and not min(low, high) > 0):
             raise ValueError
     except ArgumentError:
         raise
     except (ValueError, IndexError):
         raise ArgumentError(
-            f"vary = {text!r} is not of the form section.field=from:to:count, with :log only for positive ends"
+            f"vary = {shown(text)} is not of the form section.field=from:to:count, with :log only for positive ends"
         ) from None
+    count = check_integer("number of values to vary", count, f"[1, {LONGEST}]")
     steps = [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
     if info is not None and takes_integers(info):
         return field, list(dict.fromkeys(round(value) for value in steps))
@@ -149,7 +153,7 @@ def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:
 def _bare(text: str) -> Any:
     """The number that a text is, else the text."""
     try:
-        return float(text)
+        return parse_number(text)
     except ValueError:
         return text.strip()
 
@@ -161,7 +165,7 @@ def _number(value: Any, unit: str | None, text: str) -> Any:
     try:
         return quantity(value, unit)
     except ValueError as error:
-        raise ArgumentError(f"vary = {text!r}: {value!r} {error}") from None
+        raise ArgumentError(f"vary = {shown(text)}: {shown(value)} {error}") from None
 
 
 def _central_row(scene: Scene, device: str | None) -> BudgetRow:

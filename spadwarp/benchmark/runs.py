@@ -18,8 +18,8 @@ from spadwarp.analytic import simulate_analytic
 from spadwarp.benchmark.cases import CASES, GROUPS, Case
 from spadwarp.benchmark.results import BenchResult
 from spadwarp.device import core_count, pick_device
-from spadwarp.errors import ConfigError
 from spadwarp.frames import detect
+from spadwarp.limits import check_choice, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import simulate, trace, truth_maps
@@ -63,16 +63,14 @@ def run(
         found: Called with each result.
 
     Raises:
-        ConfigError: An unknown case, or a number out of range.
+        ArgumentError: An unknown case, or a number out of range.
         DeviceError: No such device, or one that is too small for a case.
     """
     names = list(CASES) if cases is None else list(cases)
     for name in names:
-        if name not in CASES and name not in GROUPS:
-            raise ConfigError(f"cases: {name!r} is not one of {', '.join([*CASES, *GROUPS])}")
-    for option, value, high in (("photons", photons, 10**12), ("repeats", repeats, 1000)):
-        if value is not None and not 1 <= value <= high:
-            raise ConfigError(f"{option} = {value} is outside [1, {high}]")
+        check_choice("cases: an item", name, [*CASES, *GROUPS])
+    photons = None if photons is None else check_integer("photons", photons, "[1, 1000000000000]")
+    repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)
     chosen = [case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])]
     results = []

@@ -14,25 +14,25 @@ from spadwarp.checks.survey import Survey
 from spadwarp.checks.targets import check_targets
 from spadwarp.checks.timing import check_timing
 from spadwarp.mesh import TriangleMesh
-from spadwarp.scene import Scene
+from spadwarp.scene import SceneLike, as_scene
 
 __all__ = ["check", "summary"]
 
 _CHECKS = (check_plausible, check_targets, check_focus, check_scan, check_timing, check_medium, check_statistics)
 
 
-def check(scene: Scene, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
+def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
     """Everything worth knowing about a scene, warnings first; occlusion is not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
     for the table of a phase function.
     """
-    survey = Survey(scene, mesh)
+    survey = Survey(as_scene(scene), mesh)
     messages = [message for find in _CHECKS for message in find(survey)]
     return sorted(messages, key=lambda message: message.level != "warning")
 
 
-def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
+def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any]:
     """Numbers that follow from a scene; lengths in m, None where there is no target in the view and the beam.
 
     `attenuation_length` and `albedo` are those of the water before the first layer; `layers` has those of each layer,
@@ -44,6 +44,7 @@ def summary(scene: Scene, mesh: TriangleMesh | None = None) -> dict[str, Any]:
     tallies.
     Raises `MeshError`.
     """
+    scene = as_scene(scene)
     survey = Survey(scene, mesh)
     camera, gate, laser, medium = scene.camera, scene.gate, scene.laser, scene.medium
 

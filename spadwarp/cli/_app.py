@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import platform
 import shlex
@@ -17,7 +18,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from typing import Any, NoReturn, TypeVar
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import spadwarp
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
@@ -139,8 +140,27 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
     raise typer.Exit(code)
 
 
+class _Command(TyperCommand):
+    """Refuses options that are not finite numbers, which `float` takes without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        for param in self.params:
+            value = ctx.params.get(param.name)
+            for one in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(one, float) and not math.isfinite(one):
+                    raise typer.BadParameter(f"{one} is not a finite number", param_hint=param.opts[0])
+        return super().invoke(ctx)
+
+
+class Commands(typer.Typer):
+    """The application, or a group of its commands."""
+
+    def command(self, *args: Any, **options: Any) -> Any:
+        return super().command(*args, cls=_Command, **options)
+
+
 # Help in plain text: units in square brackets stay, and nothing is loaded to draw boxes.
-app = typer.Typer(
+app = Commands(
     cls=_Commands,
     no_args_is_help=True,
     add_completion=True,

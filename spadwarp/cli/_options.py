@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import enum
+import math
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -13,6 +13,7 @@ import typer
 
 import spadwarp
 from spadwarp.cli._outputs import Json, Out, Outputs, Overwrite, check_outputs, in_bytes  # noqa: F401
+from spadwarp.limits import parse_number, shown
 from spadwarp.units import quantity
 
 if TYPE_CHECKING:
@@ -32,16 +33,26 @@ def whole_number(text: str | int) -> int:
     return int(value)
 
 
+def real_number(text: str | float) -> float:
+    """A finite number, such as `0.02` or `1e-3`."""
+    try:
+        number = parse_number(str(text))
+    except ValueError as error:
+        raise typer.BadParameter(f"{shown(text)} {error}") from None
+    if math.isinf(number):
+        raise typer.BadParameter(f"{text} is not a finite number")
+    return number
+
+
 def in_unit(unit: str) -> Callable[[str | float], float]:
     """A parser for a number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
 
     def parse(text: str | float) -> float:
-        with contextlib.suppress(ValueError):
-            return float(text)
+        word = str(text).strip()
         try:
-            return quantity(str(text), unit)
+            return real_number(word) if word[-1:] in "0123456789." else quantity(word, unit)
         except ValueError as error:
-            raise typer.BadParameter(f"{text!r} {error}") from None
+            raise typer.BadParameter(f"{shown(text)} {error}") from None
 
     parse.__name__ = unit
     return parse
@@ -55,7 +66,11 @@ def two_lengths(text: str, option: str) -> tuple[float, float]:
     first, colon, second = text.partition(":")
     if not colon:
         raise typer.BadParameter(f"{text!r} is not FROM:TO, two lengths", param_hint=option)
-    return length(first), length(second)
+    try:
+        return length(first), length(second)
+    except typer.BadParameter as error:
+        error.param_hint = option
+        raise
 
 
 ScenePath = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (TOML).", show_default=False)]
@@ -105,10 +120,14 @@ RayAddress = Annotated[
 Workers = Annotated[
     int | None,
     typer.Option(
-        min=1, metavar="N", help="Workers of Ray; by default one for each GPU, or one for each machine without a GPU."
+        parser=whole_number,
+        metavar="N",
+        help="Workers of Ray; by default one for each GPU, or one for each machine without a GPU.",
     ),
 ]
-Threads = Annotated[int | None, typer.Option(min=1, metavar="N", help="CPU threads; by default one for each core.")]
+Threads = Annotated[
+    int | None, typer.Option(parser=whole_number, metavar="N", help="CPU threads; by default one for each core.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and errors.")]
 TorchDevice = Annotated[
     str | None,
@@ -118,7 +137,7 @@ RunOrFrames = Annotated[
     Path,
     typer.Argument(metavar="RUN", help="A result or frames, or the directory of one of them.", show_default=False),
 ]
-Frame = Annotated[int, typer.Option(min=0, metavar="N", help="Number of the frame, if RUN holds frames.")]
+Frame = Annotated[int, typer.Option(parser=whole_number, metavar="N", help="Number of the frame, if RUN holds frames.")]
 
 
 class Estimator(enum.StrEnum):

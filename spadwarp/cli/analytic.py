@@ -13,6 +13,7 @@ import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import parse_number
 
 if TYPE_CHECKING:
     from spadwarp.analytic import AnalyticResult
@@ -40,7 +41,10 @@ def analytic(
     ] = None,
     depth_channel: Annotated[str | None, typer.Option(metavar="NAME", help="Its channel; the preset's.")] = None,
     depth_scale: Annotated[
-        float | None, typer.Option(metavar="M", help="Metres per unit of depth; the preset's (unreal: 0.01).")
+        float | None,
+        typer.Option(
+            parser=opt.real_number, metavar="M", help="Metres per unit of depth; the preset's (unreal: 0.01)."
+        ),
     ] = None,
     radial: Annotated[
         bool, typer.Option("--radial", help="Depth is the distance from the camera, not planar.")
@@ -137,7 +141,7 @@ def analytic(
 def _albedo(text: str | None) -> Path | float:
     """A number, or the path of a file."""
     try:
-        return 0.5 if text is None else float(text)
+        return 0.5 if text is None else parse_number(text)
     except ValueError:
         return Path(str(text))
 

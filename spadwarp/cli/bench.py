@@ -26,7 +26,9 @@ def bench(
     ] = None,
     device: opt.Device = None,
     photons: opt.Photons = None,
-    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Timed runs; the fastest is reported.")] = 3,
+    repeats: Annotated[
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Timed runs; the fastest is reported.")
+    ] = 3,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,

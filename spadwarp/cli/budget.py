@@ -27,7 +27,8 @@ def budget(
         typer.Option("--medium", metavar="NAME", help="A named water; may be repeated. By default the scene's."),
     ] = None,
     reflectance: Annotated[
-        float | None, typer.Option(metavar="X", help="Of the surface; by default that of the first target.")
+        float | None,
+        typer.Option(parser=opt.real_number, metavar="X", help="Of the surface; by default that of the first target."),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Directory for budget.png and budget.csv.")] = None,
     overrides: opt.Overrides = None,

@@ -10,10 +10,10 @@ import typer
 
 import spadwarp
 from spadwarp.cli import _options as opt
-from spadwarp.cli._app import app, fail, say
+from spadwarp.cli._app import Commands, app, fail, say
 from spadwarp.cli._progress import progress
 
-group = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+group = Commands(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(group, name="dataset", help="Datasets of labelled depth frames: make, verify, info, preview.")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset's folder.", show_default=False)]
@@ -36,7 +36,11 @@ def make(
     device: opt.Devices = None,
     processes: Annotated[
         int,
-        typer.Option(min=1, metavar="N", help="Largest number of processes per GPU; fewer for few shards or cores."),
+        typer.Option(
+            parser=opt.whole_number,
+            metavar="N",
+            help="Largest number of processes per GPU; fewer for few shards or cores.",
+        ),
     ] = 4,
     engine_name: opt.EngineName = "local",
     ray_address: opt.RayAddress = None,
@@ -153,7 +157,7 @@ def preview(
     out: Annotated[Path | None, typer.Option(metavar="PNG", help="The picture; by default preview.png in DIR.")] = None,
     split: Annotated[Split, typer.Option(help="Split of the frames.")] = Split.all,
     frames: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Number of frames, spread evenly over the split.")
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Number of frames, spread evenly over the split.")
     ] = 20,
     overwrite: opt.Overwrite = False,
 ) -> None:

@@ -45,7 +45,9 @@ def denoise(
         bool, typer.Option("--depth", help="Three dimensions in .npy and .mat are frames of depth, not a histogram.")
     ] = False,
     channel: Annotated[str | None, typer.Option(metavar="NAME", help="Channel of an EXR that holds depth.")] = None,
-    scale: Annotated[float, typer.Option(metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")] = 1.0,
+    scale: Annotated[
+        float, typer.Option(parser=opt.real_number, metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")
+    ] = 1.0,
     variable: Annotated[str | None, typer.Option(metavar="NAME", help="Array in a .mat file.")] = None,
     bin_width_ps: Annotated[
         float | None,
@@ -61,7 +63,11 @@ def denoise(
     ] = None,
     group_index: Annotated[
         float | None,
-        typer.Option(metavar="N", help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; for measured histograms."),
+        typer.Option(
+            parser=opt.real_number,
+            metavar="N",
+            help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; for measured histograms.",
+        ),
     ] = None,
     irf_fwhm_ps: Annotated[
         float | None,

@@ -11,6 +11,7 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
+from spadwarp.limits import parse_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,11 @@ def depth(
     ] = None,
     group_index: Annotated[
         float | None,
-        typer.Option(metavar="N", help="For the speed of light; 1 in air, 1.3566 in fresh water, 1.3638 in seawater."),
+        typer.Option(
+            parser=opt.real_number,
+            metavar="N",
+            help="For the speed of light; 1 in air, 1.3566 in fresh water, 1.3638 in seawater.",
+        ),
     ] = None,
     horizontal_fov_deg: Annotated[
         float | None,
@@ -131,7 +136,7 @@ def _background(text: str | None) -> Any:
     if text is None or text == "median":
         return text
     try:
-        return float(text)
+        return parse_number(text)
     except ValueError:
         raise typer.BadParameter(f"{text!r} is neither a number nor 'median'", param_hint="--background") from None
 

@@ -48,6 +48,7 @@ def simulate(
     relative_error: Annotated[
         float | None,
         typer.Option(
+            parser=opt.real_number,
             metavar="X",
             help="Stop at this relative error of the bins that decide the depth (0.02: 2 %); --photons is then the "
             "largest number of photons, rounded up to whole batches.",
@@ -64,7 +65,7 @@ def simulate(
     checkpoint: Annotated[
         float,
         typer.Option(
-            min=0.0,
+            parser=opt.real_number,
             metavar="SECONDS",
             help="Time between checkpoints in --out, for --resume after a crash; longer where writing takes long. "
             "0: none.",

@@ -10,6 +10,7 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
+from spadwarp.limits import parse_number
 
 
 @app.command()
@@ -22,9 +23,11 @@ def video(
         str | None, typer.Option(metavar="FROM,TO", help="Times of flight [ns]; by default those with light.")
     ] = None,
     pictures: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Largest number of pictures; bins are merged.")
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Largest number of pictures; bins are merged.")
     ] = 120,
-    fps: Annotated[float, typer.Option(metavar="N", help="Pictures per second, up to 50.")] = 12.0,
+    fps: Annotated[
+        float, typer.Option(parser=opt.real_number, metavar="N", help="Pictures per second, up to 50.")
+    ] = 12.0,
     linear: Annotated[bool, typer.Option("--linear", help="A linear colour scale instead of four decades.")] = False,
     frame: opt.Frame = 0,
     overwrite: opt.Overwrite = False,
@@ -48,7 +51,7 @@ def _window(text: str | None) -> tuple[float, float] | None:
     if text is None:
         return None
     try:
-        start, stop = (float(word) for word in text.split(","))
+        start, stop = map(parse_number, text.split(","))
     except ValueError:
         raise typer.BadParameter(f"{text!r} is not FROM,TO, two numbers", param_hint="--window") from None
     return start, stop

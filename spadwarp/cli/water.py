@@ -17,9 +17,15 @@ def water(
     wavelength_nm: Annotated[
         float, typer.Argument(parser=opt.in_unit("nm"), metavar="NM", help="Vacuum wavelength, 400 to 700 [nm].")
     ],
-    chlorophyll: Annotated[float, typer.Option(metavar="C", help="0 (pure water) to 30 [mg/m3].")] = 0.0,
-    temperature: Annotated[float, typer.Option(metavar="T", help="0 to 30 [degrees Celsius].")] = 20.0,
-    salinity: Annotated[float, typer.Option(metavar="S", help="0 (fresh) to 40 [g/kg].")] = 35.0,
+    chlorophyll: Annotated[
+        float, typer.Option(parser=opt.real_number, metavar="C", help="0 (pure water) to 30 [mg/m3].")
+    ] = 0.0,
+    temperature: Annotated[
+        float, typer.Option(parser=opt.real_number, metavar="T", help="0 to 30 [degrees Celsius].")
+    ] = 20.0,
+    salinity: Annotated[
+        float, typer.Option(parser=opt.real_number, metavar="S", help="0 (fresh) to 40 [g/kg].")
+    ] = 35.0,
     overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tomllib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,7 +24,9 @@ from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.lock import lock
+from spadwarp.io.parsing import parse_toml, read_toml
 from spadwarp.io.text import write_json
+from spadwarp.limits import check_integer, check_part
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
 
 __all__ = ["DatasetReport", "make_dataset"]
@@ -82,11 +83,8 @@ def make_dataset(
         KeyboardInterrupt: Ctrl-C, once the shards that were begun are finished.
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
-    number, parts = part
-    if processes < 1:
-        raise ConfigError(f"processes = {processes} is outside [1, inf)")
-    if not 1 <= number <= parts:
-        raise ConfigError(f"part = {number}/{parts}: {number} is outside [1, {parts}]")
+    number, parts = check_part("part", part)
+    processes = check_integer("processes", processes, "[1, 1000]")
     folder = Path(out).absolute()
     _claim(plan, folder)
     shards = [item for item in plan.shards if item.index % parts == number - 1]
@@ -182,8 +180,8 @@ def _holds(plan: Plan, folder: Path) -> bool:
     path = folder / "recipe.toml"
     if not path.is_file():
         return False
-    with suppress(ValueError):  # not TOML, or not UTF-8
-        if tomllib.loads(path.read_text(encoding="utf-8")) == tomllib.loads(plan.recipe.to_toml()):
+    with suppress(ConfigError, FileError):  # not TOML, or not UTF-8
+        if read_toml(path) == parse_toml(plan.recipe.to_toml()):
             return True
     raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
 

@@ -14,6 +14,7 @@ from spadwarp.dataset.manifest import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shard_file import ShardFile, frame_count
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import SEED, check_choice, check_integer
 from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
@@ -66,12 +67,10 @@ class FrameReader:
     ) -> None:
         self.path = Path(path)
         self.manifest = read_manifest(self.path)
-        if split not in (*SPLITS, "all"):
-            raise ArgumentError(f"split = {split!r} is not one of {', '.join(map(repr, (*SPLITS, 'all')))}")
+        check_choice("split", split, (*SPLITS, "all"))
         if unknown := [name for name in fields if name not in FIELDS]:
             raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, FIELDS))}")
-        if repeats < 1:
-            raise ArgumentError(f"repeats = {repeats} is outside [1, inf)")
+        repeats, seed = check_integer("repeats", repeats, "[1, 1000000000]"), check_integer("seed", seed, SEED)
         self.split, self.fields, self.repeats, self.seed = split, tuple(fields), repeats, seed
         self.augment, self.epoch = augment, 0
         self.shape: tuple[int, int] = (self.manifest["height"], self.manifest["width"])

@@ -19,6 +19,7 @@ from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames, own_weights
 from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.limits import check_choice, check_integer
 
 __all__ = ["Evaluation", "Sample", "evaluate"]
 
@@ -160,12 +161,12 @@ class _Comparison:
         device: str | None,
     ) -> None:
         wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
-        if unknown := [name for name in models if name not in METHODS]:
-            raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+        for name in models:
+            check_choice("models: an item", name, METHODS)
         if "histograms" in wanted:
             raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
-        if frames < 1:
-            raise ArgumentError(f"frames = {frames} is outside [1, inf)")
+        frames = check_integer("frames", frames, "[1, 1000000000]")
+        bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
         self.data, self.split, self.device, self.methods = data, split, device, ("input", *wanted)
         self.weights = own_weights(wanted, None if weights is None else Path(weights))
         self.chosen, self.photons, self.summary = _choose(data, split, frames)

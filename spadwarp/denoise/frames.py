@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_real, shown
 
 __all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "POOLED", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
 
@@ -116,9 +117,11 @@ def depth_frames(
         raise ArgumentError(
             f"histograms are {len(features)} frames of {features.shape[2:]} pixels, depth is {values.shape}"
         )
-    start, stop = map(float, gate)
-    if not (math.isfinite(stop) and 0 <= start < stop):
-        raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with 0 <= start < stop")
+    if not (isinstance(gate, tuple | list) and len(gate) == 2):
+        raise ArgumentError(f"gate = {shown(gate)} is not (start, stop) [m]")
+    start, stop = (check_real("gate", one, "[0, 1e6] m") for one in gate)
+    if not start < stop:
+        raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with start < stop")
     if (values[np.isfinite(values)] < 0).any():
         raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf)")
     present = np.isfinite(values) & (values > 0)

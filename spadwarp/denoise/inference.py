@@ -16,6 +16,7 @@ from spadwarp.denoise.frames import POOLED, DepthFrames, depth_frames
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
 from spadwarp.io.paths import existing_file
+from spadwarp.limits import check_choice
 
 __all__ = ["METHODS", "WEIGHTS", "apply", "denoise_frames", "features_of_histograms", "weights_metadata"]
 
@@ -101,8 +102,8 @@ def denoise_frames(
     Arguments and errors are those of `apply`; `model` may also be "input", the frames as they are; `window`: side of
     the median [pixels].
     """
-    if model not in (*METHODS, "input"):
-        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, METHODS))}")
+    if model != "input":
+        check_choice("model", model, METHODS)
     if model == "histograms" and frames.features is None:
         raise ArgumentError('model = "histograms" needs counts with their background and response; they are missing')
     reported = ~np.isnan(frames.depth)

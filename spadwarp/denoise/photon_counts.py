@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames, features_of_histograms, own_weights
-from spadwarp.errors import ArgumentError, SpadwarpError
+from spadwarp.errors import SpadwarpError
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.estimators import arrival_time
 from spadwarp.frames.response import detector_response
+from spadwarp.limits import SEED, check_choice, check_integer, check_real
 from spadwarp.scene.geometry import depth_from_time
 from spadwarp.units import range_from_time
 from spadwarp.viz import evaluation as drawing
@@ -107,11 +108,13 @@ def photon_sweep(
         FileError: Weights that cannot be read.
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
-    if unknown := [name for name in models if name not in METHODS]:
-        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(map(repr, METHODS))}")
+    for model in models:
+        check_choice("models: an item", model, METHODS)
     for name, values in (("photons", photons), ("sbr", sbr)):
-        if not values or min(values) <= 0:
-            raise ArgumentError(f"{name} = {list(values)} needs numbers in (0, inf)")
+        check_integer(f"number of {name}", len(values), "[1, 10000]")
+        for value in values:
+            check_real(f"{name}: an item", value, "[1e-9, 1e9]")
+    frames, seed = check_integer("frames", frames, "[1, 1000000]"), check_integer("seed", seed, SEED)
     own = own_weights(models, weights)
     # A median of each window is tried; the other methods have one variant.
     variants = [("input", 5)]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
-
-if TYPE_CHECKING:
-    from spadwarp.result.result import Result
+from spadwarp.limits import BIN_WIDTH, check_choice, check_real
+from spadwarp.result.file import ResultLike, as_result
 
 __all__ = ["crlb", "crlb_from_histogram"]
 
@@ -64,11 +62,9 @@ def crlb_from_histogram(
     for name, cube in (("signal_cube", signal), ("background_cube", background)):
         if not (np.isfinite(cube).all() and (cube >= 0).all()):
             raise ArgumentError(f"{name} holds a value outside [0, inf)")
-    for name, value in (("bin_width", bin_width), ("pulses", pulses)):
-        if not (value > 0 and math.isfinite(value)):
-            raise ArgumentError(f"{name} = {value} is outside (0, inf)")
-    if law not in ("poisson", "first_photon"):
-        raise ArgumentError(f"law = {law!r} is not one of 'poisson', 'first_photon'")
+    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
+    pulses = check_real("pulses", pulses, "(0, 1e30]")
+    check_choice("law", law, ("poisson", "first_photon"))
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
     rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
@@ -85,7 +81,7 @@ def crlb_from_histogram(
 
 
 def crlb(
-    result: Result,
+    result: ResultLike,
     *,
     pulses: float | None = None,
     law: Literal["poisson", "first_photon"] = "first_photon",
@@ -97,10 +93,11 @@ def crlb(
     The scene's instrument response is applied.
 
     Args:
-        result: Of `spadwarp.simulate`.
+        result: Of `spadwarp.simulate`, or its path.
         pulses: Of one depth frame; default: the scene's, `Scene.pulses_per_depth_frame`.
         law, device: See `crlb_from_histogram`.
     """
+    result = as_result(result)
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detector.pde
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
@@ -122,9 +119,7 @@ def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width
     if irf is None:
         return np.ones(1), stencil
     if not isinstance(irf, InstrumentResponse) and np.ndim(irf) == 0:
-        fwhm = float(irf)  # type: ignore[arg-type]
-        if not (fwhm > 0 and math.isfinite(fwhm)):
-            raise ArgumentError(f"irf = {irf} s is outside (0, inf)")
+        fwhm = check_real("irf", irf, BIN_WIDTH)
         irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
     if isinstance(irf, InstrumentResponse):
         if not irf.is_smooth:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError
 from spadwarp.frames.estimators import Method, arrival_time
 from spadwarp.frames.measured import Histograms
+from spadwarp.limits import check_choice, check_real
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_path
 from spadwarp.units import path_from_time
@@ -32,8 +33,7 @@ def depth_frame(
             `options` (`irf`, `background`, `gate`, `device`).
         quantity: `"depth"` is planar, z; `"range"` runs along the line of sight.
     """
-    if quantity not in ("depth", "range"):
-        raise ArgumentError(f"quantity = {quantity!r} is not 'depth' or 'range'")
+    check_choice("quantity", quantity, ("depth", "range"))
     scene, gate = result.scene, result.scene.gate
     time = arrival_time(result.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
     directions = pixel_directions(scene.camera)
@@ -141,15 +141,12 @@ def _geometry(
         )
     if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
         raise ArgumentError("group index and field of view are those of the file's scene")
-    index = scene.medium.group_index if scene is not None else float(group_index or 0)
-    if not 1 <= index <= 3:
-        raise ArgumentError(f"group index = {index} is outside [1, 3]")
+    index = check_real("group index", scene.medium.group_index if scene is not None else group_index, "[1, 3]")
     if scene is not None:
         return index, pixel_directions(scene.camera), scene.beam.position
     if horizontal_fov_deg is None:
         return index, None, (0.0, 0.0, 0.0)
-    if not 0 < horizontal_fov_deg < 180:
-        raise ArgumentError(f"horizontal field of view = {horizontal_fov_deg} is outside (0, 180)")
+    check_real("horizontal field of view", horizontal_fov_deg, "[1e-6, 180)")
     height, width = histograms.values.shape[-3:-1]
     camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
     return index, pixel_directions(camera), (0.0, 0.0, 0.0)

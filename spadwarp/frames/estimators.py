@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
 from spadwarp.errors import ArgumentError, kernel_errors
+from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
@@ -55,12 +56,9 @@ def arrival_time(
     """
     from spadwarp_kernels import detection as kernels
 
-    if method not in METHODS:
-        raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, METHODS))}")
-    if not (np.isfinite(bin_width) and bin_width > 0):
-        raise ArgumentError(f"bin_width = {bin_width} s is outside (0, inf)")
-    if not np.isfinite(gate_start):
-        raise ArgumentError(f"gate_start = {gate_start} s is not finite")
+    check_choice("method", method, METHODS)
+    gate_start = check_real("gate_start", gate_start, TIME)
+    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     filtered = method in ("matched", "likelihood")
     if irf is None and filtered:
         raise ArgumentError(f"method = {method!r} needs an irf")
@@ -93,8 +91,10 @@ def arrival_time(
 
 def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float, bins: int) -> tuple[int, int]:
     """The bins [first, stop) whose centres lie in the gate."""
+    if not (isinstance(gate, tuple | list) and len(gate) == 2):
+        raise ArgumentError(f"gate = {shown(gate)} is not (start [s], stop [s])")
     # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
-    edges = [(time - gate_start) / bin_width - 0.5 for time in gate]
+    edges = [(check_real("gate", time, "[-inf, inf]") - gate_start) / bin_width - 0.5 for time in gate]
     first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
     if first >= stop:
         end = gate_start + bins * bin_width

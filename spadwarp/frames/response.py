@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.parsing import read_columns
 from spadwarp.io.paths import file_problem
-from spadwarp.limits import shown
+from spadwarp.limits import check_real, shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -57,9 +57,7 @@ class InstrumentResponse:
 
     def __post_init__(self) -> None:
         for name in ("sigma", "tail"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ArgumentError(f"{name} = {value} s is outside [0, inf)")
+            check_real(name, getattr(self, name), "[0, 1e6] s")
         if (self.times is None) != (self.values is None):
             raise ArgumentError("times and values of a measured response go together")
         if self.times is None:
@@ -240,8 +238,7 @@ def instrument_response(
         ArgumentError: Names the argument, or the file and the line.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise ArgumentError(f"{name} = {value} s is outside [0, inf)")
+        check_real(name, value, "[0, 1e6] s")
     sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
     if shape == "gaussian":
         return InstrumentResponse(sigma=sigma)

@@ -7,6 +7,7 @@ dark counts, ambient light, crosstalk → hazard λ per detector bin → counts,
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from typing import Any, NamedTuple
 
@@ -19,9 +20,13 @@ from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
 from spadwarp.frames.response import InstrumentResponse, detector_response, response_matrix
 from spadwarp.frames.window import Window, detector_window, missing_light
+from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
+from spadwarp.result.file import as_result
 from spadwarp.scene import Detector, Laser
 
 __all__ = ["detect"]
+
+_LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]"}
 
 
 @kernel_errors()
@@ -57,8 +62,8 @@ def detect(
     a warning says by how much it exceeds the shot noise (see `monte_carlo_noise`), a note that it is unknown.
 
     Args:
-        source: A `Result` or `TorchResult`, or expected detections per pulse `[H, W, T]` (PDE included, noise not;
-            NumPy, torch, Warp). From torch tensors come torch tensors, on their device.
+        source: A `Result`, its path, or a `TorchResult`; or expected detections per pulse `[H, W, T]` (PDE included,
+            noise not; NumPy, torch, Warp). From torch tensors come torch tensors, on their device.
         pulses: Per frame; default: the detector's.
         frames: Independent exposures.
         seed: 64 bits. The counts of a frame depend on the seed and the frame's number alone.
@@ -81,6 +86,7 @@ def detect(
     Raises:
         ArgumentError: Names the argument, its value and what is allowed.
     """
+    source = as_result(source) if isinstance(source, str | os.PathLike) else source
     result, scene = source, getattr(source, "scene", None)
     if scene is not None:
         detector, laser = detector or scene.detector, laser or scene.laser
@@ -91,14 +97,15 @@ def detect(
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
-    numbers = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
-    _check_integers(**numbers, camera_seed=camera_seed)
-    if summed and pulses * frames > 2**31 - 1:
-        raise ArgumentError(f"pulses · frames = {pulses * frames} is above {2**31 - 1}: give fewer, or summed=False")
+    given = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
+    numbers = {name: check_integer(name, value, _LIMITS.get(name, SEED)) for name, value in given.items()}
+    camera_seed = check_integer("camera_seed", camera_seed, SEED)
+    if summed and (total := numbers["pulses"] * numbers["frames"]) > 2**31 - 1:
+        raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
     if gate_start is None or bin_width is None:
         raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
-    if not (math.isfinite(gate_start) and math.isfinite(bin_width) and bin_width > 0):
-        raise ArgumentError(f"gate_start = {gate_start} s, bin_width = {bin_width} s: finite and > 0 are needed")
+    gate_start = check_real("gate_start", gate_start, TIME)
+    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     irf = detector_response(detector, laser) if irf is None else irf
@@ -133,14 +140,6 @@ def _noise_of_simulation(result: Any, pulses: int, detector: Detector, laser: La
     if noise.exceeds:
         warnings.warn(str(noise), SpadwarpWarning, stacklevel=4)
     return ()
-
-
-def _check_integers(**numbers: int) -> None:
-    limits = {"pulses": (1, 2**31 - 1), "frames": (1, 2**31 - 1), "first_frame": (0, 2**32 - 1)}
-    for name, value in numbers.items():
-        least, most = limits.get(name, (0, 2**64 - 1))
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
-            raise ArgumentError(f"{name} = {value!r} is not an integer in [{least}, {most}]")
 
 
 # Expected detections

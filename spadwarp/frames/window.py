@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import TIME, check_integer, check_real, shown
 
 __all__ = ["Window", "detector_window", "missing_light"]
 
@@ -39,9 +40,10 @@ def detector_window(
     free_running: bool,
 ) -> Window:
     """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
-    start, bins = window
-    if not math.isfinite(start) or isinstance(bins, bool) or not isinstance(bins, (int, np.integer)) or bins < 1:
-        raise ArgumentError(f"window = {window} is not (start [s], bins >= 1)")
+    if not (isinstance(window, tuple | list) and len(window) == 2):
+        raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
+    start = check_real("start of window", window[0], TIME)
+    bins = check_integer("bins of window", window[1], "[1, 1000000]")
     if wrap:
         # The detector knows no time beyond that from one pulse to the next.
         bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))

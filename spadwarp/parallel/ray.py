@@ -99,8 +99,6 @@ class RayWorkers:
     ) -> None:
         if device not in (None, "cpu", "cuda", "cuda:all"):
             raise ConfigError(f"device = {device!r} does not go with Ray, which gives each worker its GPU: cpu or cuda")
-        if engine.workers is not None and engine.workers < 1:
-            raise ConfigError(f"workers = {engine.workers} is outside [1, inf)")
         self._engine, self._device, self._prepare = engine, device, prepare
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], RayWorker]] = {}

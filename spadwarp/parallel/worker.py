@@ -10,6 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_integer, shown
+
 __all__ = ["Ray", "Worker", "interruptible"]
 
 
@@ -25,6 +28,12 @@ class Ray:
 
     address: str | None = None
     workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.address, str | None):
+            raise ArgumentError(f"address = {shown(self.address)} is not text such as 'auto' or 'host:6379'")
+        if self.workers is not None:
+            object.__setattr__(self, "workers", check_integer("workers", self.workers, "[1, 100000]"))
 
 
 @dataclass(eq=False)

@@ -1,6 +1,14 @@
 """The result of a simulation as plain data, its files, the sum of results, and truth maps from other programs."""
 
-from spadwarp.result.file import load_result, load_truth_maps, save_depth_exr, save_result, save_truth_maps
+from spadwarp.result.file import (
+    ResultLike,
+    as_result,
+    load_result,
+    load_truth_maps,
+    save_depth_exr,
+    save_result,
+    save_truth_maps,
+)
 from spadwarp.result.labelled import to_xarray
 from spadwarp.result.merging import Tallies, merge
 from spadwarp.result.rendered_truth import EXR_PRESETS, ExrPreset, load_truth_exr
@@ -13,10 +21,12 @@ __all__ = [
     "Component",
     "ExrPreset",
     "Result",
+    "ResultLike",
     "Tallies",
     "TorchResult",
     "TorchTruth",
     "Truth",
+    "as_result",
     "load_result",
     "load_truth_exr",
     "load_truth_maps",

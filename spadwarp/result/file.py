@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_file import Hdf5File
-from spadwarp.result.merging import physics_of
+from spadwarp.io.paths import file_within
+from spadwarp.limits import check_integer, shown
 from spadwarp.result.photon_ids import Ranges, joined
-from spadwarp.result.result import COMPONENTS, Result, Truth
+from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
 
@@ -24,6 +26,8 @@ __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
     "ResultHead",
+    "ResultLike",
+    "as_result",
     "load_result",
     "load_truth_maps",
     "read_head",
@@ -67,8 +71,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     Raises:
         FileError: The file cannot be written.
     """
-    if not 1 <= compression <= 9:
-        raise ArgumentError(f"compression = {compression} is outside [1, 9]")
+    compression = check_integer("compression", compression, "[1, 9]")
     _, height, width, bins = result.tallies.shape
     columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
     rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
@@ -122,6 +125,21 @@ def load_result(path: str | Path) -> Result:
             timing=file.numbers("timing"),
             provenance=_provenance(file),
         )
+    return result
+
+
+ResultLike = Result | str | os.PathLike[str]
+
+
+def as_result(result: ResultLike, name: str = "result") -> Result:
+    """A result as it is, or that of a file or of a run's directory.
+
+    Raises `ArgumentError` for anything else, with the argument's name, and what `load_result` raises.
+    """
+    if isinstance(result, str | os.PathLike):
+        return load_result(file_within(Path(result), ("result.h5",)))
+    if not isinstance(result, Result):
+        raise ArgumentError(f"{name} = {shown(result)} is neither a Result nor the path of one")
     return result
 
 

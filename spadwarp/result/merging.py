@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
+from spadwarp.limits import shown
+from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.photon_ids import Range, joined
-from spadwarp.result.result import Result, Truth
-from spadwarp.scene import Scene
+from spadwarp.result.result import Result, Truth, physics_of
 
 __all__ = ["Tallies", "merge"]
 
@@ -49,16 +51,21 @@ class Tallies:
             high += low < other.second_moment[0]  # the carry
 
 
-def merge(results: Iterable[Result]) -> Result:
+def merge(results: Iterable[ResultLike]) -> Result:
     """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
+
+    `results` are results or their paths.
 
     The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is kept, with its ids, in
     `provenance["parts"]`.
 
     Raises:
+        ArgumentError: No list of results.
         ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
     """
-    parts = list(results)
+    if isinstance(results, str | os.PathLike | Result) or not isinstance(results, Iterable):
+        raise ArgumentError(f"results = {shown(results)} is not a list of results or of their paths")
+    parts = [as_result(one, "results: an item") for one in results]
     if not parts:
         raise ConfigError("merge: no results given")
     first = parts[0]
@@ -137,9 +144,3 @@ def check_focus(a: float | None, b: float | None, action: str) -> None:
     """Raises `ConfigError` where two lenses are not focused at the same depth [m], or one images all depths sharply."""
     if a != b and (a is None or b is None or not np.isclose(a, b, rtol=1e-4, atol=0.0)):
         raise ConfigError(f"{action}: the lenses of the results differ: focus_distance is {a} and {b} m")
-
-
-def physics_of(scene: Scene) -> Scene:
-    """The scene without what does not change a photon's history."""
-    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
-    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})

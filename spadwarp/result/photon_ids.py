@@ -51,11 +51,9 @@ def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
     """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
 
     Raises:
-        ConfigError: There is no such part, or there are more parts than units.
+        ConfigError: There are more parts than units.
     """
     (number, parts), (start, stop) = shard, span
-    if not 1 <= number <= parts:
-        raise ConfigError(f"shard = {number}/{parts} is outside [1/{parts}, {parts}/{parts}]")
     units = (stop - start) // unit
     if units < parts:
         raise ConfigError(f"shard = {number}/{parts}: {stop - start} photons are {units} units of {unit}, too few")

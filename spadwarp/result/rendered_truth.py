@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.limits import check_choice, check_real
 from spadwarp.result.result import Truth
 from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_depth
 
@@ -98,12 +99,10 @@ def load_truth_exr(
             than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view.
         ArgumentError: An argument out of range.
     """
-    if preset not in EXR_PRESETS:
-        raise ArgumentError(f"preset = {preset!r} is not one of {', '.join(map(repr, EXR_PRESETS))}")
+    check_choice("preset", preset, [*EXR_PRESETS])
     how = EXR_PRESETS[preset]
     scale = how.depth_scale if depth_scale is None else depth_scale
-    if not (scale > 0 and np.isfinite(scale)):
-        raise ArgumentError(f"depth_scale = {depth_scale} is outside (0, inf)")
+    scale = check_real("depth_scale", scale, "[1e-9, 1e9]")
     shape = (camera.height, camera.width)
     view = pixel_directions(camera)
 
@@ -124,10 +123,8 @@ def load_truth_exr(
         wrong = hit & ~((reflectance >= 0) & (reflectance <= 1))
         if wrong.any():
             raise FileError(f"{albedo}: albedo {reflectance[wrong][0]:g} is outside [0, 1]")
-    elif 0 <= albedo <= 1:
-        reflectance = np.full(shape, float(albedo))
     else:
-        raise ArgumentError(f"albedo = {albedo} is outside [0, 1]")
+        reflectance = np.full(shape, check_real("albedo", albedo, "[0, 1]"))
 
     normals = -view if normal is None else _normals(normal, how, axes, view, hit)
     return Truth(

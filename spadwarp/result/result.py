@@ -348,3 +348,9 @@ def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]])
     for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
         count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
     return np.maximum(count, 1.0).reshape(shape)
+
+
+def physics_of(scene: Scene) -> Scene:
+    """The scene without what does not change a photon's history."""
+    transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
+    return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})

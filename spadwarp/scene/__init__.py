@@ -18,7 +18,7 @@ from spadwarp.scene.phase import PhaseFunction, phase_function
 from spadwarp.scene.pose import look_at, opencv_pose
 from spadwarp.scene.preset import Preset, presets
 from spadwarp.scene.scan import Scan
-from spadwarp.scene.scene import Scene, load_scene, template
+from spadwarp.scene.scene import Scene, SceneLike, as_scene, load_scene, template
 from spadwarp.scene.targets import Target
 from spadwarp.scene.transport import Transport
 
@@ -36,8 +36,10 @@ __all__ = [
     "Preset",
     "Scan",
     "Scene",
+    "SceneLike",
     "Target",
     "Transport",
+    "as_scene",
     "load_scene",
     "look_at",
     "opencv_pose",

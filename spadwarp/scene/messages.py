@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from spadwarp.limits import Interval, shown
+from spadwarp.limits import Interval, shown, suggestion
 from spadwarp.scene.load import Key, key_text
 
 # What people write for a field's name, beyond misspellings.
@@ -121,12 +120,8 @@ def _fields(model: type[BaseModel], key: Key) -> list[str]:
 
 
 def _suggest(name: str, known: Sequence[str]) -> str:
-    if len(name) > 100:  # the time to compare words grows as the product of their lengths
-        return ""
-    close = [_SYNONYMS[name]] if _SYNONYMS.get(name) in known else []
-    close = close or [one for one in known if one.lower().startswith(name.lower())]
-    close = close or difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {' or '.join(map(repr, close[:2]))}?" if close else ""
+    synonym = _SYNONYMS.get(name)
+    return f"; did you mean {synonym!r}?" if synonym in known else suggestion(name, known)
 
 
 def _choices(info: FieldInfo | None, cause: Any) -> tuple[str, ...]:

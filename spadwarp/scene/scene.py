@@ -10,9 +10,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import parse_toml, read_toml
+from spadwarp.limits import shown
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.camera import Camera
@@ -182,6 +183,18 @@ class Scene(BaseModel):
 
     def __hash__(self) -> int:
         return hash(tuple(self.__dict__.values()))
+
+
+SceneLike = Scene | str | os.PathLike[str]
+
+
+def as_scene(scene: SceneLike) -> Scene:
+    """A scene as it is, or that of a file. Raises `ArgumentError` for anything else, and what `load_scene` raises."""
+    if isinstance(scene, str | os.PathLike):
+        return load_scene(scene)
+    if not isinstance(scene, Scene):
+        raise ArgumentError(f"scene = {shown(scene)} is neither a Scene nor the path of a scene file")
+    return scene
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Scene:

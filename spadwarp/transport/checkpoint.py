@@ -7,7 +7,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import FileError
+from spadwarp.limits import check_real
 from spadwarp.result import Result, save_result
 
 __all__ = ["Checkpoint"]
@@ -28,10 +29,9 @@ class Checkpoint:
     """
 
     def __init__(self, path: str | Path | None, every: float) -> None:
-        if not every >= 0:
-            raise ConfigError(f"checkpoint_every = {every} is outside [0, inf)")
         self.path, self.photons = path, 0
-        self._every, self._written, self._cost = every, time.monotonic(), 0.0
+        self._every = check_real("checkpoint_every", every, "[0, inf]")
+        self._written, self._cost = time.monotonic(), 0.0
 
     def is_due(self) -> bool:
         pause = max(self._every, self._cost / _LARGEST_SHARE)

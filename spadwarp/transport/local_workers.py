@@ -12,12 +12,13 @@ import warp as wp
 
 from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError
+from spadwarp.limits import check_integer
 from spadwarp.result import COMPONENTS, Tallies, Truth
 from spadwarp.result.photon_ids import Range
 from spadwarp.transport.device_worker import DeviceWorker, device_errors
 from spadwarp.transport.executor import Event
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, check_range
+from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan
 from spadwarp.transport.truth import trace_truth
 
 __all__ = ["LocalWorkers"]
@@ -48,9 +49,8 @@ class LocalWorkers:
         if tallies is not None and len(devices) > 1:
             raise ConfigError(f"tallies go with one device, not with {len(devices)}")
         size = LAUNCH_SIZE[kind] if plan.launch_size is None else plan.launch_size
-        check_range("launch_size", size, 1, LARGEST_LAUNCH[kind])
-        threads = core_count() if threads is None else threads
-        check_range("threads", threads, 1, 4096)
+        size = check_integer("launch_size", size, f"[1, {LARGEST_LAUNCH[kind]}]")
+        threads = core_count() if threads is None else check_integer("threads", threads, "[1, 4096]")
         threads = 1 if kind == "cuda" else max(1, threads // len(devices))
         self._scene, self._devices = plan.scene, devices
         copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))

@@ -6,22 +6,26 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from spadwarp.errors import ConfigError
+from spadwarp.limits import SEED, check_integer, check_part, check_real
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
-from spadwarp.result.merging import physics_of
 from spadwarp.result.photon_ids import Range, count, shard_of
+from spadwarp.result.result import physics_of
 from spadwarp.scene import Scene
 from spadwarp.transport.tally_unit import scale_and_capacity
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["LARGEST_LAUNCH", "LAUNCH_SIZE", "Plan", "check_range", "make_plan"]
+__all__ = ["LARGEST_LAUNCH", "LAUNCH_SIZE", "PHOTONS", "Plan", "make_plan"]
 
 # Photons in one launch: large enough to fill the device, small enough for progress and Ctrl-C.
 LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
 # One CPU thread walks a whole launch, and counts its events in 32 bits.
 LARGEST_LAUNCH = {"cpu": 1 << 20, "cuda": 1 << 26}
+
+PHOTONS = "[1, 1000000000000]"
+"""Range of the photons of a run."""
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work and little is lost.
 _LARGEST_BATCH = 1 << 30
@@ -61,9 +65,16 @@ def make_plan(
     resume: Result | None,
     launch_size: int | None,
 ) -> Plan:
-    """The plan for the arguments of `simulate`; raises `ConfigError` for those that do not go together."""
-    if relative_error is not None and not 0 < relative_error < 1:
-        raise ConfigError(f"relative_error = {relative_error} is outside (0, 1)")
+    """The plan for the arguments of `simulate`.
+
+    Raises `ArgumentError` for those that are out of range, `ConfigError` for those that do not go together.
+    """
+    photons = None if photons is None else check_integer("photons", photons, PHOTONS)
+    seed = None if seed is None else check_integer("seed", seed, SEED)
+    first_photon = check_integer("first_photon", first_photon, "[0, 4611686018427387904]")
+    shard = None if shard is None else check_part("shard", shard)
+    if relative_error is not None:
+        check_real("relative_error", relative_error, "(0, 1)")
     if relative_error is not None and shard is not None:
         raise ConfigError("relative_error goes without shard: no part knows the error of the whole")
     batches = batches or relative_error is not None
@@ -75,9 +86,6 @@ def make_plan(
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
     photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed
-    check_range("photons", photons, 1, 10**12)
-    check_range("seed", seed, 0, 2**64 - 1)
-    check_range("first_photon", first_photon, 0, 2**62)
     batch_size = 0
     if resume is not None:
         batch_size = resume.batch_size
@@ -128,9 +136,3 @@ def _check_resumed(
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
     if batches and not resume.batch_size:
         raise ConfigError("uncertainty: the run to resume kept no batches")
-
-
-def check_range(name: str, value: int, low: int, high: int) -> None:
-    """Raises `ConfigError` where an argument is outside [low, high]."""
-    if not low <= value <= high:
-        raise ConfigError(f"{name} = {value} is outside [{low}, {high}]")

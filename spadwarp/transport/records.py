@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.result.file import read_ledger
+from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.pose import rotation_matrix, to_world
-from spadwarp.transport.plan import LAUNCH_SIZE, check_range
+from spadwarp.transport.plan import LAUNCH_SIZE
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Scene
     from spadwarp.transport.simulation import Progress
 
 __all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
@@ -75,7 +76,7 @@ class PhotonRecords:
 
 
 def trace(
-    scene: Scene,
+    scene: SceneLike,
     *,
     photons: int | None = None,
     seed: int | None = None,
@@ -93,10 +94,9 @@ def trace(
     from spadwarp.transport.device_worker import DeviceWorker
     from spadwarp.transport.model import build_model, transport_spec
 
-    photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
-    check_range("photons", photons, 1, 2**31 - 1)
-    check_range("seed", seed, 0, 2**64 - 1)
+    scene = as_scene(scene)
+    photons = check_integer("photons", scene.transport.photons if photons is None else photons, "[1, 2147483647]")
+    seed = check_integer("seed", scene.transport.seed if seed is None else seed, SEED)
     mesh = build_mesh(scene)
     model = build_model(scene, pick_device(device), mesh, camera=False)
     if progress is not None:

@@ -20,9 +20,10 @@ from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, Tallies
+from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.merging import add_timing, check_capacity, check_focus, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
-from spadwarp.scene import Scene
+from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, make_plan
@@ -38,7 +39,7 @@ _MANY = 10
 
 
 def simulate(
-    scene: Scene,
+    scene: SceneLike,
     *,
     photons: int | None = None,
     seed: int | None = None,
@@ -51,7 +52,7 @@ def simulate(
     relative_error: float | None = None,
     first_photon: int = 0,
     shard: tuple[int, int] | None = None,
-    resume: Result | None = None,
+    resume: ResultLike | None = None,
     checkpoint: str | Path | None = None,
     checkpoint_every: float = 60.0,
     tallies: Any = None,
@@ -61,7 +62,7 @@ def simulate(
     One seed gives the same bits on one kind of device, whatever their number, the engine, `threads` and `launch_size`.
 
     Args:
-        scene: From `spadwarp.load_scene`.
+        scene: From `spadwarp.load_scene`, or the path of its file.
         photons: Emitted photons in all, > 0; by default `scene.transport.photons`, or what the run to resume was asked
             for.
         seed: 0 ... 2^64 - 1; by default `scene.transport.seed`, or that of the run to resume.
@@ -78,8 +79,8 @@ def simulate(
             `uncertainty`, and `photons` is the most that are traced.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
         shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
-        resume: A result of the same scene, to which photons are added until it has `photons`; the outcome is that of
-            one long run. Gaps in its ids are filled.
+        resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
+            is that of one long run. Gaps in its ids are filled.
         checkpoint: A file for the photons done so far, as a partial result that `resume` takes. It is not removed when
             the run is done.
         checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
@@ -93,6 +94,7 @@ def simulate(
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
 
     Raises:
+        ArgumentError: An argument of the wrong kind or out of range.
         ConfigError, MeshError, DeviceError: The scene cannot be simulated; nothing was computed.
         DeviceError: A device failed during the run; the text names the checkpoint, if there is one.
         KeyboardInterrupt: Ctrl-C before the first launch was done, or a second Ctrl-C.
@@ -100,8 +102,9 @@ def simulate(
     if tallies is not None and (resume is not None or engine is not None):
         raise ConfigError("tallies go without resume and engine: they hold one run of one device")
     writer = Checkpoint(checkpoint, checkpoint_every)
+    resume = None if resume is None else as_result(resume, "resume")
     plan = make_plan(
-        scene,
+        as_scene(scene),
         photons=photons,
         seed=seed,
         first_photon=first_photon,

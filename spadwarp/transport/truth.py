@@ -9,7 +9,7 @@ import numpy as np
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Truth
-from spadwarp.scene import Scene
+from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import pixel_directions
 
 if TYPE_CHECKING:
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 __all__ = ["trace_truth", "truth_maps"]
 
 
-def truth_maps(scene: Scene, *, device: str | None = None) -> Truth:
+def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
     """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
     from spadwarp.transport.model import build_model
 
+    scene = as_scene(scene)
     return trace_truth(scene, build_model(scene, pick_device(device), build_mesh(scene), camera=False))
 
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from spadwarp.errors import ConfigError
+from spadwarp.limits import check_choice, check_integer
 from spadwarp.validate import camera, phase, water
 from spadwarp.validate.case import Case, Run
 from spadwarp.validate.statistics import holm, two_sided_p
@@ -72,15 +72,13 @@ def run(
         One result for each quantity, in the order of the cases.
 
     Raises:
-        ConfigError: An unknown case, or photons or seed out of range.
+        ArgumentError: An unknown case, or photons or seed out of range.
     """
     names = list(CASES) if cases is None else list(cases)
     for name in names:
-        if name not in CASES:
-            raise ConfigError(f"cases: {name!r} is not one of {', '.join(CASES)}")
-    for field, value, low, high in (("photons", photons, 1000, 10**12), ("seed", seed, 0, 2**40)):
-        if not low <= value <= high:
-            raise ConfigError(f"{field} = {value} is outside [{low}, {high}]")
+        check_choice("cases: an item", name, [*CASES])
+    photons = check_integer("photons", photons, "[1000, 1000000000000]")
+    seed = check_integer("seed", seed, "[0, 1099511627776]")
     measured = []
     with tempfile.TemporaryDirectory() as folder:
         setup = Run(photons=photons, seed=seed, device=device, tables=Path(folder) if tabulated else None)

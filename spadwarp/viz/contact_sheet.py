@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_integer
 from spadwarp.viz.panels import coloured_depth, depth_bar, strips
 from spadwarp.viz.style import INTENSITY_MAP, save
 
@@ -30,14 +31,13 @@ def draw_dataset(
         folder: The dataset.
         path: The picture.
         split: "train", "validation", "test" or "all".
-        frames: At most so many, ≥ 1.
+        frames: At most so many, 1 to 1000.
 
     Raises:
         FileError: No dataset, or the picture cannot be written.
         ArgumentError: An argument out of range.
     """
-    if frames < 1:
-        raise ArgumentError(f"frames = {frames} is outside [1, inf)")
+    frames = check_integer("frames", frames, "[1, 1000]")
     reader = FrameReader(folder, split, fields=("clean", "noisy", "intensity"))
     if not len(reader):
         raise ArgumentError(f"split = {split!r} holds no frames")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
 from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure
 from spadwarp.viz.viewer import load_run
@@ -56,8 +57,8 @@ def video(
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
         raise ArgumentError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
-    if pictures < 1 or not 0 < fps <= 50:
-        raise ArgumentError(f"pictures = {pictures} and fps = {fps:g} are not in [1, inf) and (0, 50]")
+    pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
+    check_choice("scale", scale, ("log", "linear"))
     cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
     cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
@@ -85,6 +86,7 @@ def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64]
 def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
     """The bins of a window [ns], or those from the first to the last with light in them."""
     if window_ns is not None:
+        window_ns = (check_real("window_ns", window_ns[0]), check_real("window_ns", window_ns[1]))
         first, last = (int(np.searchsorted(edges, time, side="right")) - 1 for time in window_ns)
         first, last = max(first, 0), min(max(last, 0), len(edges) - 2)
         if not window_ns[0] < window_ns[1] or window_ns[0] >= edges[-1] or window_ns[1] <= edges[0]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import shown
 
 __all__ = [
     "WaterOptics",
@@ -221,9 +222,12 @@ def _table(name: str) -> tuple[NDArray[np.float64], ...]:
 def _check(**values: ArrayLike) -> None:
     for name, value in values.items():
         low, high = _RANGES[name]
-        array = np.asarray(value, float)
+        try:
+            array = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise ArgumentError(f"{name} = {shown(value)} is not a number") from None
         if not ((array >= low) & (array <= high)).all():
-            raise ArgumentError(f"{name} = {value!r} is outside [{low:g}, {high:g}]")
+            raise ArgumentError(f"{name} = {shown(value)} is outside [{low:g}, {high:g}]")
 
 
 def _value(array: Any) -> Value:

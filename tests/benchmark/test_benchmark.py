@@ -13,7 +13,7 @@ import spadwarp
 from helpers.cli import DEVICE, run
 from spadwarp.benchmark import CASES, GROUPS, load_report, ratios, report
 from spadwarp.benchmark.runs import measure_transport
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 
@@ -151,14 +151,14 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
 
 
 def test_unknown_case_is_named():
-    with pytest.raises(ConfigError, match=r"'staircase' is not one of water, .*scaling"):
+    with pytest.raises(ArgumentError, match=r"'staircase' is not one of 'water', .*did you mean 'staircase_5m'"):
         spadwarp.benchmark.run(["staircase"])
     run("bench", "staircase", code=2)
 
 
 @pytest.mark.parametrize("option", ["photons", "repeats"])
 def test_numbers_out_of_range_are_named(option):
-    with pytest.raises(ConfigError, match=rf"{option} = 0 is outside \[1, "):
+    with pytest.raises(ArgumentError, match=rf"{option} = 0 is outside \[1, "):
         spadwarp.benchmark.run(["water"], **{option: 0})
 
 

@@ -159,7 +159,7 @@ def test_shards_are_merged(scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--shard", "4/3"), "4/3 is outside"),
+        (("--shard", "4/3"), "shard = 4/3 is outside [1/3, 3/3]"),
         (("--shard", "half"), "such as 3/64"),
         (("--engine", "slurm"), "is not local or ray"),
         (("--workers", "2"), "needs --engine ray"),

@@ -63,7 +63,7 @@ def test_a_gate_leaves_out_what_lies_before_it():
     ("changes", "message"),
     [
         ({"method": "guess"}, "method = 'guess'"),
-        ({"bin_width": 0.0}, "bin_width = 0.0 s"),
+        ({"bin_width": 0.0}, "bin_width = 0.0 is outside .* s"),
         ({"gate_start": np.nan}, "gate_start = nan"),
         ({"method": "matched"}, "needs an irf"),
         ({"histogram": np.full((2, 2, 8), -1.0)}, r"pixel \(0, 0\)"),

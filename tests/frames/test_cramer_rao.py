@@ -63,7 +63,7 @@ def test_pile_up_loses_information():
         ({"background": np.zeros(3)}, r"background_cube has shape \(3,\)"),
         ({"bin_width": 0.0}, r"bin_width = 0.0 is outside"),
         ({"pulses": -1}, r"pulses = -1 is outside"),
-        ({"irf": -1.0}, r"irf = -1.0 s is outside"),
+        ({"irf": -1.0}, r"irf = -1.0 is outside"),
         ({"irf": [1.0, 1.0]}, "odd number"),
         ({"irf": InstrumentResponse(tail=1e-10)}, "irf has no width"),
         ({"law": "coates"}, "law = 'coates' is not one of"),

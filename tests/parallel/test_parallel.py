@@ -151,8 +151,10 @@ def test_what_ray_cannot_do_is_refused(cluster):
         spadwarp.simulate(scene(), **RUN, device="cuda:1", engine=Ray())
     with pytest.raises(spadwarp.DeviceError, match="no GPU"):
         spadwarp.simulate(scene(), **RUN, device="cuda", engine=Ray())
-    with pytest.raises(spadwarp.ConfigError, match="workers = 0"):
-        spadwarp.simulate(scene(), **RUN, engine=Ray(workers=0))
+    with pytest.raises(spadwarp.ArgumentError, match="workers = 0 is outside"):
+        Ray(workers=0)
+    with pytest.raises(spadwarp.ArgumentError, match="address = 5 is not text"):
+        Ray(address=5)
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def test_errors_name_the_file_and_what_it_lacks(tmp_path, export):
     fails(r"text.exr: not an EXR image", depth=text)
     for arguments, match in [
         ({"preset": "maya"}, "preset = 'maya' is not one of 'unreal', 'blender'"),
-        ({"depth_scale": -1.0}, r"depth_scale = -1.0 is outside \(0, inf\)"),
+        ({"depth_scale": -1.0}, r"depth_scale = -1.0 is outside \[1e-9, 1e9\]"),
         ({"albedo": 1.2}, r"albedo = 1.2 is outside \[0, 1\]"),
         ({"normal": export / "wall_Surf_Norm.EXR", "axes": np.ones((3, 3))}, "not three orthogonal unit vectors"),
     ]:

@@ -117,7 +117,10 @@ def test_an_interrupted_shard_knows_where_it_ends(whole):
 
 def test_parts_that_make_no_sense_are_refused(whole):
     for shard, words in {(0, 4): "0/4", (5, 4): "5/4", (1, 10**6): "too few"}.items():
-        with pytest.raises(spadwarp.ConfigError, match=words):
+        with pytest.raises((spadwarp.ArgumentError, spadwarp.ConfigError), match=words):
+            spadwarp.simulate(scene(), **RUN, device="cpu", shard=shard)
+    for shard in (3, (1, 2, 3), (1.5, 2), ("1", 2)):
+        with pytest.raises(spadwarp.ArgumentError, match=r"^shard"):
             spadwarp.simulate(scene(), **RUN, device="cpu", shard=shard)
     with pytest.raises(spadwarp.ConfigError, match="relative_error"):
         spadwarp.simulate(scene(), **RUN, device="cpu", shard=(1, 2), relative_error=0.1)

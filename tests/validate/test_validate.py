@@ -11,7 +11,7 @@ from reference import fournier_forand
 from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab, stack
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
 from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
@@ -223,11 +223,11 @@ def test_reports(results, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"cases": ["slabs"]}, "'slabs' is not one of slab, "),
+        ({"cases": ["slabs"]}, "'slabs' is not one of 'slab', "),
         ({"photons": 10}, "photons = 10 is outside"),
         ({"seed": -1}, "seed = -1 is outside"),
     ],
 )
 def test_errors_name_the_argument(arguments, text):
-    with pytest.raises(ConfigError, match=text.replace("[", r"\[")):
+    with pytest.raises(ArgumentError, match=text.replace("[", r"\[")):
         run(**arguments)

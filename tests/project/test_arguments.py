@@ -1,0 +1,164 @@
+"""What the functions of `spadwarp.__all__` take: scenes and results or their paths, whole numbers as 1e5, and nothing
+that is not finite, out of range or of another kind."""
+
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.scenes import scene
+from helpers.synthetic_result import make_result, make_scene
+
+ROOM = {"targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0]}]}
+SCENE_FUNCTIONS = {
+    "simulate": lambda one: spadwarp.simulate(one, photons=1000, device="cpu").tallies,
+    "truth_maps": lambda one: spadwarp.truth_maps(one, device="cpu").depth,
+    "check": lambda one: [str(message) for message in spadwarp.check(one)],
+    "budget": lambda one: [row.signal for row in spadwarp.budget(one, [2.0], device="cpu")],
+    "sweep": lambda one: spadwarp.sweep(one, vary="medium.extinction=0.2", device="cpu").column("signal"),
+    "simulate_analytic": lambda one: spadwarp.simulate_analytic(one, device="cpu").signal,
+}
+
+
+@pytest.fixture(scope="module")
+def scene_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene.toml"
+    path.write_text(scene(**ROOM).to_toml())
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    found = spadwarp.simulate(scene(**ROOM), photons=1000, device="cpu")
+    found.save(folder / "result.h5")
+    return found, folder
+
+
+@pytest.mark.parametrize("name", SCENE_FUNCTIONS)
+def test_a_scene_may_be_its_path(name, scene_path):
+    function = SCENE_FUNCTIONS[name]
+    expected = function(spadwarp.load_scene(scene_path))
+    for one in (scene_path, str(scene_path)):
+        np.testing.assert_array_equal(function(one), expected)
+
+
+@pytest.mark.parametrize("name", SCENE_FUNCTIONS)
+@pytest.mark.parametrize("wrong", [None, 5, {}, [1.0], object], ids=repr)
+def test_what_is_no_scene_is_refused(name, wrong):
+    with pytest.raises(spadwarp.ArgumentError, match=r"scene = .* is neither a Scene nor the path of a scene file"):
+        SCENE_FUNCTIONS[name](wrong)
+
+
+RESULT_FUNCTIONS = {
+    "detect": lambda one: spadwarp.detect(one, pulses=10, seed=1, device="cpu").counts,
+    "crlb": lambda one: spadwarp.crlb(one, device="cpu"),
+    "merge": lambda one: spadwarp.merge([one]).tallies,
+    "resume": lambda one: spadwarp.simulate(scene(**ROOM), photons=1500, resume=one, device="cpu").tallies,
+}
+
+
+@pytest.mark.filterwarnings("ignore::spadwarp.errors.SpadwarpWarning")
+@pytest.mark.parametrize("name", RESULT_FUNCTIONS)
+def test_a_result_may_be_its_path(name, result):
+    found, folder = result
+    expected = RESULT_FUNCTIONS[name](found)
+    for one in (folder, folder / "result.h5", str(folder / "result.h5")):
+        np.testing.assert_array_equal(RESULT_FUNCTIONS[name](one), expected)
+
+
+@pytest.mark.parametrize("name", ["crlb", "merge", "resume"])
+@pytest.mark.parametrize("wrong", [5, {}, np.zeros((2, 2, 3))], ids=lambda value: type(value).__name__)
+def test_what_is_no_result_is_refused(name, wrong):
+    with pytest.raises(spadwarp.ArgumentError, match=r" is neither a Result nor the path of one"):
+        RESULT_FUNCTIONS[name](wrong)
+
+
+@pytest.mark.parametrize("wrong", ["a.h5", None, 5])
+def test_merge_takes_a_list(wrong):
+    with pytest.raises(spadwarp.ArgumentError, match="is not a list of results"):
+        spadwarp.merge(wrong)
+
+
+def test_integral_floats_are_integers():
+    one = spadwarp.simulate(scene(), photons=1e3, seed=3.0, threads=1.0, launch_size=2.0**9, device="cpu")
+    other = spadwarp.simulate(scene(), photons=1000, seed=np.uint64(3), device="cpu")
+    assert one.photons == 1000 and one.tallies.tobytes() == other.tallies.tobytes()
+    light = np.full((2, 2, 5), 0.1)
+    options = {"gate_start": 0, "bin_width": 1e-10, "detector": spadwarp.scene.Detector(wrap=False), "device": "cpu"}
+    assert spadwarp.detect(light, pulses=1e2, frames=2.0, seed=np.float64(7), **options).counts.shape[0] == 2
+
+
+CUBE = np.ones((2, 2, 8))
+AXIS = {"gate_start": 0.0, "bin_width": 1e-10}
+FREE = {"seed": 0, "detector": spadwarp.scene.Detector(wrap=False)}
+NUMBERS = {
+    "simulate": (lambda **one: spadwarp.simulate(scene(), device="cpu", **one), {
+        "photons": [0, 1.5, 1e13, math.nan, "1e5", True, [5]],
+        "seed": [-1, 2**64, 0.5, math.inf],
+        "first_photon": [-1, 1e300],
+        "threads": [0, 1e9, "all"],
+        "launch_size": [0, 2**40, 1.5],
+        "relative_error": [0, 1, math.nan, "2 %"],
+        "checkpoint_every": [-1, math.nan, None],
+    }),
+    "detect": (lambda **one: spadwarp.detect(CUBE, device="cpu", **{**AXIS, **FREE, **one}), {
+        "pulses": [0, 1.5, 1e10, math.nan],
+        "frames": [0, 2.5],
+        "seed": [-1, None],
+        "gate_start": [math.nan, math.inf, "0"],
+        "bin_width": [0, -1e-9, math.nan, 1e300, 1e-300],
+        "window": [5, (0.0,), (math.nan, 5), (0.0, 0), (0.0, 1.5)],
+        "camera_seed": [-1],
+    }),
+    "arrival_time": (lambda **one: spadwarp.arrival_time(CUBE, device="cpu", **{**AXIS, **one}), {
+        "gate_start": [math.nan, math.inf],
+        "bin_width": [0, math.nan, 1e300],
+        "gate": [5, (0.0,), (math.nan, 1.0)],
+        "method": ["centre", None, 3],
+    }),
+    "crlb": (lambda **one: spadwarp.crlb(make_result(make_scene()), device="cpu", **one), {
+        "pulses": [0, math.nan, "many"],
+        "law": ["Poisson", None],
+    }),
+    "budget": (lambda **one: spadwarp.budget(scene(), device="cpu", **one), {
+        "ranges": [5.0, "1:5", [0], [math.nan], [1e300], [], ["1"]],
+        "reflectance": [-0.1, 1.1, math.nan, "white"],
+    }),
+    "sweep": (lambda **one: spadwarp.sweep(scene(), device="cpu", **{"vary": "medium.extinction=1", **one}), {
+        "vary": [5, None, "x", ("medium.extinction",), ("medium.extinction", 5), ("medium.extinction", [])],
+        "of": ["depth", None],
+    }),
+    "simulate_analytic": (lambda **one: spadwarp.simulate_analytic(scene(**ROOM), device="cpu", **one), {
+        "frames": [-1, 0.5, math.nan, 1e300],
+        "seed": [-1, 2**64, "x"],
+        "backscatter_profile": [5],
+    }),
+    "Ray": (spadwarp.Ray, {"workers": [0, 1.5, "two"], "address": [6379]}),
+}  # fmt: skip
+CASES = [
+    pytest.param(name, argument, value, id=f"{name} {argument} {value!r:.20}")
+    for name, (_, arguments) in NUMBERS.items()
+    for argument, values in arguments.items()
+    for value in values
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "value"), CASES)
+def test_what_is_out_of_range_or_of_another_kind_is_refused_by_name(name, argument, value):
+    with pytest.raises(spadwarp.ArgumentError) as caught:
+        NUMBERS[name][0](**{argument: value})
+    assert argument in str(caught.value) and len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("name", [5, "", "cpu,", "CPU", "cuda:99", "all"])
+def test_a_device_that_does_not_exist_is_refused(name):
+    for function in (
+        lambda: spadwarp.simulate(scene(), photons=10, device=name),
+        lambda: spadwarp.detect(CUBE, **AXIS, **FREE, device=name),
+        lambda: spadwarp.arrival_time(CUBE, **AXIS, device=name),
+        lambda: spadwarp.truth_maps(scene(), device=name),
+    ):
+        with pytest.raises(spadwarp.DeviceError, match=r"device = .* is not one of cpu"):
+            function()
