@@ -1,5 +1,6 @@
 """The estimators by name."""
 
+import functools
 from collections.abc import Callable
 
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -17,3 +18,9 @@ ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
     "guided": make_guided,
 }
 """A function of a spec for each name that `TransportSpec.estimator` may have; add a line for one of your own."""
+
+
+@functools.cache
+def make_estimator(spec: TransportSpec) -> Estimator:
+    """The estimator of a spec, made once: each launch asks for it, and its Warp functions take milliseconds to make."""
+    return ESTIMATORS[spec.estimator](spec)

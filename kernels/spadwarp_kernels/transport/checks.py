@@ -18,7 +18,7 @@ from spadwarp_kernels.arguments import (
     check_vector,
 )
 from spadwarp_kernels.estimators.estimator import Estimator
-from spadwarp_kernels.estimators.registry import ESTIMATORS
+from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -90,7 +90,7 @@ def check_model(model: Any) -> None:
 def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
     """Everything that the kernel of a spec reads and writes: numbers in range, arrays long enough and on the device."""
     check_spec(spec)
-    estimator = ESTIMATORS[spec.estimator](spec)
+    estimator = make_estimator(spec)
     if spec.mesh:
         _check_surfaces(spec, model)
     _check_water(spec, model)

@@ -16,7 +16,7 @@ import warp as wp
 
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.queue import make_queue
-from spadwarp_kernels.estimators.registry import ESTIMATORS
+from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, step_leaf, step_node
 from spadwarp_kernels.medium.layers import Layers
@@ -88,7 +88,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
     """
     check_spec(spec)
-    estimator = ESTIMATORS[spec.estimator](spec)
+    estimator = make_estimator(spec)
     cross, score = estimator.cross, estimator.score
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = cross is not None, request_flight is not None, score is not None
