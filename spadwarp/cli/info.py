@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,14 +30,16 @@ def info(
     outputs = opt.check_outputs(json=json_path, inputs=(path,), overwrite=overwrite)
     result = opt.load_run(path)
     summary = result.summary()
-    outside = {name: result.counters[name] * result.unit / result.photons for name in ("before_gate", "after_gate")}
+    counted = {name: result.counters.get(name, 0) for name in ("before_gate", "after_gate")}
+    outside = {name: number * result.unit / result.photons for name, number in counted.items()}
     say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _lines(summary, outside).items()))
     outputs.write_json(summary)
 
 
 def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str, dict[str, str]]:
     """A result's summary by headings."""
-    image, gate, medium, made = summary["image"], summary["gate"], summary["medium"], summary["provenance"]
+    image, gate, medium = summary["image"], summary["gate"], summary["medium"]
+    made = defaultdict(lambda: "unknown", summary["provenance"])
     depth, ledger, timing = summary["truth"]["depth_m"], summary["ledger"], summary["timing"]
     fractions, counters = ledger["fractions"], summary["counters"]
     photons = opt.count(summary["photons"]) + (", interrupted" if summary["partial"] else "")

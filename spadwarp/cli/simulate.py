@@ -227,13 +227,14 @@ def described(result: Result, files: RunFiles) -> str:
     import numpy as np
 
     summary, truth, frame, written = result.summary(), result.truth.depth, files.depth, files.written
-    seconds = result.timing["trace"]
+    seconds = result.timing.get("trace", 0.0)
+    speed = f" ({result.photons / seconds:.3g}/s)" if seconds > 0 else ""
     collected = summary["collected_fraction"]
     ledger = summary["ledger"]
     returned = np.isfinite(frame)
     lines = {
-        "photons": f"{opt.count(result.photons)}, seed {result.seed}, on {result.provenance['device']} "
-        f"in {seconds:.3g} s ({result.photons / seconds:.3g}/s)",
+        "photons": f"{opt.count(result.photons)}, seed {result.seed}, on {result.provenance.get('device', 'unknown')} "
+        f"in {seconds:.3g} s{speed}",
         "collected": f"{sum(collected.values()):.3g} of the emitted light: "
         + ", ".join(f"{name.replace('_', '-')} {part:.3g}" for name, part in collected.items()),
         "detections": f"{summary['detections_per_pulse']:.3g} a pulse, all pixels together",

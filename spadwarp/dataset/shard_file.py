@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,11 @@ class SceneFile:
     def __init__(self, folder: Path, name: str, shape: tuple[int, int]) -> None:
         self.file = _opened(folder / "scenes" / name.replace("frames-", "scenes-"), "spadwarp scenes")
         self._columns = scene_columns(shape)
-        self.count = len(self.file.stored("distance", np.float64, (None,)))
+        try:
+            self.count = len(self.file.stored("distance", np.float64, (None,)))
+        except BaseException:
+            self.file.close()
+            raise
 
     def stored(self, name: str) -> Any:
         """A column of `spadwarp.dataset.schema.scene_columns`, its first dimension the scenes."""
@@ -79,9 +83,15 @@ class ShardFile:
     """
 
     def __init__(self, folder: Path, name: str, manifest: dict[str, Any]) -> None:
+        with ExitStack() as opened:  # closed again where one of them is refused
+            self._open(opened, folder, name, manifest)
+            opened.pop_all()
+
+    def _open(self, opened: ExitStack, folder: Path, name: str, manifest: dict[str, Any]) -> None:
         shape, targets = (manifest["height"], manifest["width"]), len(manifest["targets"])
-        self.frames = _opened(folder / name, "spadwarp frames")
+        self.frames = opened.enter_context(closing(_opened(folder / name, "spadwarp frames")))
         self.scenes = SceneFile(folder, name, shape)
+        opened.enter_context(closing(self.scenes.file))
         count = len(self.frames.stored("sample", np.int64, (None,)))
         self.columns = {column: self.frames.array(column, kind, (count,)) for column, kind in _COLUMNS.items()}
         self.first_scene = int(self.columns["scene"][0]) if count else 0
@@ -110,7 +120,8 @@ class ShardFile:
         cubes = folder / name.replace("frames-", "histograms-")
         self.histograms = None
         if os.path.isfile(cubes):
-            self.histograms = HistogramFile(_opened(cubes, "spadwarp histograms"), shape)
+            file = opened.enter_context(closing(_opened(cubes, "spadwarp histograms")))
+            self.histograms = HistogramFile(file, shape)
 
     def images(self, row: int, fields: Sequence[str], window: tuple[slice, slice]) -> dict[str, NDArray[np.float32]]:
         """A frame's images by field, `[C, H, W]` each."""

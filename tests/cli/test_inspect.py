@@ -1,5 +1,6 @@
 """Commands that look: check, info, presets, water, devices, validate, targets; help, version, processes."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -67,6 +68,14 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     assert run("info", tmp_path).stdout == printed  # the directory stands for the result in it
     assert "20 000, seed 3" in printed and "Energy balance, exact" in printed and "100.000000 %" in printed
     assert tables(summary) == json.loads(json.dumps(result.summary()))
+
+
+def test_a_result_that_says_little_about_its_origin_is_shown(done, tmp_path):
+    result = dataclasses.replace(spadwarp.load_result(done / "result.h5"), provenance={}, timing={}, counters={})
+    result.save(tmp_path / "result.h5")
+    assert "unknown" in run("info", tmp_path / "result.h5").stdout
+    run("merge", tmp_path / "result.h5", "--out", tmp_path / "out", *DEVICE)
+    run("view", tmp_path, "--out", tmp_path / "view.html")
 
 
 def test_presets_water_and_devices_are_those_of_python(tmp_path):

@@ -10,12 +10,13 @@ import OpenEXR
 import pytest
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import FileError
+from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.exr import read_exr
 from spadwarp.result import (
     Result,
     load_result,
     load_truth_maps,
+    merge,
     save_depth_exr,
     save_result,
     save_truth_maps,
@@ -192,6 +193,58 @@ def test_flipped_bits_in_the_tallies_are_noticed(result, tmp_path):
     path.write_bytes(content)
     with pytest.raises(FileError, match="damaged"):
         load_result(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("tallies", -1, "tallies are negative"),
+        ("truth/depth", np.inf, "truth/depth is infinite"),
+        ("photon_ranges", 0, "photon_ranges are not ranges"),
+        ("requested", 5, "requested from 5 to 5"),
+    ],
+)
+def test_values_that_no_run_makes_are_refused(result, tmp_path, name, value, words):
+    path = result.save(tmp_path / "result.h5")
+    with h5py.File(path, "r+") as file:
+        file[name][...] = value
+    with pytest.raises(FileError, match=rf"result\.h5: not a whole spadwarp result: {words}"):
+        load_result(path)
+
+
+def test_signed_entries_of_the_ledger_are_valid(result, tmp_path):
+    ledger = {**result.ledger, "roulette": -(10**12)}
+    assert load_result(dataclasses.replace(result, ledger=ledger).save(tmp_path / "result.h5")).ledger == ledger
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("ledger", "[]"),
+        ("ledger", '{"roulette": 0.5}'),
+        ("ledger", f'{{"roulette": {10**40}}}'),
+        ("counters", '{"after_gate": null}'),
+        ("timing", '{"transport": NaN}'),
+        ("provenance", '{"parts": 3}'),
+        ("provenance", "[" * 100_000),
+        ("config", "[medium]\nextinction = nan"),
+        ("config", "a." * 50_000 + "a = 1"),
+    ],
+)
+def test_text_that_no_run_writes_is_refused(result, tmp_path, name, text):
+    path = result.save(tmp_path / "result.h5")
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = text
+    with pytest.raises(FileError, match=r"result\.h5: not a whole spadwarp result: "):
+        load_result(path)
+
+
+def test_results_that_count_different_things_are_not_added(result):
+    other = dataclasses.replace(result, photon_ranges=((10**9, 2 * 10**9),), requested=(10**9, 2 * 10**9))
+    for name in ("ledger", "counters"):
+        with pytest.raises(ConfigError, match=f"in their {name}: spam"):
+            merge([result, dataclasses.replace(other, **{name: {**getattr(other, name), "spam": 0}})])
 
 
 # EXR
