@@ -24,6 +24,7 @@ _ROOMS = {
     "analytic": ("budget", "plan", "simulate_analytic", "sweep"),
     "dataset": (),
     "denoise": (),
+    "files": ("load",),
     "viz": (),
     "run": ("export",),
     "validate": (),
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from spadwarp.analytic import budget, plan, simulate_analytic, sweep
     from spadwarp.checks import check
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
+    from spadwarp.files import load
     from spadwarp.frames import Frames, arrival_time, crlb, detect
     from spadwarp.interop import data_frame
     from spadwarp.parallel import Ray

@@ -3,6 +3,7 @@
 from spadwarp.analytic.experiment import Proposal, plan
 from spadwarp.analytic.exposure_proposal import PILE_UP, Exposure
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, permissible_exposure
+from spadwarp.analytic.file import AnalyticFile, save_analytic
 from spadwarp.analytic.labelled import to_xarray
 from spadwarp.analytic.model import pixel_maps
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budget
@@ -15,6 +16,7 @@ __all__ = [
     "OUTLIERS",
     "PILE_UP",
     "TOLERANCE",
+    "AnalyticFile",
     "AnalyticResult",
     "BudgetRow",
     "DepthErrorRow",
@@ -31,6 +33,7 @@ __all__ = [
     "permissible_exposure",
     "pixel_maps",
     "plan",
+    "save_analytic",
     "simulate_analytic",
     "sweep",
     "to_xarray",

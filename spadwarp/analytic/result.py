@@ -151,10 +151,10 @@ class AnalyticResult:
         ]
 
     def save(self, path: str | Path, *, frames: int | None = None, device: Any = None) -> Path:
-        """Writes everything to one HDF5 file, whole or not at all: see `spadwarp.run.save_analytic`."""
+        """Writes everything to one HDF5 file, whole or not at all: see `spadwarp.analytic.save_analytic`."""
         import spadwarp
 
-        return spadwarp.run.save_analytic(self, path, frames=frames, device=device)
+        return spadwarp.analytic.save_analytic(self, path, frames=frames, device=device)
 
 
 def background_photons(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:

@@ -135,7 +135,11 @@ TorchDevice = Annotated[
 ]
 RunOrFrames = Annotated[
     Path,
-    typer.Argument(metavar="RUN", help="A result or frames, or the directory of one of them.", show_default=False),
+    typer.Argument(
+        metavar="RUN",
+        help="A result, frames, an analytic file, a dataset or a shard of one; or their directory.",
+        show_default=False,
+    ),
 ]
 Frame = Annotated[int, typer.Option(parser=whole_number, metavar="N", help="Number of the frame, if RUN holds frames.")]
 
@@ -182,8 +186,9 @@ def one_device(devices: str | None, engine: Ray | None) -> str | None:
 
 
 def load_run(place: Path) -> Result:
-    """The result in a file, or in the directory of a run."""
-    return spadwarp.load_result(spadwarp.io.file_within(place, ("result.h5",)))
+    """The result in a file, or in the directory of a run; a checkpoint where there is no result."""
+    path = spadwarp.files.locate(place)
+    return spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
 
 
 def read_part(text: str | None, option: str) -> tuple[int, int] | None:

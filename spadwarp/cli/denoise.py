@@ -19,8 +19,8 @@ def denoise(
         Path,
         typer.Argument(
             metavar="IN",
-            help="A result or frames (.h5), depth (.exr, .npy, .mat), measured histograms (.npy, .mat, .ptu), or a "
-            "folder of them.",
+            help="A result, frames, an analytic file, a dataset or a shard (.h5, or their directory), depth (.exr, "
+            ".npy, .mat), measured histograms (.npy, .mat, .ptu), or a folder of them.",
             show_default=False,
         ),
     ],
@@ -96,8 +96,6 @@ def denoise(
 
     from spadwarp.denoise import denoise_file, depth_files
 
-    if path.is_dir() and (path / "result.h5").is_file():
-        path = path / "result.h5"
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):

@@ -26,7 +26,8 @@ def depth(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A result or frames (.h5, or their directory), or measured: .npy, .mat, .ptu.",
+            help="A result or frames (.h5, or their directory), or measured: .npy, .mat, .ptu. Of an analytic file, "
+            "a dataset or a shard its depth frames are written as they are.",
             show_default=False,
         ),
     ],
@@ -101,7 +102,10 @@ def depth(
     from spadwarp.frames import depth_of, read_histograms
     from spadwarp.run import write_depth
 
-    histograms = read_histograms(spadwarp.io.file_within(path, ("frames.h5", "result.h5")), variable=variable)
+    place = spadwarp.files.locate(path)
+    stored = _stored(place)
+    histograms = None if stored is not None else read_histograms(place, variable=variable)
+    size = 4 * stored.values.size if histograms is None else histograms.values.size // histograms.values.shape[-1]
     outputs = opt.check_outputs(
         out,
         [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")],
@@ -109,18 +113,20 @@ def depth(
         json=json_path,
         inputs=(path, irf),
         overwrite=overwrite,
-        needed=8 * histograms.values.size // histograms.values.shape[-1],
+        needed=8 * size,
     )
-    histograms = _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf)
-    reduced = depth_of(
-        histograms,
-        method=method.value,
-        group_index=group_index,
-        horizontal_fov_deg=horizontal_fov_deg,
-        background=_background(background),
-        device=device,
-    )
-    written = write_depth(reduced, out, ply=ply, comment=f"{path.name}, {method.value}")
+    if histograms is None:
+        reduced = stored
+    else:
+        reduced = depth_of(
+            _with_options(histograms, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf),
+            method=method.value,
+            group_index=group_index,
+            horizontal_fov_deg=horizontal_fov_deg,
+            background=_background(background),
+            device=device,
+        )
+    written = write_depth(reduced, out, ply=ply, comment=f"{path.name}, {reduced.method}")
     first = reduced.first
     summary = {**_statistics(first), "quantity": reduced.quantity, "frames": reduced.frames, "files": written}
     if not quiet:
@@ -130,6 +136,13 @@ def depth(
         frames = f" (first of {opt.count(reduced.frames)} frames)" if reduced.frames > 1 else ""
         say(opt.rows({reduced.quantity: found + frames, "written": ", ".join(map(str, written))}))
     outputs.write_json(summary)
+
+
+def _stored(place: Path) -> Any:
+    """The depth frames of a file that holds no histograms, else None."""
+    if place.is_dir() or place.suffix.lower() == ".h5":
+        return spadwarp.files.stored_depth(spadwarp.load(place))
+    return None
 
 
 def _background(text: str | None) -> Any:

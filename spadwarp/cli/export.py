@@ -28,7 +28,7 @@ def export(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A result, frames of counts or depth, or their directory.",
+            help="A result, frames, an analytic file, a dataset or a shard; or their directory.",
             show_default=False,
         ),
     ],
@@ -64,7 +64,7 @@ def export(
       spadwarp export run1/result.h5 --format npy --out exported/
       spadwarp export data/small/ --split test --frames 0:20 --format exr --out exported/
     """
-    source = _inside(path)
+    source = spadwarp.files.locate(path)
     chosen = _frames(frames)
     stem = source.resolve().stem
     outputs = opt.check_outputs(
@@ -86,13 +86,6 @@ def export(
             lines[name] = f"{paths[0]}{more}"
         say(opt.rows(lines))
     outputs.write_json({"files": [path for paths in written.values() for path in paths]})
-
-
-def _inside(place: Path) -> Path:
-    """The file, or the one that can be exported in a directory."""
-    if (place / "manifest.json").is_file():
-        return place
-    return spadwarp.io.file_within(place, ("frames.h5", "result.h5", "analytic.h5"))
 
 
 def _frames(text: str | None) -> int | slice | None:

@@ -9,27 +9,40 @@ from typing import Annotated, Any
 
 import typer
 
+import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="A result, or its directory.")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A result, checkpoint, frames, analytic file, records, dataset or shard; or their directory.",
+        ),
+    ],
     overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Contents of a result, and how it was made.
+    """Contents of any of our files; of a result also how it was made.
 
-    Includes the energy balance: where the emitted light went.
+    A result's includes the energy balance: where the emitted light went.
 
     \b
     Example:
       spadwarp info out/result.h5
     """
     outputs = opt.check_outputs(json=json_path, inputs=(path,), overwrite=overwrite)
-    result = opt.load_run(path)
-    summary = result.summary()
+    held = spadwarp.load(path)
+    summary = spadwarp.files.summary(held)
+    if not isinstance(held, spadwarp.Result):
+        kind = summary["kind"]
+        say(opt.rows({kind: "", **{f"  {name}": _plain(value) for name, value in summary.items() if name != "kind"}}))
+        outputs.write_json(summary)
+        return
+    result = held
     counted = {name: result.counters.get(name, 0) for name in ("before_gate", "after_gate")}
     outside = {name: number * result.unit / result.photons for name, number in counted.items()}
     say("\n\n".join(f"{title}\n{opt.rows(lines, indent='  ')}" for title, lines in _lines(summary, outside).items()))
@@ -71,6 +84,16 @@ def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str
             "in": ", ".join(f"{name} {seconds:.3g} s" for name, seconds in timing.items()),
         },
     }
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_plain(item)}" for name, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_plain, value))
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    return opt.count(value) if isinstance(value, int) else _number(value)
 
 
 def _number(value: Any) -> str:

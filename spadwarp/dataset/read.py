@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from spadwarp.dataset.manifest import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shard_file import ShardFile, frame_count
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, FileError
 from spadwarp.limits import SEED, check_choice, check_integer
 from spadwarp.scene import Scene
 
@@ -39,7 +40,7 @@ class FrameReader:
     (float32), `gate` (float32 `[2]`, ranges at which it opens and closes [m]).
 
     Args:
-        path: The dataset's folder.
+        path: The dataset's folder, or the file of one of its shards, whose frames are read alone.
         split: "train", "validation", "test", or "all".
         fields: Images of an item, from `FIELDS`.
         crop: Side, or height and width, of a random part of the frame; None for the whole.
@@ -65,7 +66,7 @@ class FrameReader:
         repeats: int = 1,
         seed: int = 0,
     ) -> None:
-        self.path = Path(path)
+        self.path, only = _folder_and_shard(Path(path))
         self.manifest = read_manifest(self.path)
         check_choice("split", split, (*SPLITS, "all"))
         if unknown := [name for name in fields if name not in FIELDS]:
@@ -79,9 +80,30 @@ class FrameReader:
             raise ArgumentError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
         splits = [self.manifest["splits"][name] for name in (SPLITS if split == "all" else (split,))]
         self.shards: list[str] = [shard for described in splits for shard in described["shards"]]
+        if only is not None:
+            if only not in self.shards:
+                raise FileError(f"{path}: not a shard of {self.path}, split {split!r}")
+            self.shards = [only]
         self._open: dict[int, ShardFile] = {}
         self._process = os.getpid()
         self._stops = np.cumsum([frame_count(self.path, name) for name in self.shards], dtype=np.int64)
+
+    def __repr__(self) -> str:
+        shards = self.shards[0] if len(self.shards) == 1 else f"{len(self.shards)} shards"
+        return f"{type(self).__name__}({self.path}, {self.split!r}: {len(self)} frames in {shards})"
+
+    def with_fields(self, *fields: str) -> Self:
+        """The same frames with other images, whole and not augmented."""
+        changed = copy.copy(self)
+        changed.fields, changed.crop, changed.augment, changed._open = fields, None, False, {}
+        return changed
+
+    def same_scene(self, index: int) -> range:
+        """Indices of the frames of the same scene."""
+        shard, row = self._row(index % self.frame_count)
+        rows = np.flatnonzero(shard.columns["scene"] == shard.columns["scene"][row])
+        first = index - row
+        return range(first + int(rows[0]), first + int(rows[-1]) + 1)
 
     def __len__(self) -> int:
         return self.repeats * self.frame_count
@@ -189,6 +211,14 @@ def iterate_dataset(
     if shuffle is not None:
         np.random.Generator(np.random.Philox(shuffle)).shuffle(order)
     return (reader[int(index)] for index in order)
+
+
+def _folder_and_shard(path: Path) -> tuple[Path, str | None]:
+    """The dataset's folder, and the frames' file of the shard that a path names."""
+    if not path.is_file():
+        return path, None
+    folder = path.parent.parent if path.parent.name == "scenes" else path.parent
+    return folder, f"frames-{path.name.partition('-')[2]}"
 
 
 def _rotated(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.inference import denoise_frames, features_of_histograms, weights_metadata
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.files import gate_of, holds_own_file, load, locate, stored_depth
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.estimators import Method
 from spadwarp.frames.measured import Histograms, read_array, read_histograms
@@ -67,8 +68,8 @@ class Denoised:
 def depth_files(path: str | Path) -> list[Path]:
     """The file, or the files of a folder that may hold depth or histograms. Raises `FileError` if there are none."""
     place = Path(path)
-    if not place.is_dir():
-        return [place]
+    if not place.is_dir() or holds_own_file(place):
+        return [locate(place)]
     found = sorted(file for file in place.iterdir() if file.is_file() and file.suffix.lower() in ENDINGS)
     if not found:
         raise FileError(f"{place}: no file that ends in {', '.join(ENDINGS)}")
@@ -159,9 +160,9 @@ def read_depth(
 ) -> DepthReading:
     """Depth from a file.
 
-    `.h5`: a result, or frames of counts. `.exr`: depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or
-    histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`: histograms. Histograms become depth by
-    `spadwarp.frames.depth.depth_of`.
+    `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
+    depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`:
+    histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
 
     Args:
         path: The file.
@@ -178,11 +179,17 @@ def read_depth(
         FileError: No such file, not readable, or without depth.
         ArgumentError: An argument out of range, or missing for what the file holds.
     """
-    place = existing_file(path)
-    if place.suffix.lower() not in ENDINGS:
-        raise FileError(f"{place}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
+    place = locate(path)
+    if place.suffix.lower() not in ENDINGS and not place.is_dir():
+        raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ArgumentError(f"scale = {scale} is outside (0, inf)")
+    if place.is_dir() or place.suffix.lower() == ".h5":
+        held = load(place)
+        own = stored_depth(held)
+        if own is not None:
+            frames = own.values.astype(np.float32)
+            return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is")
     stored = _stored_depth(place, channel, variable, as_depth)
     if stored is not None:
         if stored.dtype.kind not in "iuf":

@@ -51,7 +51,7 @@ class Reduction:
         range: The same along the line of sight.
         intensity: Sum over the bins, `[frames, H, W]`.
         directions: Lines of sight, unit vectors `[H, W, 3]`, or None.
-        method: Estimator of the arrival time.
+        method: Estimator of the arrival time, or "stored" for depth that was read.
     """
 
     quantity: Literal["depth", "range"]
@@ -59,7 +59,7 @@ class Reduction:
     range: NDArray[np.float64]
     intensity: NDArray[Any]
     directions: NDArray[np.float64] | None
-    method: Method
+    method: str
 
     @property
     def frames(self) -> int:

@@ -74,12 +74,21 @@ class FrameSequence:
         count: Of the frames.
         frame: Number of a frame, from 0 → the frame.
         largest_count: Of a pixel in any frame, if that is known.
+        same_scene: Number of a frame → numbers of the frames of the same scene, itself included; None where frames have
+            counts.
     """
 
     name: str
     count: int
     frame: Callable[[int], SequenceFrame]
     largest_count: int | None = None
+    same_scene: Callable[[int], range] | None = None
+
+    def at(self, number: int) -> SequenceFrame:
+        """A frame; `ArgumentError` for a number that is not there."""
+        if not 0 <= number < self.count:
+            raise ArgumentError(f"frame = {number} is outside [0, {self.count}), the frames of {self.name}")
+        return self.frame(number)
 
     def with_counts(self, number: int, ending: str) -> tuple[SequenceFrame, NDArray[Any]]:
         """A frame and its counts; `ArgumentError` if it has none, which files of `ending` are for."""

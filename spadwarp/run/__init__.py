@@ -1,6 +1,5 @@
-"""The directory of a run; our files opened, whatever they hold, and written in other formats."""
+"""The directory of a run; results and frames in the formats of other programs; JSON Schema of our TOML files."""
 
-from spadwarp.run.analytic_file import save_analytic
 from spadwarp.run.depth import write_depth
 from spadwarp.run.directory import (
     CHECKPOINT,
@@ -13,7 +12,6 @@ from spadwarp.run.directory import (
 )
 from spadwarp.run.formats import FORMATS, export
 from spadwarp.run.schema import SCHEMAS, json_schema
-from spadwarp.run.sources import open_source
 
 __all__ = [
     "CHECKPOINT",
@@ -25,9 +23,7 @@ __all__ = [
     "export",
     "json_schema",
     "load_resumable",
-    "open_source",
     "remove_checkpoint",
-    "save_analytic",
     "write_depth",
     "write_run",
 ]

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.files import open_source
 from spadwarp.frames.export import FrameSequence, exr_metadata, write_exr_frame, write_mat, write_npy, write_ptu
 from spadwarp.frames.frames import Frames
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.result.result import COMPONENTS, Result
-from spadwarp.run.sources import open_source
 
 __all__ = ["FORMATS", "export"]
 

@@ -14,11 +14,13 @@ from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.files import Held, load, sequence
+from spadwarp.frames import FramesFile
 from spadwarp.io.atomic import atomic_path
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
 from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure
-from spadwarp.viz.viewer import load_run
+from spadwarp.viz.viewer import reported_depths
 
 __all__ = ["video"]
 
@@ -27,7 +29,7 @@ _DPI = 100
 
 
 def video(
-    source: Result | str | Path,
+    source: Held | str | Path,
     path: str | Path = "light.gif",
     *,
     window_ns: tuple[float, float] | None = None,
@@ -42,7 +44,8 @@ def video(
     scale, whose upper end is the 99.9th percentile of the values above zero.
 
     Args:
-        source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
+        source: What `spadwarp.load` returns, or a path that it takes. Of an analytic file or a dataset, the frames of
+            one scene that report a time.
         path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install 'spadwarp[video]'`.
         window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
         pictures: Largest number of pictures; bins are merged where there are more.
@@ -74,11 +77,17 @@ def video(
     return path
 
 
-def _light(source: Result | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
+def _light(source: Held | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
-    run = load_run(source)
+    run = source if isinstance(source, Held) else load(source)
     if isinstance(run, Result):
         return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
+    if not isinstance(run, FramesFile):
+        frames = sequence(run)
+        reported, times = reported_depths(frames, frame)
+        scene = frames.at(frame).scene
+        assert scene is not None
+        return reported.astype(np.float64), 1e9 * times, "frames per pixel", 1e-9 * scene.medium.pulse_speed
     counts, edges = run.counts(frame).astype(np.float64), 1e9 * (run.gate_start + run.edges)
     return counts, edges, "counts per pixel", 1e-9 * run.scene.medium.pulse_speed
 

@@ -12,21 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.frames import FramesFile, InstrumentResponse, detector_response, is_frames_file
-from spadwarp.io.paths import file_within
-from spadwarp.result import Result, load_result
+from spadwarp.files import Held, load, sequence
+from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
+from spadwarp.frames.export import FrameSequence
+from spadwarp.result import Result
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
 from spadwarp.viz import style
 from spadwarp.viz.pages import write_page
 from spadwarp.viz.panels import median_pixel
 
-__all__ = ["HISTOGRAM_BYTES", "load_run", "view"]
+__all__ = ["HISTOGRAM_BYTES", "reported_depths", "view"]
 
 HISTOGRAM_BYTES = 5_000_000
 """Largest size of the packed histograms [bytes]; with plotly and the images a page stays below 15 MB."""
 
 _DECADES = 7.0
+_MOST_BINS = 256  # of reported depths
 # Blocks of pixels and of bins that are added up until the histograms fit, the finest first.
 _STEPS = ((1, 1), (1, 2), (1, 4), (2, 2), (2, 4), (2, 8), (4, 4), (4, 8), (4, 16), (8, 16), (16, 16), (32, 32))
 
@@ -62,7 +64,7 @@ class _Page:
 
 
 def view(
-    source: Result | str | Path,
+    source: Held | str | Path,
     path: str | Path = "view.html",
     *,
     method: str | None = None,
@@ -73,12 +75,13 @@ def view(
 
     It shows the depth frame as a point cloud coloured by its error, the depth frame, its truth, error and intensity as
     images, and the histogram of the pixel that is clicked on: a result's components, or counts of a frame with their
-    expectation and background, with the instrument response. `view.html#row,column` opens on a pixel. Histograms are
+    expectation and background, with the instrument response; where there is depth alone, the depths that the frames of
+    one scene report. `view.html#row,column` opens on a pixel. Histograms are
     kept to 7 decades and 7 %, counts exactly; where they would take more than `HISTOGRAM_BYTES`, bins and then blocks
     of pixels are averaged, and the page says so.
 
     Args:
-        source: A `Result`, `result.h5`, `frames.h5`, or the directory of one of them.
+        source: What `spadwarp.load` returns, or a path that it takes: a result, frames, an analytic file, a dataset.
         path: The file to write.
         method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
         frame: Number of the frame, from 0, where the source holds frames.
@@ -92,21 +95,16 @@ def view(
         from plotly.offline import get_plotlyjs
     except ModuleNotFoundError as error:
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
-    run = load_run(source)
-    page = _of_frames(run, method, frame) if isinstance(run, FramesFile) else _of_result(run, method, device)
+    held = source if isinstance(source, Held) else load(source)
+    if isinstance(held, Result):
+        page = _of_result(held, method, device)
+    else:
+        page = _of_frames(held, method, frame) if isinstance(held, FramesFile) else _of_depth(held, method, frame)
     write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
     return Path(path)
 
 
 # Sources
-
-
-def load_run(source: Result | str | Path) -> Result | FramesFile:
-    """A result or frames, from a file or from the directory that holds one. Raises `FileError`."""
-    if isinstance(source, Result):
-        return source
-    path = file_within(source, ("frames.h5", "result.h5"))
-    return FramesFile.load(path) if is_frames_file(path) else load_result(path)
 
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
@@ -166,6 +164,50 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
         unit="counts per bin",
         response=file.irf,
     )
+
+
+def _of_depth(held: Held, method: str | None, frame: int) -> _Page:
+    """Depth frames without counts."""
+    frames = sequence(held)
+    if method is not None:
+        raise ArgumentError(f"method = {method!r}: {frames.name} holds depth, not histograms")
+    shown = frames.at(frame)
+    assert shown.scene is not None and shown.depth is not None
+    cube, edges = reported_depths(frames, frame)
+    return _Page(
+        title=_name(shown.scene),
+        caption=f"frame {frame} of {frames.count}: {shown.content}; histograms are of the depths that the frames of "
+        "this scene report",
+        scene=shown.scene,
+        depth=shown.images["Z"].astype(np.float64),
+        method="stored",
+        truth=shown.depth.astype(np.float64),
+        reflectance=None,
+        intensity=shown.images.get("intensity", shown.images["background"]).astype(np.float64),
+        intensity_label="recorded photons" if "intensity" in shown.images else "background photon (1) or return (0)",
+        layers=[_Layer(label="frames", colour="#999999", cube=cube, factor=1.0, filled=True)],
+        edges=edges,
+        unit="frames per bin",
+        response=detector_response(shown.scene.detector, shown.scene.laser),
+    )
+
+
+def reported_depths(frames: FrameSequence, frame: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """How many frames of a frame's scene report a time of flight, `[H, W, T]`, and the bins' edges [s]."""
+    scene = frames.at(frame).scene
+    assert scene is not None and frames.same_scene is not None
+    bins = min(scene.gate.bins, _MOST_BINS)
+    edges = np.linspace(scene.gate.start, scene.gate.stop, bins + 1)
+    view = pixel_directions(scene.camera)
+    cube = np.zeros((scene.camera.height * scene.camera.width, bins), np.int64)
+    pixels = np.arange(len(cube))
+    for number in frames.same_scene(frame):
+        distance = range_from_depth(frames.frame(number).images["Z"].astype(np.float64), view)
+        path = path_from_range(distance, view, scene.beam.position)
+        place = (path / scene.medium.pulse_speed - edges[0]) / (edges[1] - edges[0])
+        known = np.isfinite(place.ravel())
+        cube[pixels[known], np.clip(place.ravel()[known], 0, bins - 1).astype(np.intp)] += 1
+    return cube.reshape(scene.camera.height, scene.camera.width, bins), edges
 
 
 def _name(scene: Scene) -> str:

@@ -67,7 +67,7 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     printed = run("info", tmp_path / "result.h5", "--json", summary).stdout
     assert run("info", tmp_path).stdout == printed  # the directory stands for the result in it
     assert "20 000, seed 3" in printed and "Energy balance, exact" in printed and "100.000000 %" in printed
-    assert tables(summary) == json.loads(json.dumps(result.summary()))
+    assert tables(summary) == json.loads(json.dumps({"kind": "result", **result.summary()}))
 
 
 def test_a_result_that_says_little_about_its_origin_is_shown(done, tmp_path):

@@ -14,6 +14,7 @@ LEVELS = (
     ("run",),
     ("denoise",),
     ("viz",),
+    ("files",),
     ("dataset",),
     ("checks",),
     ("analytic",),

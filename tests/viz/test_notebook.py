@@ -1,5 +1,6 @@
 """Notebooks: short names, pictures with numbers, labelled arrays, tables."""
 
+import dataclasses
 import math
 import tomllib
 
@@ -20,7 +21,8 @@ def result():
 
 @pytest.fixture(scope="module")
 def frames(result):
-    return spadwarp.detect(result, pulses=500, frames=3, seed=2, device="cpu")
+    few = dataclasses.replace(result, second_moment=None, batch_size=0)  # whose noise is nobody's business here
+    return spadwarp.detect(few, pulses=500, frames=3, seed=2, device="cpu")
 
 
 @pytest.fixture(scope="module")

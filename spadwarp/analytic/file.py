@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.labelled import MAP_UNITS
 from spadwarp.analytic.model import response_sigma
-from spadwarp.frames.export import FrameSequence, SequenceFrame
+from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
 
 if TYPE_CHECKING:
     from spadwarp.analytic.result import AnalyticResult
 
-__all__ = ["FORMAT", "load_analytic", "save_analytic"]
+__all__ = ["FORMAT", "AnalyticFile", "save_analytic"]
 
 FORMAT = "spadwarp analytic"
 FORMAT_VERSION = 1
@@ -94,20 +96,61 @@ def _metadata(result: AnalyticResult) -> dict[str, Any]:
     }
 
 
-def load_analytic(path: str | Path) -> FrameSequence:
-    """The depth frames in a file of `save_analytic`. Raises `FileError`."""
-    with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
-        scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
-        shape = scene.camera.height, scene.camera.width
-        truth = file.array("truth/depth", np.float32, shape)
-        count = len(file.stored("depth", np.float32, (None, *shape)))
-        file.stored("labels", np.bool_, (count, *shape))
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class AnalyticFile:
+    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory.
 
-    def frame(number: int) -> SequenceFrame:
-        with read_hdf5(path, FORMAT) as file:
-            depth = file.stored("depth", np.float32, (count, *shape))[number]
-            labels = file.stored("labels", np.bool_, (count, *shape))[number].astype(np.float32)
-        images = {"Z": depth, "background": labels, "truth.Z": truth}
-        return SequenceFrame(images=images, scene=scene, depth=truth, content="Z by the analytic simulator")
+    Attributes:
+        path: The file.
+        frames: Their number.
+        seed: Of the frames.
+        scene: The scene.
+        truth: Depth, range, normal and reflectance.
+        maps: Name → float64 `[H, W]`, as the attributes of `AnalyticResult`.
+    """
 
-    return FrameSequence(name=str(path), count=count, frame=frame)
+    path: Path
+    frames: int
+    seed: int
+    scene: Scene
+    truth: Truth
+    maps: dict[str, NDArray[np.float64]]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Opens a file that `save_analytic` wrote. Raises `FileError`."""
+        with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
+            scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
+            shape = scene.camera.height, scene.camera.width
+            kinds = {name: (np.float32, (*shape, 3) if name == "normal" else shape) for name in _TRUTH_UNITS}
+            truth = {name: file.array(f"truth/{name}", kind, sides) for name, (kind, sides) in kinds.items()}
+            count = len(file.stored("depth", np.float32, (None, *shape)))
+            file.stored("labels", np.bool_, (count, *shape))
+            return cls(
+                path=Path(path),
+                frames=count,
+                seed=file.integer("seed"),
+                scene=scene,
+                truth=Truth(**truth),
+                maps={name: file.array(f"maps/{name}", np.float64, shape) for name in MAP_UNITS},
+            )
+
+    def __repr__(self) -> str:
+        height, width = self.truth.depth.shape
+        return f"AnalyticFile({self.path}: {self.frames} depth frames, {width} x {height} pixels)"
+
+    def depth(self, frame: int | None = None) -> NDArray[np.float32]:
+        """Depth of one frame `[H, W]`, or of all `[frames, H, W]` [m]; NaN for no estimate."""
+        return self._read("depth", np.float32, frame)
+
+    def labels(self, frame: int | None = None) -> NDArray[np.bool_]:
+        """Whether pixels report a background photon, `[H, W]` or `[frames, H, W]`."""
+        return self._read("labels", np.bool_, frame)
+
+    def _read(self, name: str, kind: Any, frame: int | None) -> NDArray[Any]:
+        if frame is not None and not 0 <= frame < self.frames:
+            raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
+        with read_hdf5(self.path, FORMAT) as file:
+            return np.asarray(
+                file.stored(name, kind, (self.frames, *self.truth.depth.shape))[... if frame is None else frame]
+            )

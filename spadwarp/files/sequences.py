@@ -1,35 +1,34 @@
-"""Any of our files opened: results, frames of a camera or of the analytic simulator, datasets."""
+"""Frames of any source, one at a time: of a camera, of the analytic simulator, of a dataset."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.analytic import AnalyticFile
 from spadwarp.arrays import on_host
 from spadwarp.dataset import FrameReader
 from spadwarp.errors import ArgumentError
+from spadwarp.files.loader import load, locate
 from spadwarp.frames.export import FrameSequence, SequenceFrame
-from spadwarp.frames.file import FORMAT, FramesFile
+from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
-from spadwarp.io.hdf5 import hdf5_format
-from spadwarp.result.file import load_result
 from spadwarp.result.result import Result
-from spadwarp.run import analytic_file
 
-__all__ = ["open_source"]
+__all__ = ["open_source", "sequence"]
 
 
 @contextmanager
 def open_source(source: Any, *, result: Result | None = None, split: str = "all") -> Iterator[Result | FrameSequence]:
-    """A result or frames: in memory, in a file, or a dataset's folder.
+    """A result or frames: in memory, in a file, or in a directory; see `load`.
 
     Args:
-        source: A `Result`, `Frames`, a path.
+        source: A `Result`, `Frames`, what `load` returns, or a path.
         result: From which `Frames` were drawn.
         split: Of a dataset.
 
@@ -37,22 +36,24 @@ def open_source(source: Any, *, result: Result | None = None, split: str = "all"
         ArgumentError: A source of another type.
         FileError: Not a file of ours, or damaged.
     """
-    if isinstance(source, Result):
-        yield source
-    elif isinstance(source, (str, Path)):
-        path = Path(source)
-        if path.is_dir():
-            yield _of_dataset(path, split)
-        elif (kind := hdf5_format(path)) == FORMAT:
-            yield _of_file(FramesFile.load(path))
-        elif kind == analytic_file.FORMAT:
-            yield analytic_file.load_analytic(path)
-        else:
-            yield load_result(path)
-    elif hasattr(source, "counts"):
+    if isinstance(source, Frames):
         yield _of_frames(source, result)
-    else:
-        raise ArgumentError(f"source is a {type(source).__name__}; a Result, Frames or a file of one is needed")
+        return
+    if isinstance(source, (str, os.PathLike)):
+        place = locate(source)
+        source = FrameReader(place, split) if place.is_dir() else load(place)
+    yield source if isinstance(source, Result) else sequence(source)
+
+
+def sequence(held: Any) -> FrameSequence:
+    """The frames of a `FramesFile`, an `AnalyticFile` or a `FrameReader`. Raises `ArgumentError` for others."""
+    if isinstance(held, FramesFile):
+        return _of_file(held)
+    if isinstance(held, AnalyticFile):
+        return _of_analytic(held)
+    if isinstance(held, FrameReader):
+        return _of_dataset(held)
+    raise ArgumentError(f"source is a {type(held).__name__}; a Result, Frames or a file of one is needed")
 
 
 def _of_frames(frames: Frames, result: Result | None) -> FrameSequence:
@@ -109,9 +110,19 @@ def _of_file(file: FramesFile) -> FrameSequence:
     return FrameSequence(name=str(file.path), count=file.frames, frame=frame, largest_count=most)
 
 
-def _of_dataset(folder: Path, split: str) -> FrameSequence:
-    depth = FrameReader(folder, split, fields=("noisy", "clean", "label", "intensity", "bound"))
-    histograms = FrameReader(folder, split, fields=("counts", "expected"))
+def _of_analytic(file: AnalyticFile) -> FrameSequence:
+    truth = file.truth.depth
+
+    def frame(number: int) -> SequenceFrame:
+        images = {"Z": file.depth(number), "background": file.labels(number).astype(np.float32), "truth.Z": truth}
+        return SequenceFrame(images=images, scene=file.scene, depth=truth, content="Z by the analytic simulator")
+
+    return FrameSequence(name=str(file.path), count=file.frames, frame=frame, same_scene=lambda _: range(file.frames))
+
+
+def _of_dataset(reader: FrameReader) -> FrameSequence:
+    depth = reader.with_fields("noisy", "clean", "label", "intensity", "bound")
+    histograms = reader.with_fields("counts", "expected")
     photons, pulses, backscatter = map(depth.scene_numbers, ("photons", "pulses", "backscatter"))
 
     def frame(number: int) -> SequenceFrame:
@@ -138,7 +149,7 @@ def _of_dataset(folder: Path, split: str) -> FrameSequence:
             **common,
         )
 
-    return FrameSequence(name=str(folder), count=len(depth), frame=frame)
+    return FrameSequence(name=str(reader.path), count=len(depth), frame=frame, same_scene=depth.same_scene)
 
 
 _DATASET_IMAGES = {

@@ -1,0 +1,52 @@
+"""Depth frames that a file holds, without an estimator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spadwarp.analytic import AnalyticFile
+from spadwarp.dataset import FrameReader
+from spadwarp.files.loader import Held
+from spadwarp.frames import Reduction
+from spadwarp.scene.geometry import pixel_directions, range_from_depth
+from spadwarp.units import range_from_time
+
+__all__ = ["gate_of", "stored_depth"]
+
+
+def stored_depth(held: Held) -> Reduction | None:
+    """The depth frames of an analytic file, a dataset or a shard; None for what holds histograms.
+
+    `intensity` is that of a dataset's frames, and the expected signal of the analytic model.
+    """
+    if isinstance(held, AnalyticFile):
+        depth = held.depth().astype(np.float64)
+        intensity = np.broadcast_to(np.nan_to_num(held.maps["signal"]), depth.shape)
+        camera = held.scene.camera
+    elif isinstance(held, FrameReader):
+        items = [(item["noisy"][0], item["intensity"][0]) for item in held]
+        depth = np.array([noisy for noisy, _ in items], np.float64)
+        intensity = np.array([counts for _, counts in items])
+        camera = held.scene(0).camera
+    else:
+        return None
+    view = pixel_directions(camera)
+    return Reduction(
+        quantity="depth",
+        values=depth,
+        range=range_from_depth(depth, view),
+        intensity=intensity,
+        directions=view,
+        method="stored",
+    )
+
+
+def gate_of(held: Held) -> tuple[float, float] | None:
+    """Ranges at which the gate of an analytic file or a dataset opens and closes [m], of all its scenes together."""
+    if isinstance(held, AnalyticFile):
+        gate, index = held.scene.gate, held.scene.medium.group_index
+        return range_from_time(gate.start, index), range_from_time(gate.stop, index)
+    if isinstance(held, FrameReader):
+        gates = np.array([item["gate"] for item in held.with_fields()])
+        return float(gates[:, 0].min()), float(gates[:, 1].max())
+    return None

@@ -1,0 +1,75 @@
+"""One loader for all files that spadwarp writes as HDF5."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from spadwarp.analytic import AnalyticFile
+from spadwarp.dataset import FrameReader
+from spadwarp.errors import FileError
+from spadwarp.frames import FramesFile
+from spadwarp.io.hdf5 import read_hdf5
+from spadwarp.io.paths import file_within
+from spadwarp.result import Result, load_result
+from spadwarp.transport import PhotonRecords, load_records
+
+__all__ = ["Held", "holds_own_file", "load", "locate"]
+
+Held = Result | FramesFile | AnalyticFile | FrameReader | PhotonRecords
+"""What a file of ours holds."""
+
+_NAMES = ("frames.h5", "result.h5", "analytic.h5")
+_DATASET, _CHECKPOINT = "manifest.json", "checkpoint.h5"
+_LOADERS: dict[str, Callable[[Path], Held]] = {
+    "spadwarp result": load_result,
+    "spadwarp frames": FramesFile.load,
+    "spadwarp analytic": AnalyticFile.load,
+    "spadwarp records": load_records,
+}
+
+
+def load(path: str | os.PathLike[str]) -> Held:
+    """What a file that spadwarp wrote holds.
+
+    - `result.h5`, `checkpoint.h5`: a `Result`.
+    - `frames.h5` of `detect`: a `FramesFile`, which reads counts and depth when asked.
+    - `analytic.h5`: an `AnalyticFile`, likewise.
+    - A dataset's folder or one of its shards: a `FrameReader` of all its frames.
+    - `records.h5`: `PhotonRecords`.
+    - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
+
+    Raises:
+        FileError: Not a file of ours, damaged, or a directory that holds none or several of them.
+    """
+    place = locate(path)
+    if place.is_dir():
+        return FrameReader(place, "all")
+    with read_hdf5(place) as file:
+        kind, shard = file.attribute("format", None), file.attribute("shard", None)
+    if shard is not None:
+        return FrameReader(place, "all")
+    loader = _LOADERS.get(kind) if isinstance(kind, str) else None
+    if loader is None:
+        known = ", ".join(_LOADERS)
+        raise FileError(f"{place}: an HDF5 file, but none of ours: its format is {kind!r}, not one of {known}")
+    return loader(place)
+
+
+def locate(path: str | os.PathLike[str]) -> Path:
+    """A file as it is; of a directory the only result, frames or analytic file in it, else its checkpoint.
+
+    A dataset's folder stays a folder. Raises `FileError` for a directory that holds none of them, or several.
+    """
+    place = Path(path)
+    if not os.path.isdir(place) or (place / _DATASET).is_file():
+        return place
+    if not any((place / name).is_file() for name in _NAMES) and (place / _CHECKPOINT).is_file():
+        return place / _CHECKPOINT
+    return file_within(place, _NAMES)
+
+
+def holds_own_file(folder: str | os.PathLike[str]) -> bool:
+    """Whether a directory is that of a run, of frames, of an analytic file or of a dataset."""
+    return any((Path(folder) / name).is_file() for name in (*_NAMES, _DATASET, _CHECKPOINT))
