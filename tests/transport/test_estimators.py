@@ -133,6 +133,7 @@ def test_the_near_depth_map_skips_rays_and_changes_no_bit(estimator, device):
 VESSEL = {"builtin": "box", "size": [3.0, 2.0, 4.0], "translation": [0.0, 0.0, 1.5], "reflectance": 1.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("events", [1, 2, 3, 5])
 def test_estimators_agree_under_a_cap_on_events(events, device):
     """White vessel, lossless water: no light is lost but by the cap, so that the last allowed event is a fair part.
