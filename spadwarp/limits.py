@@ -18,7 +18,7 @@ __all__ += ["check_part", "check_real", "parse_number", "shown", "suggestion"]
 
 SEED = "[0, 18446744073709551615]"
 """Range of seeds: 64 bits."""
-BIN_WIDTH, TIME = "[1e-18, 1e6] s", "[-1e6, 1e6] s"
+BIN_WIDTH, TIME = "[1e-24, 1e6] s", "[-1e6, 1e6] s"
 """Ranges of the width of a bin and of a time, beyond which squares leave those of single precision."""
 
 _NUMBER = re.compile(

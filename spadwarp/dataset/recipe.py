@@ -25,9 +25,10 @@ from pydantic import (
     model_validator,
 )
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
+from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
@@ -35,6 +36,8 @@ from spadwarp.scene.renamed import current_fields, current_path
 from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
+
+_MOST_TRIED = 1000  # values of a field that varies
 
 SPLITS = ("train", "validation", "test")
 
@@ -55,8 +58,8 @@ class Distribution(_Table):
     """One of `choices`, equally likely, or uniform between `low` and `high`."""
 
     choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
-    low: float | None = Field(None, description="lowest value")
-    high: float | None = Field(None, description="highest value")
+    low: float | None = Field(None, ge=-1e19, le=1e19, description="lowest value")
+    high: float | None = Field(None, ge=-1e19, le=1e19, description="highest value")
     log: bool = Field(False, description="whether uniform in the logarithm")
 
     @model_validator(mode="after")
@@ -68,6 +71,10 @@ class Distribution(_Table):
                 raise ValueError(f"low = {self.low} is outside (-inf, {self.high}], {self.high} being high")
             if self.log and not self.low > 0:
                 raise ValueError(f"low = {self.low} is outside (0, inf), the range of a logarithm")
+            if not math.isfinite(self.high / self.low if self.log else self.high - self.low):
+                raise ValueError(f"low = {self.low} and high = {self.high} are too far apart")
+        if not all(map(_is_finite, self.choices)):
+            raise ValueError(f"holds {shown(self.choices)}, not all of which are finite")
         return self
 
     @property
@@ -94,33 +101,41 @@ class Distribution(_Table):
         return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
 
 
+def _is_finite(value: Any) -> bool:
+    """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
+    if isinstance(value, list | tuple):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
 def _distribution(value: Any) -> Any:
     if isinstance(value, (Mapping, Distribution)):
         return value
     return {"choices": list(value) if isinstance(value, (list, tuple)) else [value]}
 
 
-def _within(low: float, high: float, *, open_low: bool = False) -> AfterValidator:
-    """A distribution of numbers in [low, high], or (low, high]."""
+def _within(interval: str) -> AfterValidator:
+    """A distribution of numbers in a range."""
 
     def check(value: Distribution) -> Distribution:
-        for choice in value.choices:
-            if isinstance(choice, bool) or not isinstance(choice, (int, float)):
-                raise ValueError(f"{choice!r} is not a number")
-        for limit in value.limits:
-            if not low <= limit <= high or (open_low and limit == low):
-                left, right = "(" if open_low else "[", "]" if high < math.inf else ")"
-                raise ValueError(f"{limit} is outside {left}{low}, {high}{right}")
+        values = value.choices or value.limits
+        for one in values:
+            try:
+                check_real("value", one, interval)
+            except ArgumentError:
+                problem = f"is no number in {interval}"
+                raise ValueError(problem if len(values) == 1 else f"holds {shown(one)}, which {problem}") from None
         return value
 
     return AfterValidator(check)
 
 
-Positive = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, math.inf, open_low=True)]
-NotNegative = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, math.inf)]
-Share = Annotated[Distribution, BeforeValidator(_distribution), _within(0.0, 1.0)]
-Angle = Annotated[Distribution, BeforeValidator(_distribution), _within(-360.0, 360.0)]
-Real = Annotated[Distribution, BeforeValidator(_distribution), _within(-math.inf, math.inf)]
+Positive = Annotated[Distribution, BeforeValidator(_distribution), _within("[1e-9, 1e9]")]
+NotNegative = Annotated[Distribution, BeforeValidator(_distribution), _within("[0, 1e9]")]
+PulseCount = Annotated[Distribution, BeforeValidator(_distribution), _within("[0.5, 9e18]")]
+Share = Annotated[Distribution, BeforeValidator(_distribution), _within("[0, 1]")]
+Angle = Annotated[Distribution, BeforeValidator(_distribution), _within("[-360, 360]")]
+Real = Annotated[Distribution, BeforeValidator(_distribution), _within("[-1e9, 1e9]")]
 
 
 def _constant(value: float) -> Distribution:
@@ -135,7 +150,7 @@ class Targets(_Table):
     )
     meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
-        3.6, gt=0, description="longest side that meshes are scaled to [m]; none if not given"
+        3.6, ge=1e-6, le=1e6, description="longest side that meshes are scaled to [m]; none if not given"
     )
     exports: Names = Field((), description="*_RGBD.EXR of a game engine, or folders of them, rendered with the camera")
     export_preset: Literal["unreal", "blender"] = Field("unreal", description="program that wrote the exports")
@@ -183,7 +198,7 @@ class Exposure(_Table):
     """Exposure of a frame: its pulses, or the photons that the median pixel records from the target."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
-    pulses_per_depth_frame: Positive | None = Field(
+    pulses_per_depth_frame: PulseCount | None = Field(
         None, description="pulses of a frame; the scene's if neither is given"
     )
 
@@ -268,10 +283,22 @@ class Recipe(_Table):
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
         try:
-            recipe.template()
+            template = recipe.template()
         except ConfigError as error:
             raise ConfigError([f"scene: {line}" for line in error.problems], source=name) from None
+        try:
+            recipe._check_vary(template)
+        except ConfigError as error:
+            raise ConfigError([f"vary: {line}" for line in error.problems], source=name) from None
         return recipe
+
+    def _check_vary(self, template: Scene) -> None:
+        """Raises `ConfigError` where a value that can be drawn for a field is not one of its values."""
+        values = {field: drawn.choices or drawn.limits for field, drawn in self.vary.items()}
+        first = {field: some[0] for field, some in values.items()}
+        for field, some in values.items():
+            for value in some[:_MOST_TRIED]:
+                template.with_overrides({**first, field: value})
 
     def template(self) -> Scene:
         """The scene before anything is drawn, without targets, its gate from 0 to 1 ns."""

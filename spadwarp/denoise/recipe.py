@@ -14,6 +14,7 @@ from spadwarp.errors import ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
 from spadwarp.scene.messages import describe
+from spadwarp.scene.sections import Whole
 
 __all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]
 
@@ -32,13 +33,17 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 def _pair(value: Any) -> Any:
-    return tuple(map(float, value)) if isinstance(value, list) else value
+    is_pair = isinstance(value, list) and all(
+        isinstance(one, int | float) and not isinstance(one, bool) for one in value
+    )
+    return tuple(map(float, value)) if is_pair else value
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Above0 = Annotated[float, Field(gt=0)]
+Spread = Annotated[float, Field(ge=0, le=100)]
+Above0 = Annotated[float, Field(ge=1e-9, le=1e9)]
 _CHECKS = BeforeValidator(_pair), AfterValidator(_ordered)
-Limits = Annotated[tuple[float, float], *_CHECKS]
+Limits = Annotated[tuple[Spread, Spread], *_CHECKS]
 Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
 Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
@@ -74,19 +79,21 @@ class Noise(_Table):
 class Optimiser(_Table):
     """How the network is trained."""
 
-    steps: int = Field(40_000, ge=1, description="updates of the weights")
-    batch: int = Field(64, ge=1, description="crops per update, on all GPUs together")
-    crop: int = Field(96, ge=32, description="side of a crop [pixels]")
-    learning_rate: float = Field(1e-3, gt=0, description="highest; decreases along a cosine to a hundredth")
-    warm_up: int = Field(500, ge=0, description="updates in which the learning rate rises")
-    weight_decay: float = Field(1e-4, ge=0)
+    steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
+    batch: Whole = Field(64, ge=1, le=10**6, description="crops per update, on all GPUs together")
+    crop: Whole = Field(96, ge=32, le=16384, description="side of a crop [pixels]")
+    learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; decreases along a cosine to a hundredth")
+    warm_up: Whole = Field(500, ge=0, le=10**12, description="updates in which the learning rate rises")
+    weight_decay: float = Field(1e-4, ge=0, le=1e3)
     averaging: float = Field(0.999, ge=0, lt=1, description="decay of the running mean of the weights that is kept")
     loss: Literal["psnr", "mse"] = Field(
         "psnr",
         description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much as hard ones',
     )
     precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
-    report_every: int = Field(500, ge=1, description="updates between two lines of the log and two checkpoints")
+    report_every: Whole = Field(
+        500, ge=1, le=10**12, description="updates between two lines of the log and two checkpoints"
+    )
 
 
 class TrainingRecipe(_Table):
@@ -97,7 +104,7 @@ class TrainingRecipe(_Table):
         None, description="network of the package whose weights the training starts from"
     )
     data: str = Field(..., min_length=1, description="dataset (folder), relative to the working directory")
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
+    seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
     optimiser: Optimiser = Optimiser()
     _source: Path | None = PrivateAttr(None)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["TriangleMesh", "build_mesh", "load_target"]
 
 MAX_FACES = 2**31 - 1
+FARTHEST = 1e9  # [m], as for all coordinates of a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +203,11 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
         raise MeshError(f"{name}: the mesh has no faces")
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
         corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
-    if not np.isfinite(corners).all():
-        bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
-        raise MeshError(f"{name}: {bad} of {len(mesh.faces)} faces have coordinates that are not finite")
+    if not (inside := np.abs(corners) <= FARTHEST).all():
+        bad = int((~inside).any(axis=(1, 2)).sum())
+        raise MeshError(
+            f"{name}: {bad} of {len(mesh.faces)} faces have coordinates that are not finite, or beyond {FARTHEST:g} m"
+        )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     solid = (normals != 0.0).any(axis=1)
     if not solid.any():
@@ -238,6 +241,6 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"{name}: the file holds no triangles")
-    if np.isfinite(mesh.vertices).all():
+    if (np.abs(mesh.vertices) < 1e15).all():  # else merging would leave the range of integers
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh

@@ -17,7 +17,7 @@ class Analytic(Section):
     """constants of the lidar equation: radiometry, or eq 7 as printed"""
     backscatter: Literal["constant", "single_scatter", "monte_carlo"] = "single_scatter"
     """time course of the backscatter"""
-    backscatter_rate: float = Field(0.0, ge=0)
+    backscatter_rate: float = Field(0.0, ge=0, le=1e15)
     """constant backscatter, detections per second in the gate [1/s]"""
     backscatter_fraction: float | None = Field(None, ge=0, le=1)
     """part of the pixels that report backscatter (BS); from the rates if not given"""
@@ -27,5 +27,5 @@ class Analytic(Section):
     """pulses of one depth frame, for per_pulse; if not given those of one frame of the detector, pulses_per_frame"""
     frames: Whole = Field(1000, ge=1, le=2**63 - 1)
     """detector frames of one depth frame, for per_frame"""
-    exposure: float = Field(1e-5, gt=0)
+    exposure: float = Field(1e-5, ge=1e-15, le=1e6)
     """exposure of one detector frame [s]"""

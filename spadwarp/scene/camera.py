@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from spadwarp.scene import intrinsics
 from spadwarp.scene.calibration import load_calibration
-from spadwarp.scene.sections import Brown, Section, Vector, Whole
+from spadwarp.scene.sections import Brown, Coordinate, Section, Vector, Whole
 
 
 def _infinite(value: Any) -> Any:
@@ -33,30 +33,31 @@ class Camera(Section):
     """pixels in a row"""
     height: Whole = Field(..., ge=1, le=16384)
     """rows"""
-    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180)
+    horizontal_fov_deg: float | None = Field(None, ge=1e-6, lt=180)
     """full horizontal field of view [°]"""
-    focal_length: float | None = Field(None, gt=0)
+    focal_length: float | None = Field(None, ge=1e-6, le=1e6)
     """focal length [m]"""
-    pixel_pitch_um: float | None = Field(None, gt=0)
+    pixel_pitch_um: float | None = Field(None, ge=1e-9, le=1e6)
     """side of a pixel [µm]"""
-    fx: float | None = Field(None, gt=0)
+    fx: float | None = Field(None, ge=1e-3, le=1e9)
     """focal length along rows [pixels], as OpenCV writes it"""
-    fy: float | None = Field(None, gt=0)
+    fy: float | None = Field(None, ge=1e-3, le=1e9)
     """focal length along columns [pixels]; fx if not given"""
-    cx: float | None = None
+    cx: Coordinate | None = None
     """column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle"""
-    cy: float | None = None
+    cy: Coordinate | None = None
     """row of the optical axis, likewise"""
     distortion: Brown = (0.0,) * 5
     """Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order"""
     calibration: str | None = None
     """OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place"""
-    aperture_diameter: float | None = Field(None, gt=0)
+    aperture_diameter: float | None = Field(None, ge=1e-9, le=1e6)
     """diameter of the entrance aperture [m]"""
-    f_number: float | None = Field(None, gt=0)
+    f_number: float | None = Field(None, ge=1e-3, le=1e6)
     """focal length over aperture diameter"""
     focus_distance: Annotated[
-        Annotated[float, Field(gt=0, le=math.inf, allow_inf_nan=True)] | Literal["target"], BeforeValidator(_infinite)
+        Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"],
+        BeforeValidator(_infinite),
     ] = "target"
     """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
     pinhole: bool = False

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from spadwarp.limits import Interval
+
+EXTINCTION = "[1e-12, 1e6]"
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 
 
@@ -38,6 +41,6 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
         a = c - b if a is None else a
         b = c - a if b is None else b
-    if not c > 0.0:
-        raise ValueError(f"extinction = {c} is outside (0, inf)")
+    if c not in Interval.read(EXTINCTION):
+        raise ValueError(f"extinction = {c} is outside {EXTINCTION}")
     return {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c if albedo is None else albedo}

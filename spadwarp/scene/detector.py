@@ -19,29 +19,29 @@ class Detector(Section):
     """photon detection probability of the active area"""
     fill_factor: float = Field(0.2, gt=0, le=1)
     """active part of a pixel's area, microlenses included"""
-    jitter_fwhm_ps: float = Field(200.0, ge=0)
+    jitter_fwhm_ps: float = Field(200.0, ge=0, le=1e12)
     """timing jitter, full width at half maximum [ps]"""
     irf: str = "gaussian"
     """instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file"""
-    irf_tail_ps: float = Field(100.0, gt=0)
+    irf_tail_ps: float = Field(100.0, ge=1e-12, le=1e12)
     """time constant of the exponential tail [ps]"""
-    dark_count_rate: float = Field(100.0, ge=0)
+    dark_count_rate: float = Field(100.0, ge=0, le=1e15)
     """median dark counts per second and pixel [1/s]"""
-    dark_count_spread: float = Field(0.0, ge=0)
+    dark_count_spread: float = Field(0.0, ge=0, le=10)
     """relative (log-normal) spread of the dark count rate over pixels"""
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1)
     """part of the pixels that are hot"""
-    hot_pixel_rate: float = Field(1e4, ge=0)
+    hot_pixel_rate: float = Field(1e4, ge=0, le=1e15)
     """dark count rate of a hot pixel [1/s]"""
-    ambient_rate: float = Field(0.0, ge=0)
+    ambient_rate: float = Field(0.0, ge=0, le=1e15)
     """detected background counts per second and pixel [1/s]"""
     mode: Literal["first_photon", "free_running"] = "first_photon"
     """one count a pulse, or as many as come"""
-    dead_time_ns: float = Field(0.0, ge=0)
+    dead_time_ns: float = Field(0.0, ge=0, le=1e12)
     """dead time after a count, free-running [ns]"""
     afterpulsing_probability: float = Field(0.0, ge=0, lt=1)
     """probability that a count causes another"""
-    afterpulsing_time_constant_ns: float = Field(50.0, gt=0)
+    afterpulsing_time_constant_ns: float = Field(50.0, ge=1e-12, le=1e12)
     """decay time of afterpulsing [ns]"""
     crosstalk_probability: float = Field(0.0, ge=0, lt=1)
     """probability that a count fires a neighbour"""

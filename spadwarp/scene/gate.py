@@ -15,9 +15,9 @@ class Gate(Section):
     section: ClassVar[str] = "gate"
     preset: str | None = None
     """named electronics, see `spadwarp presets gate`"""
-    start_ns: float = Field(0.0, ge=0)
+    start_ns: float = Field(0.0, ge=0, le=1e12)
     """begin of the first bin [ns]"""
-    bin_width_ps: float = Field(..., gt=0)
+    bin_width_ps: float = Field(..., ge=1e-12, le=1e15)
     """width of a bin [ps]"""
     bins: Whole = Field(..., ge=1, le=1_000_000)
     """number of bins"""

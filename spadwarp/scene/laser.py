@@ -30,26 +30,26 @@ class Laser(Section):
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
     profile_image: str | None = None
     """irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"""
-    half_angle_deg: float = Field(15.0, gt=0, le=180)
+    half_angle_deg: float = Field(15.0, ge=1e-6, le=180)
     """half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]"""
-    beam_radius: float = Field(0.0, ge=0)
+    beam_radius: float = Field(0.0, ge=0, le=1e6)
     """radius of the collimated beam [m]; 0 is a pencil beam"""
-    wavelength_nm: float = Field(532.0, gt=0)
+    wavelength_nm: float = Field(532.0, ge=1e-9, le=1e6)
     """vacuum wavelength [nm]"""
-    pulse_energy: float = Field(37.5e-9, gt=0)
+    pulse_energy: float = Field(37.5e-9, ge=1e-30, le=1e6)
     """energy of one pulse [J]"""
-    average_power: float = Field(0.0, gt=0)
+    average_power: float = Field(0.0, ge=1e-30, le=1e15)
     """mean power, in place of pulse_energy: pulse_energy times repetition_rate [W]"""
-    peak_power: float = Field(0.0, gt=0)
+    peak_power: float = Field(0.0, ge=1e-30, le=1e21)
     """power at the peak of the pulse, in place of pulse_energy: for a Gaussian pulse pulse_energy/(1.0645 FWHM) [W]"""
-    repetition_rate: float = Field(20e6, gt=0)
+    repetition_rate: float = Field(20e6, ge=1e-6, le=1e15)
     """pulses per second [Hz]"""
-    pulse_fwhm_ps: float = Field(85.0, ge=0)
+    pulse_fwhm_ps: float = Field(85.0, ge=0, le=1e12)
     """pulse duration, full width at half maximum [ps]"""
 
     @model_validator(mode="after")
     def _has_a_beam(self) -> Self:
-        if not any(self.direction):
+        if math.hypot(*self.direction) < 1e-9:
             raise ValueError(f"direction = {list(self.direction)} has no length")
         if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
             raise ValueError(
@@ -72,6 +72,10 @@ class Laser(Section):
             energy = self.average_power / rate
         elif "peak_power" in self.given:
             energy = self.peak_power * duration
+        if not 1e-30 <= energy <= 1e6:
+            raise ValueError(
+                f"{self.given[0]} = {getattr(self, self.given[0])} makes pulses of {energy:.3g} J, outside [1e-30, 1e6]"
+            )
         powers = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
         derived = {"pulse_energy": energy} | powers
         self.__dict__.update({name: value for name, value in derived.items() if name not in self.given})

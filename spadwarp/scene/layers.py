@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.load import merge_section
 from spadwarp.scene.quantities import with_units
-from spadwarp.scene.sections import Section
+from spadwarp.scene.sections import Coordinate, Section
 
 
 class Water(Section):
@@ -19,11 +19,11 @@ class Water(Section):
     section: ClassVar[str] = "medium"
     preset: str | None = None
     """a named water, see `spadwarp presets medium`"""
-    absorption: float = Field(0.0, ge=0)
+    absorption: float = Field(0.0, ge=0, le=1e6)
     """absorption coefficient a [1/m]"""
-    scattering: float = Field(0.0, ge=0)
+    scattering: float = Field(0.0, ge=0, le=1e6)
     """scattering coefficient b [1/m]"""
-    extinction: float = Field(0.0, gt=0)
+    extinction: float = Field(0.0, ge=1e-12, le=1e6)
     """extinction (beam attenuation) coefficient c = a + b [1/m]"""
     albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
@@ -58,7 +58,7 @@ class Water(Section):
 class Layer(Water):
     """Water from a plane on, up to the next layer; given as a medium is."""
 
-    start: float
+    start: Coordinate
     """where it begins along `layer_axis`, the world's z if not given [m]"""
     anisotropy: float | None = Field(None, gt=-1, lt=1)
     """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""

@@ -88,7 +88,7 @@ class Medium(Water):
 
     @model_validator(mode="after")
     def _resolved(self) -> Self:
-        if not any(self.layer_axis):
+        if math.hypot(*self.layer_axis) < 1e-9:
             raise ValueError(f"layer_axis = {list(self.layer_axis)} has no length")
         for i, layer in enumerate(self.layers):
             if i and layer.start <= self.layers[i - 1].start:

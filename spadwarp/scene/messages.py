@@ -95,7 +95,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
             return text
         if not whole_table:
             return f"{entry} {text}"
-        return f"{name} {text}" if text.startswith("needs") else f"{name}.{text}"
+        return f"{name} {text}" if text.startswith(("needs", "holds", "is ")) else f"{name}.{text}"
     choices = _choices(info, cause)
     if kind in _LIMITS and info is not None:
         return f"{entry} is outside {_interval(info)}" + "".join(f" and not {word!r}" for word in choices)

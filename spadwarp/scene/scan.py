@@ -16,5 +16,5 @@ class Scan(Section):
     section: ClassVar[str] = "scan"
     mode: Literal["none", "confocal"] = "none"
     """confocal: the beam visits the pixels in turn and each sees its own light alone"""
-    distance: float = Field(math.inf, gt=0, le=math.inf, allow_inf_nan=True)
+    distance: float = Field(math.inf, ge=1e-6, le=math.inf, allow_inf_nan=True)
     """range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel"""

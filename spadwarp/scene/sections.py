@@ -40,12 +40,14 @@ def _repeated(count: int) -> BeforeValidator:
 
 
 Whole = Annotated[int, BeforeValidator(_whole)]
-Vector = Annotated[tuple[float, float, float], BeforeValidator(listed)]
-Brown = Annotated[tuple[float, float, float, float, float], BeforeValidator(_padded)]
+# Every number has a range in which products of several stay within single precision.
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Vector = Annotated[tuple[Coordinate, Coordinate, Coordinate], BeforeValidator(listed)]
+Brown = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(_padded)]
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
 Corner = Annotated[tuple[Bound, Bound, Bound], _repeated(3)]
-Size = Annotated[tuple[Annotated[float, Field(gt=0)], ...], _repeated(1), Field(min_length=1, max_length=3)]
-Scale = Annotated[tuple[float, float, float], _repeated(3)]
+Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], _repeated(1), Field(min_length=1, max_length=3)]
+Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], _repeated(3)]
 
 
 class Section(BaseModel):

@@ -29,7 +29,7 @@ class Target(Section):
     """shift in the world [m], the camera's frame if it has no pose"""
     reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = 0.5
     """Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file"""
-    reflectance_scale: float = Field(1.0, gt=0)
+    reflectance_scale: float = Field(1.0, ge=1e-9, le=1e9)
     """factor on a reflectance that is "from_file", the file's"""
     colour_encoding: Literal["srgb", "linear"] = "srgb"
     """how the file's colours and images stand for reflectance; "linear" is proportional"""

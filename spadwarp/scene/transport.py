@@ -27,9 +27,9 @@ class Transport(Section):
     """analog weight below which a photon ends; 0 is never"""
     max_collisions: Whole = Field(64, ge=1, le=2**31 - 1)
     """events of one photon at most, surfaces included; the light of the last one still counts"""
-    max_path: float | None = Field(None, gt=0)
+    max_path: float | None = Field(None, gt=0, le=1e12)
     """longest geometric path [m]; the gate's end if not given"""
-    lateral_limit: float = Field(math.inf, gt=0, allow_inf_nan=True)
+    lateral_limit: float = Field(math.inf, gt=0, le=math.inf, allow_inf_nan=True)
     """photons end where |x| or |y| in the camera frame reaches this [m]; inf is no limit"""
     axis_threshold: float = Field(0.9998, gt=0, le=1)
     """|u_z| from which the near-axis rule acts; 1 turns it off (exact)"""

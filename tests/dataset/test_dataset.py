@@ -323,13 +323,59 @@ def test_errors_of_recipes_name_each_field():
     with pytest.raises(spadwarp.ConfigError) as caught:
         Recipe.from_dict({**TABLES, **wrong})
     text = str(caught.value)
-    for words in ("pose.distance", "(0.0, inf)", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
+    for words in ("pose.distance", "[1e-9, 1e9]", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
         assert words in text
     with pytest.raises(spadwarp.ConfigError, match=r"scene: camera\.pixels"):
         Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
     for names in ({"test": ["boat"]}, {"test": ["car"], "validation": ["car"]}, {"builtin": ["boat"]}):
         with pytest.raises(spadwarp.ConfigError, match=r"targets\."):
             Plan(Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
+
+
+INF, NAN = math.inf, math.nan
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["pose.distance", "pose.shift", "pose.reflectance", "exposure.signal_photons", "frames.backscatter_fraction"],
+)
+@pytest.mark.parametrize(
+    "value",
+    [
+        NAN,
+        INF,
+        -INF,
+        [0.5, NAN],
+        [NAN, 0.5],
+        [0.5, INF],
+        {"low": NAN, "high": 1.0},
+        {"low": 0.1, "high": INF},
+        [0.5, 1e300],
+    ],
+    ids=repr,
+)
+def test_distributions_are_finite_whatever_the_order(field, value):
+    with pytest.raises(spadwarp.ConfigError) as caught:
+        Recipe.from_dict(TABLES).with_overrides({field: value})
+    assert str(caught.value).startswith(field)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "problem"),
+    [
+        ("medium.extinction", [0.1, NAN], "vary.medium.extinction holds"),
+        ("medium.extinction", [0.1, -1.0], "vary: medium.extinction = -1.0"),
+        ("medium.extinction", {"low": 0.1, "high": 1e7}, "vary: medium.extinction = 10000000.0"),
+        ("medium.extinction", {"low": 5e-324, "high": 1.0, "log": True}, "too far apart"),
+        ("laser.preset", ["lu2024", "none"], "vary: laser.preset = 'none'"),
+        ("x", 3, "vary: x is not a known section"),
+        ("medium.haze", 3, "vary: medium.haze is not a known field"),
+    ],
+)
+def test_what_varies_is_tried_when_the_recipe_is_read(field, value, problem):
+    with pytest.raises(spadwarp.ConfigError) as caught:
+        Recipe.from_dict({**TABLES, "vary": {field: value}})
+    assert problem in str(caught.value)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs/datasets").glob("*.toml")), ids=lambda path: path.stem)

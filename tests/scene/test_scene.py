@@ -1,15 +1,18 @@
 """Scenes: media, presets and overrides win in the promised order; errors name field, value and range."""
 
 import math
+import typing
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from helpers.minimal_scene import CAMERA, MINIMAL, problems, scene
+from spadwarp.dataset.recipe import Recipe
+from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.errors import ConfigError, FileError, SpadwarpError
-from spadwarp.scene import Camera, Domain, Laser, Medium, load_scene, parse_override, presets
+from spadwarp.scene import Camera, Domain, Laser, Medium, Scene, load_scene, messages, parse_override, presets
 from spadwarp.units import SPEED_OF_LIGHT
 
 coefficients = st.floats(1e-6, 1e3)
@@ -176,8 +179,8 @@ def test_overrides_that_name_no_field_are_refused(overrides):
         ("medium.albedo=none", "medium.albedo = 'none' (an override) is neither a number nor 'lu2024'"),
         ("transport.max_collisions=0", "transport.max_collisions = 0 (an override) is outside [1, 2147483647]"),
         ("transport.axis_threshold=0", "transport.axis_threshold = 0 (an override) is outside (0, 1]"),
-        ("transport.max_path=inf", "transport.max_path = inf (an override) is outside (0, inf)"),
-        ("transport.lateral_limit=nan", "transport.lateral_limit = nan (an override) is outside (0, inf)"),
+        ("transport.max_path=inf", "transport.max_path = inf (an override) is outside (0, 1e12]"),
+        ("transport.lateral_limit=nan", "transport.lateral_limit = nan (an override) is outside (0, inf]"),
         ("transport.seed=-1", "transport.seed = -1 (an override) is outside [0, 18446744073709551615]"),
         ("camera.width=3.5", "camera.width = 3.5 (an override) is not an integer"),
         ("camera.width=true", "camera.width = True (an override) is not an integer"),
@@ -185,7 +188,7 @@ def test_overrides_that_name_no_field_are_refused(overrides):
         ("laser.position=[1, 2]", "laser.position = [1, 2] has the wrong number of values"),
         ("laser.direction=[0, 0, 'up']", "laser.direction[2] = 'up' (an override) is not a number"),
         ("laser.direction=[0, 0, 0]", "laser.direction = [0.0, 0.0, 0.0] has no length"),
-        ("targets[0].size=[-1]", "targets[0].size[0] = -1 (an override) is outside (0, inf)"),
+        ("targets[0].size=[-1]", "targets[0].size[0] = -1 (an override) is outside [1e-9, 1e9]"),
         ("targets[0].reflectance=2", "targets[0].reflectance = 2 (an override) is outside [0, 1]"),
         ("medium=3", "medium = 3 (an override) is not a table"),
         ("targets=3", "targets = 3 (an override) is not a list"),
@@ -217,7 +220,7 @@ LENS = {"width": 8, "height": 6, "focal_length": 0.05, "pixel_pitch_um": 100.0, 
     ("section", "fields", "message"),
     [
         ("medium", {"absorption": 0.4, "extinction": 0.3}, "absorption = 0.4 is outside [0, 0.3], 0.3 being the ext"),
-        ("medium", {"absorption": 0.0, "scattering": 0.0}, "extinction = 0.0 is outside (0, inf)"),
+        ("medium", {"absorption": 0.0, "scattering": 0.0}, "extinction = 0.0 is outside [1e-12, 1e6]"),
         ("medium", {"absorption": 0.1, "albedo": 1.0}, "albedo = 1.0 leaves the extinction undetermined"),
         ("medium", {"absorption": 0.1, "albedo": "lu2024"}, "albedo = 'lu2024' goes with extinction only"),
         (
@@ -366,3 +369,30 @@ def test_a_later_layer_gives_the_camera_in_another_way(tmp_path):
 
 def test_an_older_word_beside_the_word_for_it_now_is_refused():
     assert problems({"detector": {"fold": True, "wrap": True}})[0].startswith("detector.fold is not a known field")
+
+
+def number_fields(model, path=""):
+    """Every field that takes numbers, with its range."""
+    for name, info in model.model_fields.items():
+        inner = [one for one in kinds(info.annotation) if isinstance(one, type) and issubclass(one, BaseModel)]
+        for one in inner:
+            yield from number_fields(one, f"{path}{name}.")
+        if {int, float} & kinds(info.annotation) and not inner:
+            yield pytest.param(info, id=f"{path}{name}")
+
+
+def kinds(annotation):
+    inner = typing.get_args(annotation)
+    return set().union(*map(kinds, inner)) if inner else {annotation}
+
+
+# Fields that document infinity.
+INFINITE = {"focus_distance", "distance", "lower", "upper", "lateral_limit"}
+
+
+@pytest.mark.parametrize("info", [*number_fields(Scene), *number_fields(Recipe), *number_fields(TrainingRecipe)])
+def test_every_number_has_a_range(info, request):
+    name = request.node.callspec.id.rpartition(".")[2]
+    bounds = {type(one).__name__ for one in messages._bounds(info)} & {"Ge", "Gt", "Le", "Lt"}
+    assert any(one in bounds for one in ("Ge", "Gt")) and any(one in bounds for one in ("Le", "Lt"))
+    assert ("inf" in messages._interval(info)) == (name in INFINITE)
