@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.hdf5_heap import heap_problem
 from spadwarp.io.parsing import parse_json
 from spadwarp.limits import check_integer, check_real
 
@@ -91,13 +92,18 @@ class Hdf5File:
 
     def attribute(self, name: str, default: Any = _REQUIRED, *, of: str = "/") -> Any:
         """An attribute of the file, or of a dataset in it: text, a number, an array; `default` where it is missing."""
-        from h5py import h5a
+        from h5py import h5a, h5t
 
         with _damage(f"{self.path}: {name}"):
             place = self._object(of)
             if not h5a.exists(place.id, name.encode()):
                 return self.refuse(name, "is missing") if default is _REQUIRED else default
             stored = h5a.open(place.id, name.encode())
+            kind = stored.get_type().get_class()
+            if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM, h5t.STRING):
+                self.refuse(name, "is neither text nor numbers")
+            if kind == h5t.STRING:
+                self._check_text(name)
             if math.prod(stored.shape) * max(stored.dtype.itemsize, 1) > _LARGEST_ATTRIBUTE:
                 self.refuse(name, f"is an attribute of shape {stored.shape}, which is too large")
             return place.attrs[name]
@@ -166,6 +172,7 @@ class Hdf5File:
             if not isinstance(found, h5py.Dataset):
                 self.refuse(name, "is not text")
             _check_storage(found, lambda problem: self.refuse(name, problem))
+            self._check_text(name)
             if h5py.check_string_dtype(found.dtype) is None or found.shape != ():
                 self.refuse(name, f"is {found.dtype} {found.shape}; one text is needed")
             _check_size(found, lambda problem: self.refuse(name, problem))
@@ -208,6 +215,10 @@ class Hdf5File:
                 self.refuse(name, "is a link; only what is in the file itself is read")
             place = place[part] if part else place
         return place
+
+    def _check_text(self, name: str) -> None:
+        if (problem := heap_problem(self.path)) is not None:
+            raise FileError(f"{self.path}: damaged: the file {problem}, so that {name} cannot be read")
 
     @contextmanager
     def _whole(self, name: str) -> Iterator[None]:

@@ -1,0 +1,81 @@
+"""HDF5 files that make the library that reads them hang or crash are refused before it reads them."""
+
+import struct
+
+import h5py
+import numpy as np
+import pytest
+
+from spadwarp.errors import FileError
+from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
+from spadwarp.io.hdf5_heap import heap_problem
+
+
+@pytest.fixture
+def path(tmp_path):
+    with write_hdf5(tmp_path / "file.h5") as file:
+        file.attrs["format"] = "a format"
+        file["text"] = "a text " * 1000
+        file["numbers"] = np.arange(10_000)
+    return tmp_path / "file.h5"
+
+
+def collections(content):
+    """Where texts of any length lie."""
+    place = content.find(b"GCOL")
+    while place >= 0:
+        yield place
+        place = content.find(b"GCOL", place + 1)
+
+
+@pytest.mark.parametrize("size", [2**64 - 16, 2**64 - 1, 2**63, 1 << 20, 4096])
+def test_texts_whose_sizes_do_not_fit_are_refused(path, size):
+    """HDF5 follows such sizes for ever."""
+    assert hdf5_format(path) == "a format" and heap_problem(path) is None
+    content = path.read_bytes()
+    for place in collections(content):
+        changed = bytearray(content)
+        struct.pack_into("<Q", changed, place + 24, size)  # of the first object
+        path.write_bytes(changed)
+        with pytest.raises(FileError, match=r"file\.h5: damaged: the file has damaged text"):
+            hdf5_format(path)
+
+
+def test_free_space_of_no_size_is_refused(path):
+    content = bytearray(path.read_bytes())
+    place = next(collections(content))
+    struct.pack_into("<HxxxxxxQ", content, place + 16, 0, 0)
+    path.write_bytes(content)
+    with pytest.raises(FileError, match="damaged text"):
+        hdf5_format(path)
+
+
+def test_letters_that_only_look_like_a_text_do_no_harm(tmp_path):
+    numbers = np.frombuffer(b"GCOL\0\0\0\0" * 100 + b"\x89HDF\r\n\x1a\n", np.int64)
+    with write_hdf5(tmp_path / "file.h5") as file:
+        file["numbers"] = numbers
+        file.attrs["format"] = "a format"
+    with read_hdf5(tmp_path / "file.h5", "a format") as file:
+        np.testing.assert_array_equal(file.array("numbers", np.int64, (None,)), numbers)
+
+
+def test_attributes_are_text_or_numbers(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs.create("list", np.array([np.arange(3)], object), dtype=h5py.vlen_dtype(np.int32))
+        file.attrs.create("place", file["text"].ref, dtype=h5py.ref_dtype)
+        file.attrs.create("pair", np.zeros((), "i4,f4"))
+        file.attrs["many"] = np.zeros(8000)
+        file.attrs["flag"] = True
+    with read_hdf5(path) as file:
+        assert file.flag("flag") and file.attribute("many").shape == (8000,)
+        for name in ("list", "place", "pair"):
+            with pytest.raises(FileError, match=f"{name} is neither text nor numbers"):
+                file.attribute(name)
+
+
+def test_a_file_that_grows_is_looked_at_again(path):
+    assert heap_problem(path) is None
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<Q", content, next(collections(content)) + 8, 2**40)
+    path.write_bytes(content + b"\0")
+    assert "damaged text" in heap_problem(path)
