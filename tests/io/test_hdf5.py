@@ -60,8 +60,10 @@ def test_letters_that_only_look_like_a_text_do_no_harm(tmp_path):
 
 
 def test_attributes_are_text_or_numbers(path):
+    ragged = np.empty(1, object)
+    ragged[0] = np.arange(3, dtype=np.int32)
     with h5py.File(path, "r+") as file:
-        file.attrs.create("list", np.array([np.arange(3)], object), dtype=h5py.vlen_dtype(np.int32))
+        file.attrs.create("list", ragged, dtype=h5py.vlen_dtype(np.int32))
         file.attrs.create("place", file["text"].ref, dtype=h5py.ref_dtype)
         file.attrs.create("pair", np.zeros((), "i4,f4"))
         file.attrs["many"] = np.zeros(8000)
