@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import typer
 
 import spadwarp
+from spadwarp.cli import _measured as measured
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, say
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
 
 
 @app.command()
@@ -20,7 +21,7 @@ def denoise(
         typer.Argument(
             metavar="IN",
             help="A result, frames, an analytic file, a dataset or a shard (.h5, or their directory), depth (.exr, "
-            ".npy, .mat), measured histograms (.npy, .mat, .ptu), or a folder of them.",
+            ".npy, .mat), measured histograms (.npy, .mat, .h5, .ptu), or a folder of them.",
             show_default=False,
         ),
     ],
@@ -48,33 +49,16 @@ def denoise(
     scale: Annotated[
         float, typer.Option(parser=opt.real_number, metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")
     ] = 1.0,
-    variable: Annotated[str | None, typer.Option(metavar="NAME", help="Array in a .mat file.")] = None,
-    bin_width_ps: Annotated[
-        float | None,
-        typer.Option(
-            parser=opt.in_unit("ps"), metavar="PS", help="Width of a bin; for measured histograms other than .ptu."
-        ),
-    ] = None,
-    gate_start_ns: Annotated[
-        float | None,
-        typer.Option(
-            parser=opt.in_unit("ns"), metavar="NS", help="Time of flight at the start of bin 0 of measured histograms."
-        ),
-    ] = None,
-    group_index: Annotated[
-        float | None,
-        typer.Option(
-            parser=opt.real_number,
-            metavar="N",
-            help="1 in air, 1.3566 in fresh water, 1.3638 in seawater; for measured histograms.",
-        ),
-    ] = None,
-    irf_fwhm_ps: Annotated[
-        float | None,
-        typer.Option(
-            parser=opt.in_unit("ps"), metavar="PS", help="Width of the instrument response of measured histograms."
-        ),
-    ] = None,
+    dataset: measured.Dataset = None,
+    axes: measured.Axes = None,
+    image_size: measured.ImageSize = None,
+    tag_unit_ps: measured.TagUnit = None,
+    bin_width_ps: measured.BinWidth = None,
+    gate_start_ns: measured.GateStart = None,
+    sum_frames: measured.SumFrames = False,
+    group_index: measured.GroupIndex = None,
+    irf_fwhm_ps: measured.IrfFwhm = None,
+    irf: measured.Irf = None,
     device: opt.TorchDevice = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -103,8 +87,11 @@ def denoise(
     given = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     names = [f"{stem}.{ending}" for stem in stems for ending in ("npy", "exr", "png")]
     needed = sum(one.stat().st_size for one in paths if one.is_file())
-    options: dict[str, Any] = {"inputs": (*paths, profile, weights), "overwrite": overwrite, "needed": needed}
+    options: dict[str, Any] = {"inputs": (*paths, profile, weights, irf), "overwrite": overwrite, "needed": needed}
     outputs = opt.check_outputs(out, names, json=json_path, **options)
+    facts = measured.facts(
+        dataset, axes, image_size, tag_unit_ps, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf, sum_frames
+    )
     lines, summary, failed = {}, [], 0
     for number, one in enumerate(paths, 1):
         try:
@@ -119,13 +106,10 @@ def denoise(
                 as_depth=depth,
                 channel=channel,
                 scale=scale,
-                variable=variable,
-                bin_width_ps=bin_width_ps,
-                gate_start_ns=gate_start_ns,
                 group_index=group_index,
-                irf_fwhm_ps=irf_fwhm_ps,
+                **facts,
             )
-        except (ConfigError, FileError) as error:
+        except (ConfigError, FileError, ArgumentError) as error:
             if len(paths) == 1:
                 raise
             complain(f"error: {error}" if isinstance(error, FileError) else f"error: {one}: {error}")

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.inference import denoise_frames, features_of_histograms, weights_metadata
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.files import gate_of, holds_own_file, load, locate, stored_depth
+from spadwarp.files import gate_of, holds_own_file, is_own_file, load, locate, stored_depth
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.estimators import Method
-from spadwarp.frames.measured import Histograms, read_array, read_histograms
-from spadwarp.frames.response import instrument_response
+from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.paths import existing_file
@@ -29,7 +28,7 @@ from spadwarp.viz import draw_denoised
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
 
-ENDINGS = (".h5", ".exr", ".npy", ".mat", ".ptu")
+ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
 
 _EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
 
@@ -150,30 +149,27 @@ def read_depth(
     as_depth: bool = False,
     channel: str | None = None,
     scale: float = 1.0,
-    variable: str | None = None,
     method: Method | None = None,
-    bin_width_ps: float | None = None,
-    gate_start_ns: float | None = None,
     group_index: float | None = None,
-    irf_fwhm_ps: float | None = None,
     device: str | None = None,
+    **measured: Any,
 ) -> DepthReading:
     """Depth from a file.
 
     `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
-    depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or histograms `[H, W, T]`, `[N, H, W, T]`. `.ptu`:
-    histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
+    depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or histograms, see
+    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
 
     Args:
         path: The file.
         as_depth: Three dimensions in `.npy` and `.mat` are frames `[N, H, W]` of depth, not a histogram.
         channel: Of an EXR; default: the first of Z, depth, range, A that it has.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
-        variable: Array of a `.mat`.
         method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
             where the response is not known.
-        bin_width_ps, gate_start_ns, group_index, irf_fwhm_ps: Of measured histograms, see `depth_of`.
+        group_index: Of measured histograms, see `depth_of`.
         device: Warp device of the estimator.
+        measured: What a file of measured histograms does not say, as `read_histograms` takes it.
 
     Raises:
         FileError: No such file, not readable, or without depth.
@@ -184,36 +180,29 @@ def read_depth(
         raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ArgumentError(f"scale = {scale} is outside (0, inf)")
-    if place.is_dir() or place.suffix.lower() == ".h5":
+    if is_own_file(place):
         held = load(place)
         own = stored_depth(held)
         if own is not None:
             frames = own.values.astype(np.float32)
             return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is")
-    stored = _stored_depth(place, channel, variable, as_depth)
+    stored = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if stored is not None:
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
+        if given := [name.replace("_", " ") for name in measured if name != "dataset"]:
+            raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
         depth = stored.astype(np.float32)
         below = np.count_nonzero(depth < 0)
         depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
         frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
         source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = read_histograms(place, variable=variable)
-    if histograms.scene is None:
-        changes: dict[str, Any] = {}
-        if bin_width_ps is not None:
-            changes["bin_width"] = 1e-12 * bin_width_ps
-        if gate_start_ns is not None:
-            changes["gate_start"] = 1e-9 * gate_start_ns
-        if irf_fwhm_ps is not None:
-            changes["irf"] = changes["response"] = instrument_response(pulse_fwhm=0.0, jitter_fwhm=1e-12 * irf_fwhm_ps)
-        histograms = dataclasses.replace(histograms, **changes)
+    histograms = read_histograms(place, **measured)
     return _estimate_depth(histograms, method, group_index, device)
 
 
-def _stored_depth(path: Path, channel: str | None, variable: str | None, as_depth: bool) -> NDArray[Any] | None:
+def _stored_depth(path: Path, channel: str | None, dataset: str | None, as_depth: bool) -> NDArray[Any] | None:
     """Depth `[H, W]` or `[N, H, W]` as the file has it; None for histograms."""
     ending = path.suffix.lower()
     if ending == ".exr":
@@ -223,15 +212,7 @@ def _stored_depth(path: Path, channel: str | None, variable: str | None, as_dept
         if found is None:
             raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
         return found
-    if ending not in (".npy", ".mat"):
-        return None
-    try:
-        array = read_array(path, variable, dimensions=(2, 3, 4))
-    except FileError:
-        raise
-    except Exception as error:  # what a reader raises depends on the format
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
-    return array if array.ndim == 2 or (as_depth and array.ndim == 3) else None
+    return stored_images(path, dataset, several=as_depth)
 
 
 def _estimate_depth(
@@ -256,7 +237,7 @@ def _estimate_depth(
         frames=reduced.frames > 1,
         gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
         profile=_profile(histograms),
-        source=f"{reduced.quantity} by {method} from histograms",
+        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes]),
         histograms=histograms if counted else None,
     )
 

@@ -2,7 +2,8 @@
 
 from spadwarp.files.depth import gate_of, stored_depth
 from spadwarp.files.describe import summary
-from spadwarp.files.loader import Held, holds_own_file, load, locate
+from spadwarp.files.loader import Held, holds_own_file, is_own_file, load, locate
 from spadwarp.files.sequences import open_source, sequence
 
-__all__ = ["Held", "gate_of", "holds_own_file", "load", "locate", "open_source", "sequence", "stored_depth", "summary"]
+__all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "open_source", "sequence"]
+__all__ += ["stored_depth", "summary"]

@@ -15,7 +15,7 @@ from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
 from spadwarp.transport import PhotonRecords, load_records
 
-__all__ = ["Held", "holds_own_file", "load", "locate"]
+__all__ = ["Held", "holds_own_file", "is_own_file", "load", "locate"]
 
 Held = Result | FramesFile | AnalyticFile | FrameReader | PhotonRecords
 """What a file of ours holds."""
@@ -73,3 +73,15 @@ def locate(path: str | os.PathLike[str]) -> Path:
 def holds_own_file(folder: str | os.PathLike[str]) -> bool:
     """Whether a directory is that of a run, of frames, of an analytic file or of a dataset."""
     return any((Path(folder) / name).is_file() for name in (*_NAMES, _DATASET, _CHECKPOINT))
+
+
+def is_own_file(place: Path) -> bool:
+    """Whether a path from `locate` is a dataset's folder, or an HDF5 file that spadwarp wrote; raises `FileError` for a
+    damaged one."""
+    if place.is_dir():
+        return True
+    if place.suffix.lower() not in (".h5", ".hdf5"):
+        return False
+    with read_hdf5(place) as file:
+        kind = file.attribute("format", None)
+        return file.attribute("shard", None) is not None or (isinstance(kind, str) and kind.startswith("spadwarp"))

@@ -10,7 +10,13 @@ from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.pile_up import coates, first_photon_probabilities
 from spadwarp.frames.record import FrameErrors, Recording, record_frames
-from spadwarp.frames.response import InstrumentResponse, detector_response, instrument_response, response_matrix
+from spadwarp.frames.response import (
+    InstrumentResponse,
+    detector_response,
+    instrument_response,
+    read_response,
+    response_matrix,
+)
 from spadwarp.frames.spad import detect
 
 __all__ = [
@@ -38,6 +44,7 @@ __all__ = [
     "is_frames_file",
     "monte_carlo_noise",
     "read_histograms",
+    "read_response",
     "record_frames",
     "response_matrix",
     "to_xarray",

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.parsing import read_columns
+from spadwarp.io.npy import read_npy
+from spadwarp.io.parsing import read_columns, read_text
 from spadwarp.io.paths import file_problem
 from spadwarp.limits import check_real, shown
 
@@ -25,6 +26,7 @@ __all__ = [
     "SparseResponse",
     "detector_response",
     "instrument_response",
+    "read_response",
     "response_matrix",
 ]
 
@@ -268,6 +270,36 @@ def _read_csv(path: Path) -> InstrumentResponse:
         return InstrumentResponse(times=times * 1e-12, values=values)
     except ValueError as error:
         raise ArgumentError(f"{path}: {error}") from None
+
+
+def read_response(path: str | Path, *, bin_width: float | None = None) -> InstrumentResponse:
+    """A measured response from a file.
+
+    Args:
+        path: `.csv` of time_ps and value, whose time 0 is the arrival of the photon; or `.csv` or `.npy` of one value
+            for each bin, whose mean is taken for that time.
+        bin_width: Of these bins [s].
+
+    Raises:
+        ArgumentError: No such file, not a response, or values of bins without their width.
+    """
+    place = Path(path)
+    try:
+        if place.suffix.lower() == ".npy":
+            values = read_npy(place, largest=1 << 20).astype(np.float64)
+        elif any("," in line for line in read_text(place).splitlines() if not line.lstrip().startswith("#")):
+            return _read_csv(place)
+        else:
+            values = read_columns(place, {"value": "[0, 1e30]"})[:, 0]
+    except (ConfigError, FileError) as error:
+        raise ArgumentError(str(error)) from None
+    if values.ndim != 1 or values.size < 2 or not (np.isfinite(values).all() and values.min() >= 0 and values.any()):
+        raise ArgumentError(f"{path}: {values.shape} is not a response: two values or more, not negative, not all 0")
+    if bin_width is None:
+        raise ArgumentError(f"bin width is missing (--bin-width-ps): {path} has a value for each bin")
+    values = np.concatenate([[0.0], values, [0.0]])  # between its bins linear, to 0 on either side
+    centres = np.arange(values.size) - float(values @ np.arange(values.size)) / float(values.sum())
+    return InstrumentResponse(times=centres * bin_width, values=values)
 
 
 class SparseResponse(NamedTuple):

@@ -27,6 +27,7 @@ _DEFLATE, _SMALL = 1100, 1 << 16  # gzip makes data smaller by no more than this
 _LARGEST_ATTRIBUTE = 1 << 20  # bytes
 _LARGEST_CHUNK = 1 << 26  # bytes that may be larger than the array itself
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32"}
+_MOST_ARRAYS, _DEEPEST = 10_000, 32  # that are listed; groups in each other
 _REQUIRED: Any = object()
 
 
@@ -87,6 +88,43 @@ class Hdf5File:
                 return []
             found = self._object(group)
             return list(found) if isinstance(found, h5py.Group) else self.refuse(group, "is not a group")
+
+    def arrays(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+        """Shape and dtype of the arrays in the file and its groups, by name; links are passed over."""
+        import h5py
+
+        found: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
+        left = [""]
+        while left and len(found) < _MOST_ARRAYS:
+            group = left.pop()
+            with _damage(f"{self.path}: {group or '/'}"):
+                place = self._file[group] if group else self._file
+                for name in place:
+                    if not isinstance(place.get(name, getlink=True), h5py.HardLink):
+                        continue
+                    item, full = place[name], f"{group}/{name}".lstrip("/")
+                    if isinstance(item, h5py.Group) and full.count("/") < _DEEPEST:
+                        left.append(full)
+                    elif isinstance(item, h5py.Dataset) and item.shape is not None:
+                        found[full] = item.shape, item.dtype
+        return found
+
+    def referenced(self, name: str) -> NDArray[Any]:
+        """The arrays to which a dataset of references refers, as cells of MATLAB do: an object array of one dimension,
+        each of its arrays flat; empty where MATLAB marks it so."""
+        import h5py
+
+        references = self.array(name, h5py.ref_dtype, (None,) * len(self._object(name).shape)).ravel()
+        cells = np.empty(references.size, object)
+        with _damage(f"{self.path}: {name}"):
+            for index, reference in enumerate(references):
+                item = self._file[reference]
+                if not isinstance(item, h5py.Dataset):
+                    self.refuse(name, "refers to what is no array")
+                _check_storage(item, lambda problem: self.refuse(name, problem))
+                _check_size(item, lambda problem: self.refuse(name, problem))
+                cells[index] = np.empty(0) if "MATLAB_empty" in item.attrs else np.ravel(item[...])
+        return cells
 
     # Attributes
 
