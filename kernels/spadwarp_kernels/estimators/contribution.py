@@ -122,6 +122,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.path = s.path
                 if wp.static(flights):
                     q.lens = s.flight.lens  # that of the flight; others draw one from `first`
+                    q.weight *= s.flight.lens_weight
                 q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
                 q.rounding_sample = s.flight.block[2]  # of the azimuth to come

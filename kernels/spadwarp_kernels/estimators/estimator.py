@@ -15,11 +15,13 @@ class FlightPlan:
     Attributes:
         block: Random words of the sample.
         lens: The point of the lens that the flight is scored through [m].
+        lens_weight: Its density if it were uniform, over that of the draw.
         interval: The part of the flight that is to be scored, unless a surface stands before it [m]; empty for none.
     """
 
     block: wp.vec4ui
     lens: wp.vec3
+    lens_weight: float
     interval: wp.vec2
 
 

@@ -7,10 +7,11 @@ import functools
 
 import warp as wp
 
-from spadwarp_kernels.math.rotations import cotangent
+from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.phase.phase_function import PhaseGuide
+from spadwarp_kernels.sensor.camera import Camera, lens_point
 
 
 @wp.struct
@@ -21,6 +22,37 @@ class FlightSample:
     s: float
     r: float
     density: float
+
+
+@wp.struct
+class LensSample:
+    """A point of the lens [m]; its density if it were uniform, over that of the draw."""
+
+    point: wp.vec3
+    weight: float
+
+
+@wp.func
+def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
+    """A point of the lens through which the flight x + s u is scored.
+
+    The score goes with 1/D, D its distance from the flight's line. Where this passes the lens, the point is drawn with
+    that density, uniform in angle and distance about the place: even draws would have no finite variance.
+    """
+    sample = LensSample()
+    sample.point = lens_point(camera, xi1, xi2)
+    sample.weight = 1.0
+    s = -x[2] / u[2]
+    p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
+    radius2 = camera.aperture_radius * camera.aperture_radius
+    if wp.dot(p, p) < radius2:
+        turn = cos_sin_turn(xi2)
+        aside = p[0] * turn[1] - p[1] * turn[0]
+        to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
+        distance = xi1 * to_rim
+        sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
+        sample.weight = 2.0 * to_rim * distance / radius2
+    return sample
 
 
 @wp.func

@@ -28,6 +28,7 @@ from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
 
 from .contribution import Request, make_event_request, make_score
 from .estimator import Direction, Estimator, FlightPlan
+from .flight_sampling import sample_lens
 
 
 def make_guided(spec: TransportSpec) -> Estimator:
@@ -46,7 +47,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
 def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     view_of = spec.lens.view
-    layered, bounded = spec.layered, spec.bounded
+    layered, bounded, has_phase_guide = spec.layered, spec.bounded, spec.phase.guide is not None
     to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
 
     @wp.func
@@ -55,7 +56,14 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     ) -> FlightPlan:
         plan = FlightPlan()
         plan.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-        plan.lens = lens_point(camera, u01(plan.block[2]), u01(plan.block[3]))
+        if wp.static(has_phase_guide):
+            # The direction was drawn for this point, see `make_direct`.
+            plan.lens = lens_point(camera, u01(plan.block[2]), u01(plan.block[3]))
+            plan.lens_weight = 1.0
+        else:
+            lens = sample_lens(camera, s.x, s.u, u01(plan.block[2]), u01(plan.block[3]))
+            plan.lens = lens.point
+            plan.lens_weight = lens.weight
         limit = limits.max_path - s.path
         if wp.static(bounded):
             limit = wp.min(limit, to_exit(limits, s.x, s.u))
@@ -78,7 +86,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.wanted = True
         q.x = s.x
         q.u = s.u
-        q.weight = wp.where(wp.static(local_albedo), s.weight.value, s.weight.value * s.albedo)
+        q.weight = s.flight.lens_weight * wp.where(wp.static(local_albedo), s.weight.value, s.weight.value * s.albedo)
         q.path = s.path
         q.lens = s.flight.lens
         q.interval = s.flight.interval

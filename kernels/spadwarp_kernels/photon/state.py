@@ -67,6 +67,7 @@ class Flight:
         reach: How far to look for surfaces [m].
         interval: The part that an estimator wants to score [m]; empty for none.
         lens: The point of the lens by which the flight, or its end, is scored [m].
+        lens_weight: Its density if it were uniform, over that of the draw.
     """
 
     block: wp.vec4ui
@@ -75,6 +76,7 @@ class Flight:
     reach: float
     interval: wp.vec2
     lens: wp.vec3
+    lens_weight: float
 
 
 @wp.func

@@ -46,6 +46,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Functio
             plan = plan_flight(s, medium, camera, gate, limits, keys, id)
             f.sample_block = plan.block
             f.lens = plan.lens
+            f.lens_weight = plan.lens_weight
             f.interval = plan.interval
             if is_planned(f):
                 f.reach = wp.max(f.reach, f.interval[1])

@@ -7,9 +7,10 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import Floats, launched
+from helpers.launch import Floats, Vectors, launched
 from spadwarp_kernels import (
     TABULATED,
+    Camera,
     Medium,
     fournier_forand_density,
     make_phase_tables,
@@ -18,6 +19,7 @@ from spadwarp_kernels import (
     u01_fine,
 )
 from spadwarp_kernels.estimators import make_sample_flight
+from spadwarp_kernels.estimators.flight_sampling import sample_lens
 from spadwarp_kernels.phase import HENYEY_GREENSTEIN_GUIDE
 
 G = 0.924
@@ -142,3 +144,35 @@ def test_flight_samples_follow_their_density(law, flight, device):
     wide = np.diff(edges) > 64 * np.spacing(np.float32(max(s1, 5.0)))  # narrower parts are a few grid points wide
     counts = np.histogram(s, bins=edges)[0][wide]
     assert stats.chisquare(counts, np.full(counts.size, counts.sum() / counts.size)).pvalue > 1e-5
+
+
+@wp.kernel(enable_backward=False)
+def _lens_points(camera: Camera, x: wp.vec3, u: wp.vec3, point: Vectors, weight: Floats):
+    i = wp.tid()
+    block = random_block(wp.uint64(3), wp.uint64(i), wp.uint32(0), wp.uint32(4))
+    sample = sample_lens(camera, x, u, u01(block[0]), u01(block[1]))
+    point[i] = sample.point
+    weight[i] = sample.weight
+
+
+@pytest.mark.parametrize("passes", [(0.0, 0.0), (0.15, 0.05), (0.0, -0.199), (0.3, 0.0)])
+def test_lens_points_are_even_but_for_their_weight(passes, device):
+    """Means over an even disc of radius 0.2; where the flight passes the disc, the score's 1/D is bounded."""
+    camera, radius = Camera(), 0.2
+    camera.aperture_radius = radius
+    u = np.array([0.3, -0.2, -0.9])
+    u /= np.linalg.norm(u)
+    place = np.array([*passes, 0.0])
+    x = place - 2.0 * u
+    point, weight = launched(_lens_points, [camera, wp.vec3(*x), wp.vec3(*u)], [wp.vec3, float], device, 400_000)
+    a, b = point[:, 0] / radius, point[:, 1] / radius
+    assert (a**2 + b**2 < 1 + 1e-4).all() and not point[:, 2].any()
+    expected = {"1": 1.0, "a": 0.0, "b": 0.0, "a*a": 0.25, "b*b": 0.25, "a*b": 0.0, "(a*a + b*b)**2": 1 / 3}
+    for term, mean in expected.items():
+        values = weight * eval(term)
+        assert values.mean() == pytest.approx(mean, abs=4.5 * values.std() / math.sqrt(values.size) + 1e-6), term
+    away = np.linalg.norm(np.cross(point - place, u), axis=1)
+    if np.hypot(*passes) < radius:
+        assert (weight < 1.001 * 4 * away / abs(u[2]) / radius + 1e-4).all()
+    else:
+        assert (weight == 1.0).all()
