@@ -16,6 +16,7 @@ from spadwarp.analytic.pilot import Pilot, measure, trace, window
 from spadwarp.device import pick_device
 from spadwarp.frames import Method, detector_response
 from spadwarp.frames.response import FWHM_PER_SIGMA
+from spadwarp.units import range_from_time
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -193,7 +194,8 @@ def _limit(scene: Scene, pilot: Pilot, terms: dict[str, float], pulses: int, met
     if largest == "background":
         return "backscatter" if pilot.backscatter >= pilot.noise else "dark counts and ambient light"
     if largest == "forward scattering" and pilot.unscattered_floor[method] > 0.7 * pilot.floor[method]:
-        return "pixel size"
+        bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
+        return "bin width" if pilot.floor[method] <= bin_range else "pixel size"
     if largest == "shot noise" and pulses * pilot.peak > _MANY_PHOTONS:
         widths = {
             "jitter": scene.detector.jitter_fwhm_ps,
@@ -213,7 +215,7 @@ _ADVICE = {
     "only by their root",
     "pulse duration": "a shorter pulse: the error is proportional to the width of the response, while photons act only "
     "by their root",
-    "bin width": "narrower bins: gate.bin_width_ps is wider than pulse and jitter",
+    "bin width": "narrower bins, gate.bin_width_ps: where light is within a bin is not known",
     "backscatter": "a gate that begins closer to the target, more distance between laser and lens, a narrower view",
     "dark counts and ambient light": "a shorter gate, a narrower spectral filter, a cooler or quieter detector",
     "forward scattering": "a shorter distance, clearer water, a narrower beam or view; more pulses do not help",

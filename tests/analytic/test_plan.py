@@ -98,6 +98,11 @@ def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
     assert hopeless.terms["total"] < 1.1 * hopeless.terms["forward scattering"]
 
 
+def test_coarse_bins_are_the_limit_of_coarse_bins():
+    coarse = proposal(make(medium={"extinction": 0.05, "albedo": 0.2}, gate={"bin_width_ps": 1000.0}))
+    assert coarse.limit == "bin width" and "bin_width_ps" in coarse.advice and not coarse.reached
+
+
 def test_a_rate_that_would_fold_is_lowered():
     fast = proposal(make(laser={"repetition_rate": 50e6}))
     assert fast.scene.laser.repetition_rate <= fast.largest_rate < 50e6
