@@ -1,25 +1,19 @@
-"""MATLAB files, versions 5 and 7.3: what they hold, and dense arrays, sparse matrices and cells of numbers in them."""
+"""MATLAB files, versions 4 to 7.3: what they hold, and dense arrays, sparse matrices and cells of numbers in them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.io.mat5 import Kind, open_variables
 
 __all__ = ["MatEntry", "SparseMatrix", "mat_entries", "read_mat"]
-
-Kind = Literal["dense", "sparse", "cell"]
-
-_NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
-_KINDS: dict[str, Kind] = {"sparse": "sparse", "cell": "cell", **dict.fromkeys(_NUMERIC, "dense")}
 
 
 class MatEntry(NamedTuple):
@@ -43,11 +37,8 @@ def mat_entries(path: Path) -> dict[str, MatEntry]:
     if _is_hdf5(path):
         with read_hdf5(path) as file:
             return dict(_hdf5_entries(file))
-    from scipy.io import whosmat
-
-    with _reading(path):
-        found = whosmat(path)
-    return {name: MatEntry(_KINDS[kind], tuple(shape)) for name, shape, kind in found if kind in _KINDS}
+    with open_variables(path) as found:
+        return {name: MatEntry(variable.kind, variable.shape) for name, variable in found.items()}
 
 
 def read_mat(path: Path, name: str, entry: MatEntry) -> NDArray[Any] | SparseMatrix:
@@ -55,36 +46,15 @@ def read_mat(path: Path, name: str, entry: MatEntry) -> NDArray[Any] | SparseMat
     dimension each. Raises `FileError`."""
     if _is_hdf5(path):
         return _read_hdf5(path, name, entry)
-    from scipy.io import loadmat
-
-    with _reading(path):
-        value = loadmat(path, variable_names=[name], spmatrix=False)[name]
-    if entry.kind == "sparse":
-        found = value.tocoo()
-        return SparseMatrix(value.shape, found.row.astype(np.int64), found.col.astype(np.int64), found.data)
-    if entry.kind == "cell":
-        cells = np.empty(value.shape, object)
-        for index, cell in enumerate(value.flat):
-            cells.flat[index] = np.ravel(cell)
-        return cells
-    return np.asarray(value)
+    with open_variables(path) as found:
+        value = found[name].read()
+    return SparseMatrix((entry.shape[0], entry.shape[1]), *value) if entry.kind == "sparse" else value
 
 
 def _is_hdf5(path: Path) -> bool:
     import h5py
 
     return h5py.is_hdf5(path)
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Errors of scipy, whose kinds depend on where a file is damaged, become a `FileError`."""
-    try:
-        yield
-    except (SpadwarpError, MemoryError):
-        raise
-    except Exception as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
 # Version 7.3, which is HDF5: dimensions are reversed, cells are references, sparse matrices groups

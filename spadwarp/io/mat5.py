@@ -1,0 +1,195 @@
+"""MATLAB files of versions 4 and 5: arrays, sparse matrices and cells of numbers.
+
+SciPy's reader follows types and sizes of a damaged file into memory that is not its own; here they are compared with
+the file first, and what remains is a view of its bytes. Layout: MATLAB, "MAT-File Format" (R2023a).
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import FileError, SpadwarpError
+
+__all__ = ["Kind", "Sparse", "Variable", "open_variables"]
+
+Kind = Literal["dense", "sparse", "cell"]
+Sparse = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]
+"""Rows, columns and values of the entries of a sparse matrix."""
+
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _SPARSE = 1, 5
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_OLD_KINDS = ("f8", "f4", "i4", "i2", "u2", "u1")
+_COMPLEX, _LOGICAL = 0x0800, 0x0200
+_HEAD = 1 << 16  # bytes of a compressed array that hold its name and shape
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable whose numbers are not yet read.
+
+    Attributes:
+        kind: "dense", "sparse" or "cell".
+        shape: As MATLAB shows it.
+        read: The array; `Sparse`; or for cells an object array of arrays, one dimension each.
+    """
+
+    kind: Kind
+    shape: tuple[int, ...]
+    read: Callable[[], Any]
+
+
+@contextmanager
+def open_variables(path: Path) -> Iterator[dict[str, Variable]]:
+    """The variables of numbers by name, which can be read within the block. Raises `FileError`, also within it."""
+    try:
+        with open(path, "rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield dict(_version_4(content) if 0 in content[:4] else _version_5(content))
+    except (SpadwarpError, MemoryError):
+        raise
+    except (OSError, ValueError, LookupError, struct.error, zlib.error, OverflowError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def _version_5(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
+    if content[126:128] not in (b"IM", b"MI"):
+        raise ValueError("not a file of MATLAB")
+    order = "<" if content[126:128] == b"IM" else ">"
+    place = 128
+    while place + 8 <= len(content):
+        kind, size = struct.unpack_from(order + "II", content, place)
+        start, stop = place + 8, place + 8 + size
+        if stop > len(content):
+            raise ValueError(f"cut: {size} bytes are missing at byte {place}")
+        if kind == _COMPRESSED:
+            found = _compressed(content[start:stop], order)
+            place = stop
+        elif kind == _MATRIX:
+            found = _matrix(content[start:stop], order, size)
+            place = stop + -size % 8
+        else:
+            raise ValueError(f"type {kind} at byte {place}")
+        if found is not None:
+            yield found
+
+
+def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
+    head = zlib.decompressobj().decompress(packed, _HEAD)
+    kind, size = struct.unpack_from(order + "II", head)
+    if kind != _MATRIX or size > 1100 * len(packed) + _HEAD:  # zlib makes nothing smaller than this
+        raise ValueError(f"a compressed array of type {kind} and {size} bytes")
+    found = _matrix(head[8:], order, size)
+    if found is None:
+        return None
+
+    def read() -> Any:
+        whole = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
+        assert whole is not None
+        return whole[1].read()
+
+    return found[0], Variable(found[1].kind, found[1].shape, read)
+
+
+def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
+    """Name and variable of a matrix of `size` bytes, of which `content` is the beginning; None for other than numbers."""
+    (flags, _), place = _field(content, 0, order, {6: "u4"}, 2)
+    (*shape,), place = _field(content, place, order, {5: "i4"})
+    letters, place = _field(content, place, order, {1: "u1", 2: "u1", 16: "u1"})
+    name = bytes(letters.astype(np.uint8)).decode("utf-8", "replace")
+    class_, sides = int(flags) & 0xFF, tuple(map(int, shape))
+    if len(sides) < 2 or min(sides) < 0:
+        raise ValueError(f"array {name!r} has shape {sides}")
+    if int(flags) & _COMPLEX or class_ not in (_CELL, _SPARSE, *_CLASSES):
+        return None
+    if class_ == _SPARSE:
+        return name, Variable("sparse", sides, partial(_sparse, content, place, order, sides))
+    # A cell takes at least a tag; numbers may be stored in fewer bytes than their class has, but not in less than one.
+    if math.prod(sides) * (8 if class_ == _CELL else 1) > max(size - place, 4):
+        raise ValueError(f"array {name!r} of shape {sides} is not in {size} bytes")
+    if class_ == _CELL:
+        return name, Variable("cell", sides, partial(_cells, content, place, order, sides))
+    kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
+    return name, Variable("dense", sides, partial(_dense, content, place, order, sides, kind))
+
+
+def _dense(content: bytes, place: int, order: str, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+    values, _ = _field(content, place, order, _STORED, math.prod(shape))
+    return values.astype(kind).reshape(shape, order="F")
+
+
+def _sparse(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> Sparse:
+    """Rows of the entries column by column, where each column begins, and the values."""
+    rows, place = _field(content, place, order, {5: "i4"})
+    starts, place = _field(content, place, order, {5: "i4"}, shape[1] + 1)
+    count = int(starts[-1])
+    values, _ = _field(content, place, order, _STORED)
+    if len(shape) != 2 or starts[0] != 0 or (np.diff(starts) < 0).any() or count > min(rows.size, values.size):
+        raise ValueError("a sparse matrix whose columns do not fit its entries")
+    rows = rows[:count].astype(np.int64)
+    if count and not 0 <= rows.min() <= rows.max() < shape[0]:
+        raise ValueError(f"a sparse matrix with entries outside its {shape[0]} rows")
+    return rows, np.repeat(np.arange(shape[1]), np.diff(starts)), values[:count].copy()
+
+
+def _cells(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    cells = np.empty(math.prod(shape), object)
+    for index in range(cells.size):
+        kind, size = struct.unpack_from(order + "II", content, place)
+        start, stop = place + 8, place + 8 + size
+        found = _matrix(content[start:stop], order, size) if kind == _MATRIX and stop <= len(content) and size else None
+        if size and (found is None or found[1].kind != "dense"):
+            raise ValueError(f"cell {index} holds no array of numbers")
+        cells[index] = np.ravel(found[1].read()) if found is not None else np.zeros(0)
+        place = stop + -size % 8
+    return cells.reshape(shape, order="F")
+
+
+def _field(
+    content: bytes, place: int, order: str, kinds: Mapping[int, str], count: int | None = None
+) -> tuple[NDArray[Any], int]:
+    """The numbers of a data element, `count` of them if that is given, and where the next element begins."""
+    kind, size = struct.unpack_from(order + "II", content, place)
+    start, following = place + 8, place + 8 + size + -size % 8
+    if kind >> 16:  # an element of at most four bytes in its own tag
+        kind, size, start, following = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+    if kind not in kinds or start + size > len(content) or (start == place + 4 and size > 4):
+        raise ValueError(f"an element of type {kind} and {size} bytes at byte {place}")
+    dtype = np.dtype(order + kinds[kind])
+    if size % dtype.itemsize or count not in (None, size // dtype.itemsize):
+        raise ValueError(f"{size} bytes of {dtype} where {count} numbers are needed")
+    return np.frombuffer(content, dtype, size // dtype.itemsize, start), following
+
+
+def _version_4(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
+    order = "<" if struct.unpack_from("<i", content)[0] < 5000 else ">"
+    place = 0
+    while place < len(content):
+        code, rows, columns, imaginary, letters = struct.unpack_from(order + "5i", content, place)
+        kind, type_ = code // 10 % 10, code % 10
+        if min(code, rows, columns) < 0 or kind >= len(_OLD_KINDS) or not 1 <= letters <= 1000:
+            raise ValueError(f"no array of MATLAB at byte {place}")
+        dtype = np.dtype(order + _OLD_KINDS[kind])
+        start = place + 20 + letters
+        place = start + rows * columns * dtype.itemsize * (2 if imaginary else 1)
+        if place > len(content):
+            raise ValueError(f"cut: {place - len(content)} bytes are missing")
+        name = content[start - letters : start].rstrip(b"\0").decode("latin-1")
+        if type_ == 0 and not imaginary:
+            yield name, Variable("dense", (rows, columns), partial(_old, content, start, place, dtype, (rows, columns)))
+
+
+def _old(content: mmap.mmap, start: int, stop: int, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    return np.frombuffer(content[start:stop], dtype).reshape(shape, order="F")

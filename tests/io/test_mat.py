@@ -1,0 +1,95 @@
+"""MATLAB files: the arrays that SciPy writes are read as they are, and damaged ones are refused."""
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from spadwarp.errors import FileError
+from spadwarp.io.mat import mat_entries, read_mat
+
+KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
+
+
+def read(path, name):
+    return read_mat(path, name, mat_entries(path)[name])
+
+
+def shapes_of(path):
+    return {name: entry.shape for name, entry in mat_entries(path).items() if entry.kind == "dense"}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_arrays_are_those_that_scipy_writes(tmp_path, packed):
+    generator = np.random.default_rng(1)
+    arrays = {f"a{number}": (100 * generator.random((3, 4, 5))).astype(kind) for number, kind in enumerate(KINDS)}
+    arrays |= {"one": np.array([[7.0]]), "zeros": np.zeros((200, 300)), "flat": np.arange(6.0)}
+    others = {"text": "letters", "cell": np.array([1, "x"], object), "complex": np.ones((2, 2)) * 1j}
+    savemat(tmp_path / "file.mat", arrays | others, do_compression=packed)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(read(tmp_path / "file.mat", name), np.atleast_2d(values))
+    assert shapes_of(tmp_path / "file.mat") == {name: np.atleast_2d(values).shape for name, values in arrays.items()}
+
+
+def test_old_files_are_read(tmp_path):
+    values = np.arange(12.0).reshape(3, 4)
+    savemat(tmp_path / "file.mat", {"a": values, "text": "letters", "b": values.astype(np.int16)}, format="4")
+    np.testing.assert_array_equal(read(tmp_path / "file.mat", "a"), values)
+    np.testing.assert_array_equal(read(tmp_path / "file.mat", "b"), values)
+    assert set(shapes_of(tmp_path / "file.mat")) == {"a", "b"}
+
+
+def test_files_of_version_7_3_hold_nothing_of_other_files(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "secret").write_bytes(b"secret" * 100)
+    with h5py.File(tmp_path / "file.mat", "w") as file:
+        file["a"] = np.arange(60.0).reshape(5, 4, 3)
+        file.create_dataset("stolen", (3, 4), np.uint8, external=[(str(tmp_path / "secret"), 0, 12)])
+        file.create_dataset("bomb", (1 << 40, 8, 8), np.uint8, chunks=(1, 8, 8))
+    np.testing.assert_array_equal(read(tmp_path / "file.mat", "a"), np.arange(60.0).reshape(5, 4, 3).T)
+    for name in ("stolen", "bomb"):
+        with pytest.raises(FileError, match=f"file.mat: .*{name}"):
+            read(tmp_path / "file.mat", name)
+
+
+def test_a_type_that_does_not_exist_is_refused(tmp_path):
+    """SciPy looks it up beyond the end of a table, and the process ends."""
+    savemat(tmp_path / "file.mat", {"a": np.arange(60).reshape(3, 4, 5)})
+    content = bytearray((tmp_path / "file.mat").read_bytes())
+    place = content.index((12).to_bytes(4, "little") + (480).to_bytes(4, "little"))  # the tag of 60 int64
+    for kind in (0, 8, 14, 255, 65535):
+        content[place : place + 4] = kind.to_bytes(4, "little")
+        (tmp_path / "file.mat").write_bytes(content)
+        with pytest.raises(FileError, match=r"file\.mat: damaged or not readable"):
+            read(tmp_path / "file.mat", "a")
+
+
+@pytest.mark.parametrize("form", ["4", "5", "packed"])
+def test_damaged_files_are_read_or_refused(tmp_path, form):
+    path, generator = tmp_path / "file.mat", np.random.default_rng(3)
+    options = {"format": "4"} if form == "4" else {"do_compression": form == "packed"}
+    shape = (6, 10) if form == "4" else (3, 4, 5)
+    savemat(path, {"a": generator.random(shape), "b": np.arange(60).reshape(shape)}, **options)
+    content = path.read_bytes()
+    for length in range(0, len(content), 37):
+        path.write_bytes(content[:length])
+        with pytest.raises((FileError, KeyError)):
+            read(path, "b")
+    for _ in range(500):
+        changed = bytearray(content)
+        for place in generator.integers(len(content), size=generator.integers(1, 4)):
+            changed[place] = generator.choice([0, 255, generator.integers(256)])
+        path.write_bytes(changed)
+        try:
+            assert all(np.size(read(path, name)) <= 1 << 16 for name in mat_entries(path))
+        except FileError as error:
+            assert "file.mat" in str(error)
+
+
+def test_a_bomb_is_refused(tmp_path):
+    savemat(tmp_path / "file.mat", {"a": np.zeros((3, 4, 5))})
+    content = bytearray((tmp_path / "file.mat").read_bytes())
+    place = content.index(np.array([3, 4, 5], "<i4").tobytes())
+    content[place : place + 12] = np.array([2**30, 2**30, 2**30], "<i4").tobytes()
+    (tmp_path / "file.mat").write_bytes(content)
+    with pytest.raises(FileError, match="is not in"):
+        read(tmp_path / "file.mat", "a")
