@@ -104,7 +104,7 @@ def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
 
 
 def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
-    """Name and variable of a matrix of `size` bytes, of which `content` is the beginning; None for other than numbers."""
+    """Name and variable of a matrix of `size` bytes that begins with `content`; None for other than numbers."""
     (flags, _), place = _field(content, 0, order, {6: "u4"}, 2)
     (*shape,), place = _field(content, place, order, {5: "i4"})
     letters, place = _field(content, place, order, {1: "u1", 2: "u1", 16: "u1"})

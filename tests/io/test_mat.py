@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import sparse
 from scipy.io import savemat
 
 from spadwarp.errors import FileError
@@ -28,6 +29,29 @@ def test_arrays_are_those_that_scipy_writes(tmp_path, packed):
     for name, values in arrays.items():
         np.testing.assert_array_equal(read(tmp_path / "file.mat", name), np.atleast_2d(values))
     assert shapes_of(tmp_path / "file.mat") == {name: np.atleast_2d(values).shape for name, values in arrays.items()}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_sparse_matrices_and_cells_are_those_that_scipy_writes(tmp_path, packed):
+    matrix = sparse.random_array((30, 20), density=0.1, random_state=2, format="csc")
+    cells = np.empty((2, 3), object)
+    for index in range(6):
+        cells.flat[index] = np.arange(float(index))
+    variables = {
+        "matrix": matrix,
+        "cells": cells,
+        "empty": sparse.csc_array((4, 5)),
+        "mixed": np.array([1, "x"], object),
+    }
+    savemat(tmp_path / "file.mat", variables, do_compression=packed)
+    for name in ("matrix", "empty"):
+        found = read(tmp_path / "file.mat", name)
+        again = sparse.coo_array((found.value, (found.row, found.column)), found.shape)
+        np.testing.assert_array_equal(again.toarray(), variables[name].toarray())
+    for one, two in zip(read(tmp_path / "file.mat", "cells").flat, cells.flat, strict=True):
+        np.testing.assert_array_equal(one, two)
+    with pytest.raises(FileError, match="cell 1 holds no array of numbers"):
+        read(tmp_path / "file.mat", "mixed")
 
 
 def test_old_files_are_read(tmp_path):
@@ -68,12 +92,15 @@ def test_damaged_files_are_read_or_refused(tmp_path, form):
     path, generator = tmp_path / "file.mat", np.random.default_rng(3)
     options = {"format": "4"} if form == "4" else {"do_compression": form == "packed"}
     shape = (6, 10) if form == "4" else (3, 4, 5)
-    savemat(path, {"a": generator.random(shape), "b": np.arange(60).reshape(shape)}, **options)
+    variables = {"a": generator.random(shape), "b": np.arange(60).reshape(shape)}
+    if form != "4":
+        variables |= {"s": sparse.eye_array(9, format="csc"), "c": np.array([np.arange(3), np.arange(2)], object)}
+    savemat(path, variables, **options)
     content = path.read_bytes()
     for length in range(0, len(content), 37):
         path.write_bytes(content[:length])
         with pytest.raises((FileError, KeyError)):
-            read(path, "b")
+            read(path, list(variables)[-1])
     for _ in range(500):
         changed = bytearray(content)
         for place in generator.integers(len(content), size=generator.integers(1, 4)):
