@@ -11,10 +11,11 @@ import spadwarp
 from helpers import hostile
 from helpers.datasets import make, recipe
 from helpers.synthetic_result import make_result, make_scene
+from spadwarp.analytic import save_analytic
 from spadwarp.dataset import FIELDS, FrameReader
 from spadwarp.errors import FileError
+from spadwarp.files import open_source
 from spadwarp.frames import FramesFile, record_frames
-from spadwarp.run import open_source, save_analytic
 from spadwarp.transport import load_records, save_records, trace
 
 SMALL = {
