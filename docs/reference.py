@@ -192,10 +192,8 @@ def _range(info: FieldInfo) -> str:
                 high = f"{_short(value)})"
             case AfterValidator(func=check):  # of a distribution's values
                 limits = inspect.getclosurevars(check).nonlocals
-                if math.isfinite(limits["low"]):
-                    low = ("(" if limits["open_low"] else "[") + _short(limits["low"])
-                if math.isfinite(limits["high"]):
-                    high = f"{_short(limits['high'])}]"
+                if "interval" in limits:
+                    return limits["interval"]
     return "" if (low, high) == ("(-∞", "∞)") else f"{low}, {high}"
 
 

@@ -6,12 +6,14 @@ import contextlib
 import logging
 import math
 import os
+import secrets
 import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
@@ -268,6 +270,7 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     address = engine.address or os.environ.get("RAY_ADDRESS")
     options: dict[str, Any] = {"address": address}
     if address is None:
+        _require_token()
         # For a value of each worker and what is being written; a third of the memory is Ray's own default.
         reserve = max(256 * _MIB, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
         reserve = min(reserve, (physical_memory() or 3 * reserve) // 3)
@@ -288,6 +291,22 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
         # Ray's own would end the program at SIGTERM.
         for number, handler in handlers.items() if main else ():
             signal.signal(number, handler)
+
+
+def _require_token() -> None:
+    """Lets nobody reach the Ray that is started here without a token: it listens on every interface of the machine.
+
+    The user's own setting and token hold where there are any.
+    """
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    own = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
+    if not own and not Path("~/.ray/auth_token").expanduser().exists():
+        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)  # kept: Ray reads it once a process
+    try:
+        from ray._raylet import Config
+    except ImportError as error:
+        raise ConfigError("Ray is started on this machine with a token, which needs ray 2.60 or newer") from error
+    Config.initialize("")  # Ray has read its settings when it was imported
 
 
 def _description(worker: RayWorker) -> str:
