@@ -6,6 +6,7 @@ import difflib
 import functools
 import math
 import operator
+import os
 import re
 import reprlib
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 from spadwarp.errors import ArgumentError
 
 __all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "check_choice", "check_integer"]
-__all__ += ["check_part", "check_real", "parse_number", "shown", "suggestion"]
+__all__ += ["check_part", "check_real", "environment_integer", "parse_number", "shown", "suggestion"]
 
 SEED = "[0, 18446744073709551615]"
 """Range of seeds: 64 bits."""
@@ -102,6 +103,16 @@ def check_part(name: str, value: Any) -> tuple[int, int]:
     if not 1 <= number <= parts:
         raise ArgumentError(f"{name} = {number}/{parts} is outside [1/{parts}, {parts}/{parts}]")
     return number, parts
+
+
+def environment_integer(name: str, default: int) -> int:
+    """A variable of the environment that is an integer ≥ 0. Raises `ArgumentError` where it is none."""
+    text = os.environ.get(name)
+    if text is None:
+        return default
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise ArgumentError(f"environment variable {name} = {shown(text)} is not an integer >= 0")
+    return int(text)
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:

@@ -122,6 +122,7 @@ def simulate(
         photons = None
     if records:
         _check_records(scene, whole=not (first_photon or shard_text))
+    _report_repeated(device)
     shard = opt.read_part(shard_text, "--shard")
     engine = opt.read_engine(engine_name, ray_address, workers)
     for message in spadwarp.check(scene):
@@ -162,6 +163,12 @@ def simulate(
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
+
+
+def _report_repeated(device: str | None) -> None:
+    names = (device or "").split(",")
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        complain(f"warning: --device: {name} is named more than once: the same bits, no sooner, with more memory")
 
 
 def _earlier(place: Path, photons: int | None) -> Result:

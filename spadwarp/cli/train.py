@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 from spadwarp.cli._progress import progress
+from spadwarp.limits import environment_integer
 
 
 @app.command()
@@ -53,7 +53,7 @@ def train(
     if steps is not None:
         changes["optimiser"] = {"steps": steps}
     chosen = load_training_recipe(recipe, overrides=changes)
-    first = int(os.environ.get("RANK", "0")) == 0
+    first = environment_integer("RANK", 0) == 0
     outputs = opt.check_outputs(
         out if first else None,  # one process of torchrun writes
         (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt"),

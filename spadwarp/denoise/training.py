@@ -26,6 +26,7 @@ from spadwarp.denoise.recipe import Noise, TrainingRecipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
+from spadwarp.limits import environment_integer
 from spadwarp.parallel.worker import interruptible
 
 __all__ = ["LEVELS", "Trained", "fit"]
@@ -217,7 +218,7 @@ class _Workers:
     """The processes of a run: this one alone, or those that torchrun started."""
 
     def __init__(self, device: str | None) -> None:
-        self.size, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
+        self.size, self.rank = environment_integer("WORLD_SIZE", 1), environment_integer("RANK", 0)
         self.is_cuda = torch.cuda.is_available() if device is None else device.startswith("cuda")
         if self.is_cuda and device in (None, "cuda"):
             device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"

@@ -16,6 +16,7 @@ from spadwarp.dataset.shard_file import SceneFile
 from spadwarp.denoise.inference import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError
+from spadwarp.limits import environment_integer
 from spadwarp.viz import draw_learning_curves
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def train(
         recipe = load_training_recipe(recipe)
     training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress)
-    if int(os.environ.get("RANK", 0)) == 0:
+    if environment_integer("RANK", 0) == 0:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]
         draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
     return trained

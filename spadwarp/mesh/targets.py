@@ -241,6 +241,10 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"{name}: the file holds no triangles")
+    if mesh.vertices.shape[1:] != (3,):
+        raise MeshError(f"{name}: its vertices have {mesh.vertices.shape[-1]} coordinates; three are needed")
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise MeshError(f"{name}: a face refers to a vertex that does not exist")
     if (np.abs(mesh.vertices) < 1e15).all():  # else merging would leave the range of integers
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh

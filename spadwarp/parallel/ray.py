@@ -303,7 +303,7 @@ def _require_token() -> None:
     if not own and not Path("~/.ray/auth_token").expanduser().exists():
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)  # kept: Ray reads it once a process
     try:
-        from ray._raylet import Config
+        from ray._raylet import Config  # type: ignore[attr-defined]
     except ImportError as error:
         raise ConfigError("Ray is started on this machine with a token, which needs ray 2.60 or newer") from error
     Config.initialize("")  # Ray has read its settings when it was imported

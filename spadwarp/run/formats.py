@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from spadwarp.dataset.recipe import SPLITS
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import open_source
 from spadwarp.frames.export import FrameSequence, exr_metadata, write_exr_frame, write_mat, write_npy, write_ptu
 from spadwarp.frames.frames import Frames
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
+from spadwarp.limits import check_choice
 from spadwarp.result.result import COMPONENTS, Result
 
 __all__ = ["FORMATS", "export"]
@@ -60,6 +62,7 @@ def export(
         FileError: A file cannot be read or written, or the package for its format is not installed.
     """
     path = Path(path)
+    check_choice("split", split, (*SPLITS, "all"))
     ending = path.suffix.lower()
     if ending not in FORMATS:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(FORMATS)}")

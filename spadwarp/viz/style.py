@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
 
 __all__ = ["BACKGROUND", "BLUE", "BOUND_MAP", "COMPONENTS", "DASHED", "DEPTH_MAP", "ERROR_MAP", "GREEN", "GRID"]
@@ -83,12 +86,25 @@ def save(figure: Figure, path: str | os.PathLike[str], *, note: str = "", dpi: i
     """
     if note:
         figure.supxlabel(textwrap.fill(note, int(14 * figure.get_figwidth())), fontsize=8, color="0.35")
-    kind = Path(path).suffix.lstrip(".") or "png"
+    kind = Path(path).suffix.lstrip(".").lower() or "png"
+    if kind not in (known := figure.canvas.get_supported_filetypes()):
+        raise FileError(f"{path}: ending {Path(path).suffix!r} is not one of {', '.join(f'.{one}' for one in known)}")
     # Without the date, so that the same figure makes the same file.
     metadata = {"CreationDate": None} if kind == "pdf" else None
-    with atomic_path(Path(path)) as temporary:
+    with atomic_path(Path(path)) as temporary, _without_a_date():
         figure.savefig(temporary, dpi=dpi, format=kind, metadata=metadata)  # type: ignore[arg-type]
     return Path(path)
+
+
+@contextmanager
+def _without_a_date() -> Iterator[None]:
+    """Hides SOURCE_DATE_EPOCH from matplotlib, which fails where it is no number; our figures have no date."""
+    date = os.environ.pop("SOURCE_DATE_EPOCH", None)
+    try:
+        yield
+    finally:
+        if date is not None:
+            os.environ["SOURCE_DATE_EPOCH"] = date
 
 
 def spaced(number: int) -> str:

@@ -135,3 +135,24 @@ def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     assert done.returncode in (0, 1)
     assert done.returncode == 0 or "not enough memory" in done.stderr or "OpenBLAS error: Memory" in done.stderr
     assert "Traceback" not in done.stderr and "bug" not in done.stderr
+
+
+def test_a_date_or_rank_of_the_environment_that_is_no_number(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    pdf = ("--set", "output.png=true", "--set", "output.pdf=true", "--photons", "1e3")
+    run("simulate", scene, "--out", tmp_path / "out", *pdf, "--device", "cpu")
+    assert (tmp_path / "out" / "depth.pdf").is_file() and os.environ["SOURCE_DATE_EPOCH"] == "yesterday"
+    monkeypatch.setenv("RANK", "²")
+    (tmp_path / "train.toml").write_text('model = "dncnn"\ndata = "none"\n')
+    complaint = run("train", tmp_path / "train.toml", "--out", tmp_path / "weights", code=2).stderr
+    assert "environment variable RANK = '²' is not an integer" in complaint
+
+
+def test_a_device_that_is_named_twice_is_told(scene, tmp_path):
+    options = ("--device", "cpu,cpu", "--photons", "1e3", "--out", tmp_path / "out")
+    assert "cpu is named more than once" in run("simulate", scene, *options).stderr
+
+
+def test_an_unknown_split_is_refused_for_every_source(done, tmp_path):
+    options = ("--format", "npy", "--split", "tset", "--out", tmp_path / "out")
+    assert "did you mean 'test'" in run("export", done, *options, code=2).stderr
