@@ -107,7 +107,9 @@ def test_damaged_files_are_read_or_refused(tmp_path, form):
             changed[place] = generator.choice([0, 255, generator.integers(256)])
         path.write_bytes(changed)
         try:
-            assert all(np.size(read(path, name)) <= 1 << 16 for name in mat_entries(path))
+            for name in mat_entries(path):
+                value = read(path, name)
+                assert np.size(getattr(value, "value", value)) <= 1 << 16
         except FileError as error:
             assert "file.mat" in str(error)
 
