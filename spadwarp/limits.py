@@ -120,12 +120,13 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
     if isinstance(value, str) and value in choices:
         return value
     listed = ", ".join(map(repr, choices))
-    raise ArgumentError(f"{name} = {shown(value)} is not one of {listed}{suggestion(str(value), choices)}")
+    raise ArgumentError(f"{name} = {shown(value)} is not one of {listed}{suggestion(value, choices)}")
 
 
-def suggestion(word: str, known: Sequence[str]) -> str:
+def suggestion(word: Any, known: Sequence[str]) -> str:
     """What to add to an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
-    if not 0 < len(word) <= 100:  # the time to compare words grows as the product of their lengths
+    # The time to compare words grows as the product of their lengths.
+    if not (isinstance(word, str) and 0 < len(word) <= 100):
         return ""
     close = [one for one in known if one.lower().startswith(word.lower())]
     close = close or difflib.get_close_matches(word, known, n=1)

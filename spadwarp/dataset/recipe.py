@@ -101,10 +101,10 @@ class Distribution(_Table):
         return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
 
 
-def _is_finite(value: Any) -> bool:
+def _is_finite(value: Any, depth: int = 0) -> bool:
     """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
     if isinstance(value, list | tuple):
-        return all(map(_is_finite, value))
+        return depth < 9 and all(_is_finite(one, depth + 1) for one in value)
     return not isinstance(value, float) or math.isfinite(value)
 
 

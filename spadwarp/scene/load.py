@@ -15,7 +15,7 @@ from spadwarp.io.parsing import parse_toml
 from spadwarp.limits import parse_number, shown
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.phase_fields import PHASE_FIELDS
-from spadwarp.scene.preset import PRESETS
+from spadwarp.scene.preset import PRESETS, Preset
 from spadwarp.scene.renamed import current_fields
 
 Table = dict[str, Any]
@@ -57,7 +57,7 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
     A value of None takes the field back to its default.
     """
     base, layer = current_fields(section, base), current_fields(section, layer)
-    preset = PRESETS.get(section, {}).get(str(layer.get("preset")))
+    preset = _preset(section, layer)
     if preset is not None:
         base = merge_section(section, base, preset.values)
     merged = dict(base)
@@ -72,10 +72,15 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
     dropped = [name for name, value in layer.items() if value is None]
     for name in dropped:
         del merged[name]
-    current = PRESETS.get(section, {}).get(str(merged.get("preset")))
+    current = _preset(section, merged)
     if current is not None and any(name in current.values for name in dropped):
         del merged["preset"]  # no longer that preset
     return merged
+
+
+def _preset(section: str, fields: Mapping[str, Any]) -> Preset | None:
+    name = fields.get("preset")
+    return PRESETS.get(section, {}).get(name) if isinstance(name, str) else None
 
 
 def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:

@@ -104,7 +104,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     if choices:
         others = [cause.args[2]] if cause is not None and len(cause.args) > 2 else []
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
-        return f"{entry} is not one of {listed}{_suggest(str(value), choices)}"
+        return f"{entry} is not one of {listed}{_suggest(value, choices)}"
     if kind in _KINDS:
         return f"{entry} is not {_KINDS[kind]}"
     message = problem["msg"]
@@ -119,8 +119,8 @@ def _fields(model: type[BaseModel], key: Key) -> list[str]:
     return list(model.model_fields)
 
 
-def _suggest(name: str, known: Sequence[str]) -> str:
-    synonym = _SYNONYMS.get(name)
+def _suggest(name: Any, known: Sequence[str]) -> str:
+    synonym = _SYNONYMS.get(name) if isinstance(name, str) else None
     return f"; did you mean {synonym!r}?" if synonym in known else suggestion(name, known)
 
 

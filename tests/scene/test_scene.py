@@ -396,3 +396,22 @@ def test_every_number_has_a_range(info, request):
     bounds = {type(one).__name__ for one in messages._bounds(info)} & {"Ge", "Gt", "Le", "Lt"}
     assert any(one in bounds for one in ("Ge", "Gt")) and any(one in bounds for one in ("Le", "Lt"))
     assert ("inf" in messages._interval(info)) == (name in INFINITE)
+
+
+def nested(depth):
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+ODD = {"deep": nested(5000), "digits": 10**5000, "table": {"a": nested(5000)}, "surrogate": "\ud800", "bytes": b"x"}
+
+
+@pytest.mark.parametrize("value", ODD.values(), ids=ODD)
+@pytest.mark.parametrize("field", ["medium.preset", "medium.extinction", "camera.width", "targets", "laser.profile"])
+def test_any_object_is_a_value_or_refused_in_a_line(field, value):
+    section, _, name = field.partition(".")
+    tables = {section: {**MINIMAL.get(section, {}), name: value}} if name else {section: value}
+    (first, *_) = problems(tables)
+    assert first.startswith(section) and len(first) < 500
