@@ -13,8 +13,10 @@ from spadwarp.checks.statistics import check_statistics
 from spadwarp.checks.survey import Survey
 from spadwarp.checks.targets import check_targets
 from spadwarp.checks.timing import check_timing
+from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh
-from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene import Scene, SceneLike, as_scene
 
 __all__ = ["check", "summary"]
 
@@ -25,11 +27,22 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """Everything worth knowing about a scene, warnings first; occlusion is not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
-    for the table of a phase function.
+    for the table of a phase function and the instrument response of the detector.
     """
     survey = Survey(as_scene(scene), mesh)
+    _check_response(survey.scene)
     messages = [message for find in _CHECKS for message in find(survey)]
     return sorted(messages, key=lambda message: message.level != "warning")
+
+
+def _check_response(scene: Scene) -> None:
+    """Reads the response's file, which only depth and counts need: at the end of a run it would be too late."""
+    try:
+        detector_response(scene.detector, scene.laser)
+    except ArgumentError as error:
+        raise ConfigError(
+            f"detector.irf: {error}", source=None if scene.source is None else str(scene.source)
+        ) from None
 
 
 def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any]:

@@ -261,7 +261,10 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
 
 def _read_csv(path: Path) -> InstrumentResponse:
     if file_problem(path) is not None:
-        raise ArgumentError(f"irf = {shown(str(path))} is neither a known shape nor a file")
+        name = str(path)
+        raise ArgumentError(
+            f"irf = {repr(name) if len(name) < 300 else shown(name)} is neither a known shape nor a file"
+        )
     try:
         times, values = read_columns(path, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
     except (ConfigError, FileError) as error:

@@ -129,6 +129,18 @@ def test_errors_say_what_is_wrong(scene, tmp_path, arguments, code, words):
     assert not (tmp_path / "out" / "result.h5").exists()
 
 
+@pytest.mark.parametrize("content", [None, "", "time_ps,value\n0,1\n", "time_ps,value\n0,-1\n1,nan\n"])
+def test_a_response_that_cannot_be_read_is_found_before_the_run(scene, tmp_path, monkeypatch, content):
+    monkeypatch.setattr(spadwarp, "simulate", lambda *_, **__: pytest.fail("it ran"))
+    path = tmp_path / "irf.csv"
+    if content is not None:
+        path.write_text(content)
+    for command in (("check", scene), ("simulate", scene, "--out", tmp_path / "out")):
+        outcome = run(*command, "--set", f"detector.irf={path}", code=2)
+        assert "detector.irf" in outcome.stderr and "irf.csv" in outcome.stderr, outcome.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_disk_that_is_too_small_is_found_out_before_the_run(scene, tmp_path, monkeypatch):
     def disk_usage(path):
         return type("usage", (), {"free": 1000})
