@@ -88,8 +88,8 @@ def test_depth_is_not_written_over_what_it_is_estimated_from(done, tmp_path):
 
 
 def test_what_appears_while_a_command_runs_is_not_replaced(done, tmp_path, monkeypatch):
-    mine, load_result = tmp_path / "mine.json", spadwarp.load_result
-    monkeypatch.setattr(spadwarp, "load_result", lambda path: mine.write_text("mine") and load_result(path))
+    mine, load = tmp_path / "mine.json", spadwarp.load
+    monkeypatch.setattr(spadwarp, "load", lambda path: mine.write_text("mine") and load(path))
     assert "appeared" in run("info", done, "--json", mine, code=1).stderr
     assert mine.read_text() == "mine"
 
