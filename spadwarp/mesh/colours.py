@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import MeshError
+from spadwarp.mesh.files import check_sizes, check_triangles
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,6 +24,7 @@ Images = tuple[NDArray[np.float32], ...]
 COLOUR_CHANNELS = (("red", 580.0), ("green", 490.0), ("blue", 0.0))
 """Which channel of a colour counts, by the shortest wavelength [nm] for which it does."""
 
+_LARGEST_IMAGE = 1 << 26  # pixels
 _KNOWN = "PLY, OBJ, GLB and OFF files can hold colours"
 
 
@@ -94,7 +96,7 @@ def read_coloured_mesh(
                 uv, found = visual.uv[mesh.faces], True
                 texture = places.setdefault(id(image), len(places))
                 if texture not in images:
-                    images[texture] = np.ascontiguousarray(decode(_pixels(image), True), np.float32)
+                    images[texture] = np.ascontiguousarray(decode(_pixels(image, name), True), np.float32)
         if not found:
             raise MeshError(
                 f"{name}: reflectance = 'from_file', but {_what_it_has(visual)}; give a number, or a file with colours"
@@ -123,6 +125,7 @@ def _parts(path: Path, ending: str, name: str) -> Iterator[tuple[trimesh.Trimesh
         raise MeshError(f"{name}: reflectance = 'from_file' does not go with {path.suffix or 'this file'}; {_KNOWN}")
     if ending == "obj":
         _check_materials(path, name)
+    check_sizes(path, name)
     try:
         with path.open("rb") as file:
             if ending == "off":
@@ -146,6 +149,7 @@ def _parts(path: Path, ending: str, name: str) -> Iterator[tuple[trimesh.Trimesh
     if not parts:
         raise MeshError(f"{name}: the file holds no triangles")
     for mesh, where in parts:
+        check_triangles(mesh, name)
         colours = mesh.face_attributes.get("colour")
         if colours is not None and len(colours) != len(mesh.faces):
             raise MeshError(
@@ -158,6 +162,8 @@ def _check_materials(path: Path, name: str) -> None:
     """Refuses an OBJ file whose material file or images are missing, which trimesh passes over."""
     for line in path.read_text(errors="replace").splitlines():
         if line.split(maxsplit=1)[:1] == ["mtllib"]:
+            if len(line.split()) < 2:
+                raise MeshError(f"{name}: mtllib stands without the name of a material file")
             materials = path.parent / line.split(maxsplit=1)[1].strip()
             if not materials.is_file():
                 raise MeshError(f"{name}: its material file {os.fspath(materials)!r} is missing")
@@ -223,11 +229,16 @@ def _material(material: Any) -> tuple[Any, Any]:
     return image, material.kwargs.get("kd")
 
 
-def _pixels(image: Any) -> NDArray[Any]:
-    """RGB components of a Pillow image, `[rows, columns, 3]`; grey ones in all three."""
-    if image.mode.startswith("I"):
-        return np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2)
-    return np.asarray(image.convert("RGB"))
+def _pixels(image: Any, name: str) -> NDArray[Any]:
+    """RGB components of a Pillow image, `[rows, columns, 3]`; grey ones in all three. Decodes it."""
+    if image.width * image.height > _LARGEST_IMAGE:
+        raise MeshError(f"{name}: an image of {image.width} x {image.height} pixels; {_LARGEST_IMAGE} are read at most")
+    try:
+        if image.mode.startswith("I"):
+            return np.repeat(np.asarray(image).astype(np.uint16)[..., None], 3, axis=2)
+        return np.asarray(image.convert("RGB"))
+    except Exception as error:  # what Pillow raises depends on the format
+        raise MeshError(f"{name}: an image that is damaged: {error}") from error
 
 
 def _what_it_has(visual: Any) -> str:

@@ -15,6 +15,7 @@ from spadwarp.errors import MeshError
 from spadwarp.io.paths import file_problem
 from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
+from spadwarp.mesh.files import check_sizes, check_triangles
 from spadwarp.scene.pose import rotation_matrix, to_camera
 
 if TYPE_CHECKING:
@@ -234,6 +235,7 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     """A mesh file in the file's own units and axes; several objects in it become one."""
     import trimesh
 
+    check_sizes(path, name)
     try:
         mesh = trimesh.load_mesh(path, process=False)  # processing would drop what is not finite, without a warning
     except Exception as error:  # what trimesh raises depends on the format and its parser
@@ -241,10 +243,7 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"{name}: the file holds no triangles")
-    if mesh.vertices.shape[1:] != (3,):
-        raise MeshError(f"{name}: its vertices have {mesh.vertices.shape[-1]} coordinates; three are needed")
-    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-        raise MeshError(f"{name}: a face refers to a vertex that does not exist")
+    check_triangles(mesh, name)
     if (np.abs(mesh.vertices) < 1e15).all():  # else merging would leave the range of integers
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh

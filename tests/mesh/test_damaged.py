@@ -1,0 +1,107 @@
+"""Mesh files that somebody has changed: an error that names the file, whether their colours count or not."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from spadwarp.errors import MeshError
+from spadwarp.mesh import load_target
+from spadwarp.scene import Target
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{}"
+FACES = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+TEXTS = {
+    "index.obj": (TRIANGLE + "f 1 2 30\n", ""),
+    "index.off": ("COFF\n3 1 0\n0 0 0 1 1 1\n1 0 0 1 1 1\n0 1 0 1 1 1\n3 0 1 20\n", "face"),
+    "index.ply": (PLY.format(FACES) + "0 0 0\n1 0 0\n0 1 0\n3 0 1 20\n", ""),
+    "flat.obj": ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", ""),
+    "nan.obj": ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ""),
+    "inf.obj": ("v 0 0 inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ""),
+}
+
+
+def refused(path, words=""):
+    for reflectance in (0.5, "from_file"):
+        with pytest.raises(MeshError) as caught:
+            load_target(Target(mesh=str(path), reflectance=reflectance))
+        assert path.name in str(caught.value) and words in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_text_with_wrong_numbers(name, tmp_path):
+    text, words = TEXTS[name]
+    (tmp_path / name).write_text(text)
+    refused(tmp_path / name, words)
+
+
+def test_mtllib_without_a_name(tmp_path):
+    for line in ("mtllib", "mtllib   "):
+        (tmp_path / "box.obj").write_text(f"{line}\n{TRIANGLE}f 1 2 3\n")
+        with pytest.raises(MeshError, match="mtllib stands without"):
+            load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+
+
+@pytest.fixture
+def glb():
+    """Bytes of a textured box, and its header as a table with where the numbers begin."""
+    box = trimesh.creation.box()
+    image = Image.fromarray(np.full((4, 4, 3), 128, np.uint8))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    content = trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False).export(file_type="glb")
+    (length,) = struct.unpack_from("<I", content, 12)
+    return content, json.loads(content[20 : 20 + length]), 20 + length + 8
+
+
+def packed(header, numbers):
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(numbers)
+    head = struct.pack("<4sIIII", b"glTF", 2, size, len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", len(numbers), 0x004E4942) + numbers
+
+
+def test_an_index_out_of_range_in_glb(glb, tmp_path):
+    content, header, begin = glb
+    place = begin + header["bufferViews"][header["accessors"][0]["bufferView"]].get("byteOffset", 0)
+    for index in (8, 10**6, 2**32 - 1):
+        changed = bytearray(content)
+        struct.pack_into("<I", changed, place, index)
+        (tmp_path / "box.glb").write_bytes(changed)
+        refused(tmp_path / "box.glb", "does not exist")
+
+
+@pytest.mark.parametrize("count", [10**10, -1, 2**31])
+def test_numbers_that_a_glb_declares_and_does_not_have(glb, tmp_path, count):
+    """Without a buffer, memory is taken for so many zeros."""
+    content, header, begin = glb
+    header["accessors"][0]["count"] = count
+    del header["accessors"][0]["bufferView"]
+    (tmp_path / "box.glb").write_bytes(packed(header, content[begin:]))
+    refused(tmp_path / "box.glb", "declares")
+
+
+@pytest.mark.parametrize("damage", ["cut", "zeros", "letters"])
+def test_a_broken_image_in_glb(glb, tmp_path, damage):
+    content, _, _ = glb
+    place, changed = content.index(b"\x89PNG"), bytearray(content)
+    changed[place + 30 if damage != "letters" else place : place + 50] = b"x" * (20 if damage != "letters" else 50)
+    (tmp_path / "box.glb").write_bytes(changed[: place + 40] if damage == "cut" else changed)
+    with pytest.raises(MeshError, match=r"box\.glb"):
+        load_target(Target(mesh=str(tmp_path / "box.glb"), reflectance="from_file"))
+
+
+def test_a_broken_image_beside_obj(tmp_path):
+    Image.fromarray(np.random.default_rng(1).integers(255, size=(64, 64, 3), dtype=np.uint8)).save(tmp_path / "a.png")
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
+    (tmp_path / "box.mtl").write_text("newmtl one\nmap_Kd a.png\n")
+    lines = "mtllib box.mtl\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl one\n"
+    (tmp_path / "box.obj").write_text(TRIANGLE + lines + "f 1/1 2/2 3/3\n")
+    with pytest.raises(MeshError, match=r"box\.obj"):
+        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
