@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,7 +58,9 @@ def write_exr(
             raise ArgumentError(f"metadata name {name!r} is one that EXR uses itself")
         header[name] = str(value)
     with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
-        file.write(str(temporary))
+        content = io.BytesIO()  # OpenEXR takes no names that are not Unicode
+        file.write(content)
+        temporary.write_bytes(content.getvalue())
     return Path(path)
 
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.io.exr import write_exr
 from spadwarp.io.parsing import parse_json, parse_toml, read_columns, read_text
 from spadwarp.io.paths import file_problem
 from spadwarp.limits import Interval, check_integer, check_real, parse_number, shown
@@ -144,3 +145,9 @@ def test_columns_may_have_a_title_comments_and_more_columns(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("# from a paper\ntime,value,error\n0,1,0.1\n\n 1.5 ,2e0\n")
     assert read_columns(path, {"time": "[0, 2]", "value": "[0, 2]"}).tolist() == [[0, 1], [1.5, 2]]
+
+
+def test_files_may_have_names_that_are_not_unicode(tmp_path):
+    path = tmp_path / "a\udcff.exr"
+    written = write_exr(path, {"Z": np.ones((2, 3), np.float32)})
+    assert written.read_bytes()[:4] == b"\x76\x2f\x31\x01"

@@ -290,6 +290,19 @@ def test_meshes_beyond_float32_are_refused(tmp_path: Path) -> None:
     assert "not finite" in error_of({"mesh": str(path)})
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", ""),
+        ("material.obj", "mtllib\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "without the name of a material file"),
+    ],
+)
+def test_incomplete_mesh_files_are_refused(tmp_path: Path, name: str, text: str, problem: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    assert problem in error_of({"mesh": str(path), "reflectance": "from_file" if problem else 0.5})
+
+
 def test_meshes_without_any_area_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "line.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
