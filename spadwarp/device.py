@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import json
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,10 +104,46 @@ def processor_name(device: wp.Device | None = None) -> str:
 
 @functools.cache
 def start_warp() -> None:
-    """`wp.init()` without Warp's start-up text, nor its warning where there is no GPU."""
+    """`wp.init()` without Warp's start-up text, nor its warning where there is no GPU.
+
+    Raises `DeviceError` where the kernel cache cannot be used; so do kernels when they are loaded.
+    """
     import warp as wp
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _kernel_cache():
+        _init_quietly()
+    load = wp.Module.load
+
+    @functools.wraps(load)
+    def explained(*args: Any, **options: Any) -> Any:
+        with _kernel_cache():
+            return load(*args, **options)
+
+    wp.Module.load = explained  # type: ignore[method-assign]  # the one place that all kernels pass
+
+
+@contextmanager
+def _kernel_cache() -> Iterator[None]:
+    """Errors of Warp's kernel cache name its folder, and what to do about it."""
+    import warp as wp
+
+    try:
+        yield
+    except Exception as error:
+        if not (isinstance(error, OSError | json.JSONDecodeError) or str(error).startswith("Failed to load C")):
+            raise
+        folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+        where = "Warp's kernel cache" + (f" {folder}" if folder else "")
+        raise DeviceError(
+            f"{where} cannot be used: {error}; remove it if it is damaged, or set WARP_CACHE_PATH to a folder that can "
+            "be written"
+        ) from error
+
+
+def _init_quietly() -> None:
+    import warp as wp
+
     if _has_cuda_driver():
         wp.init()
         return

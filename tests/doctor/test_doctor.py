@@ -1,12 +1,14 @@
 """`spadwarp doctor`: the self-test against known values, and messages about what is wrong."""
 
 import re
+import subprocess
+import sys
 
 import pytest
 import warp as wp
 
 import spadwarp
-from helpers.cli import DEVICE, run, tables
+from helpers.cli import DEVICE, ENVIRONMENT, run, tables
 from spadwarp.doctor import diagnosis, self_test
 
 
@@ -34,6 +36,34 @@ def test_a_cache_that_cannot_be_written_is_a_problem(monkeypatch, tmp_path):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file" / "cache"))
     found = spadwarp.doctor.diagnose(device="cpu", self_test=False)
     assert not found.healthy and "set WARP_CACHE_PATH" in found.problems[0]
+
+
+ARRIVAL = """
+import numpy as np, spadwarp
+spadwarp.arrival_time(np.ones((1, 1, 16)), gate_start=0.0, bin_width=1e-9, method="peak", device="cpu")
+"""
+
+
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_used_is_named(tmp_path):
+    """In a process of its own, whose kernels are not loaded yet."""
+
+    def last_line(cache, code=1, command=("-c", ARRIVAL)):
+        environment = {**ENVIRONMENT, "WARP_CACHE_PATH": str(cache)}
+        process = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
+        assert process.returncode == code, process.stderr
+        return process.stderr.splitlines()[-1] if code else ""
+
+    cache = tmp_path / "cache"
+    last_line(cache, code=0)
+    for pattern, content in (("*.o", b"not a program"), ("*.meta", b"{")):
+        for path in cache.rglob(pattern):
+            path.write_bytes(content)
+        assert f"DeviceError: Warp's kernel cache {cache}" in (text := last_line(cache)) and "WARP_CACHE_PATH" in text
+    (tmp_path / "file").touch()
+    for command in (("-c", ARRIVAL), ("-m", "spadwarp", "doctor", "--no-self-test")):
+        text = last_line(tmp_path / "file" / "cache", command=command)
+        assert "Not a directory" in text and "set WARP_CACHE_PATH" in text
 
 
 @pytest.mark.parametrize(
