@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import POOLED, DepthFrames, depth_frames
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
+from spadwarp.io.parsing import parse_json
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import check_choice
 
@@ -196,8 +196,11 @@ def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str,
 
     `weights`: the file; default: the package's for `model`. Raises `FileError`; `ArgumentError` for an unknown model.
     """
-    header = _header(_weights_path(model, weights))
-    return {name: json.loads(text) if text[:1] in "{[" else text for name, text in header.items()}
+    path = _weights_path(model, weights)
+    try:
+        return {name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in _header(path).items()}
+    except ValueError as error:
+        raise FileError(f"{path}: its header is damaged: {error}") from error
 
 
 @lru_cache(maxsize=8)
@@ -216,6 +219,8 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
         network: Any = build_network(model)
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
         network.load_state_dict(values)
+        if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
+            raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
     network = network.to(torch.device(device)).to(memory_format=torch.channels_last)
@@ -272,5 +277,5 @@ def _header(path: Path) -> dict[str, str]:
     try:
         with safe_open(path, framework="np") as file:
             return dict(file.metadata() or {})
-    except (OSError, SafetensorError) as error:
+    except (OSError, ValueError, SafetensorError) as error:
         raise FileError(f"{path}: not a safetensors file: {error}") from error

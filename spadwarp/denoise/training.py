@@ -286,12 +286,16 @@ class _Run:
             kept = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
         except Exception as error:  # what a damaged file raises depends on where it is damaged
             raise FileError(f"{self.checkpoint}: damaged; remove it to start anew ({type(error).__name__})") from error
-        if kept["recipe"] != self.recipe.model_dump_json():
+        if not isinstance(kept, dict) or kept.get("recipe") != self.recipe.model_dump_json():
             raise ConfigError(f"{self.checkpoint} belongs to another recipe; remove it, or choose another folder")
-        for name, part in self.state.items():
-            part.load_state_dict(kept[name])
-        if rank < len(kept["random"]):
-            self.generator.set_state(kept["random"][rank])
+        try:
+            for name, part in self.state.items():
+                part.load_state_dict(kept[name])
+            if rank < len(kept["random"]):
+                self.generator.set_state(kept["random"][rank])
+            kept = {**kept, "step": int(kept["step"]), "seconds": float(kept["seconds"])}
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
         if rank == 0 and self.log.is_file():  # a line is written before its checkpoint
             lines = self.log.read_text().splitlines(keepends=True)
             settings = self.recipe.optimiser

@@ -1,0 +1,51 @@
+"""Weights and checkpoints of training that somebody has changed, or that were cut."""
+
+import json
+import struct
+
+import pytest
+
+torch = pytest.importorskip("torch")
+from safetensors.torch import load_file, save_file  # noqa: E402
+
+from spadwarp.denoise.inference import WEIGHTS, load_network, own_weights, weights_metadata  # noqa: E402
+from spadwarp.errors import FileError, SpadwarpError  # noqa: E402
+
+SOURCE = WEIGHTS / "usdn.safetensors"
+
+
+@pytest.mark.parametrize("text", ["{", "[" * 10_000, '{"a": ' * 5_000])
+def test_a_header_that_is_not_json_is_refused(text, tmp_path):
+    path = tmp_path / "usdn.safetensors"
+    save_file(load_file(SOURCE), path, metadata={"model": "usdn", "recipe": text})
+    with pytest.raises(FileError, match=r"usdn\.safetensors: its header is damaged"):
+        weights_metadata("usdn", path)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    values = load_file(SOURCE)
+    name = next(iter(values))
+    values[name].view(-1)[0] = float("nan")
+    save_file(values, tmp_path / "usdn.safetensors", metadata={"model": "usdn"})
+    with pytest.raises(FileError, match=f"{name} is not finite"):
+        load_network("usdn", tmp_path / "usdn.safetensors")
+
+
+def test_sizes_that_a_header_declares_and_the_file_does_not_have(tmp_path):
+    content, path = SOURCE.read_bytes(), tmp_path / "usdn.safetensors"
+    (length,) = struct.unpack_from("<Q", content)
+    header = json.loads(content[8 : 8 + length])
+    name = next(key for key in header if key != "__metadata__")
+    header[name]["shape"] = [2**40, 2**20]
+    text = json.dumps(header).encode()
+    for changed in (
+        struct.pack("<Q", len(text)) + text + content[8 + length :],
+        struct.pack("<Q", 2**63) + content[8:],
+        content[: len(content) // 2],
+        content[:8],
+        b"",
+    ):
+        path.write_bytes(changed)
+        for read in (lambda: load_network("usdn", path), lambda: own_weights(["usdn"], path)):
+            with pytest.raises(SpadwarpError, match=r"usdn\.safetensors"):
+                read()
