@@ -13,6 +13,8 @@ from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, say
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 
+_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
+
 
 @app.command()
 def denoise(
@@ -27,7 +29,12 @@ def denoise(
     ],
     out: opt.Out,
     model: Annotated[
-        str, typer.Option(metavar="NAME", help="pyramid, histograms, dncnn, usdn; or median, gating, bm3d.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="pyramid, histograms, dncnn, usdn; or median, gating, bm3d; for counts "
+            "also likelihood, pooled, semi-global, total-variation.",
+        ),
     ] = "pyramid",
     gate: Annotated[
         tuple[float, float] | None,
@@ -59,6 +66,12 @@ def denoise(
     group_index: measured.GroupIndex = None,
     irf_fwhm_ps: measured.IrfFwhm = None,
     irf: measured.Irf = None,
+    mask: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.5."
+        ),
+    ] = None,
     device: opt.TorchDevice = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -66,9 +79,12 @@ def denoise(
 ) -> None:
     """Denoise depth frames.
 
-    Writes NAME.npy (all frames), NAME.exr and NAME.png (the first) for each file. Histograms become depth first: counts
-    by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then denoised
-    with their histograms. Needs pip install "spadwarp[denoise]".
+    Writes for each file: NAME.npy (depth of all frames), NAME_target.npy and NAME_confidence.npy (the probabilities
+    that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
+    Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
+    counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
+    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel. Needs
+    pip install "spadwarp[denoise]".
 
     \b
     Examples:
@@ -85,30 +101,21 @@ def denoise(
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
         raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
     given = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
-    names = [f"{stem}.{ending}" for stem in stems for ending in ("npy", "exr", "png")]
+    names = [stem + ending for stem in stems for ending in _ENDINGS]
     needed = sum(one.stat().st_size for one in paths if one.is_file())
     options: dict[str, Any] = {"inputs": (*paths, profile, weights, irf), "overwrite": overwrite, "needed": needed}
     outputs = opt.check_outputs(out, names, json=json_path, **options)
     facts = measured.facts(
         dataset, axes, image_size, tag_unit_ps, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf, sum_frames
     )
-    lines, summary, failed = {}, [], 0
+    settings: dict[str, Any] = {
+        "model": model, "gate": gate, "profile": given, "weights": weights, "device": device, "mask": mask,
+        "as_depth": depth, "channel": channel, "scale": scale, "group_index": group_index, **facts,
+    }  # fmt: skip
+    lines, summary, failed, written = {}, [], 0, 0
     for number, one in enumerate(paths, 1):
         try:
-            done = denoise_file(
-                one,
-                out,
-                model=model,
-                gate=gate,
-                profile=given,
-                weights=weights,
-                device=device,
-                as_depth=depth,
-                channel=channel,
-                scale=scale,
-                group_index=group_index,
-                **facts,
-            )
+            done = denoise_file(one, out, **settings)
         except (ConfigError, FileError, ArgumentError) as error:
             if len(paths) == 1:
                 raise
@@ -117,15 +124,27 @@ def denoise(
             continue
         there = float(np.isfinite(done.depth).mean())
         frames = "1 frame" if len(done.depth) == 1 else f"{opt.count(len(done.depth))} frames"
-        lines[one.name] = f"{frames}, {100 * there:.3g} % of the pixels have a depth"
-        summary.append({"file": one, "gate": done.gate, "filled": there, "files": done.files, "notes": done.notes})
+        written += len(done.files)
+        target = float((done.target_probability >= 0.5).mean())
+        parts = f"{100 * there:.3g} % of the pixels have a depth, {100 * target:.3g} % show a target"
+        lines[one.name] = f"{frames}, {parts}"
+        summary.append(
+            {
+                "file": one,
+                "gate": done.gate,
+                "filled": there,
+                "target": target,
+                "files": done.files,
+                "notes": done.notes,
+            }
+        )
         if not quiet:
             for note in done.notes:
                 complain(f"{one.name}: {note}")
             if len(paths) > 1:
                 complain(f"{number} of {len(paths)}")
     if not quiet:
-        say(opt.rows({**lines, "written": f"{3 * len(summary)} files in {out}"}))
+        say(opt.rows({**lines, "written": f"{written} files in {out}"}))
     outputs.write_json({"model": model, "files": summary})
     if failed:
         raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")

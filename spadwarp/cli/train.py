@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from spadwarp.cli import _options as opt
-from spadwarp.cli._app import app, say
+from spadwarp.cli._app import app, complain, say
 from spadwarp.cli._progress import progress
 from spadwarp.limits import environment_integer
 
@@ -31,15 +31,14 @@ def train(
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Train a denoiser on the clean scenes of a dataset.
+    """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
-    New noise is drawn for each step. Writes weights (safetensors), log.jsonl, curves.png and a checkpoint; Ctrl-C or
-    SIGTERM keep a checkpoint of the last step, and the same command resumes the training. On several GPUs: torchrun
-    --nproc-per-node N -m spadwarp train ...
+    New noise is drawn for each step; after the first ones it says how long it will take. Writes weights (safetensors),
+    log.jsonl, curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command
+    resumes the training. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:
-      spadwarp dataset make configs/datasets/training.toml --out data/training/
       spadwarp train configs/training/pyramid.toml --out runs/pyramid/
     """
     from spadwarp.denoise import load_training_recipe
@@ -63,7 +62,7 @@ def train(
         resume=True,
     )
     with progress(quiet=quiet or not first, unit="steps") as shown:
-        trained = run(chosen, out, device=device, progress=shown)
+        trained = run(chosen, out, device=device, progress=shown, notify=None if quiet or not first else complain)
     if first:
         if not quiet:
             say(

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, denoise_frames, own_weights
+from spadwarp.denoise.inference import METHODS, denoise_frames
+from spadwarp.denoise.likelihood import CLASSICAL
 from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
+from spadwarp.denoise.network_files import own_weights
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.limits import check_choice, check_integer
 
@@ -163,8 +165,10 @@ class _Comparison:
         wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
         for name in models:
             check_choice("models: an item", name, METHODS)
-        if "histograms" in wanted:
-            raise ArgumentError("models: 'histograms' needs histograms, which datasets do not keep; evaluate a result")
+        if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
+            raise ArgumentError(
+                f"models: {counting[0]!r} needs histograms, which datasets do not keep; evaluate a result"
+            )
         frames = check_integer("frames", frames, "[1, 1000000000]")
         bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
         self.data, self.split, self.device, self.methods = data, split, device, ("input", *wanted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import depth_frames
-from spadwarp.denoise.inference import denoise_frames, features_of_histograms, weights_metadata
+from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
+from spadwarp.denoise.inference import Estimate, estimate_frames
+from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
+from spadwarp.denoise.network_files import weights_metadata
+from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import gate_of, holds_own_file, is_own_file, load, locate, stored_depth
 from spadwarp.frames.depth import depth_of
@@ -56,9 +60,12 @@ class DepthReading:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """What `denoise_file` wrote: depth `[N, H, W]` [m], gate [m], paths of the files, and notes for the user."""
+    """What `denoise_file` wrote: depth `[N, H, W]` [m], probability that a pixel sees a target, probability that its
+    depth is right, gate [m], paths of the files, and notes for the user."""
 
     depth: NDArray[np.float32]
+    target_probability: NDArray[np.float32]
+    confidence: NDArray[np.float32]
     gate: tuple[float, float]
     files: tuple[Path, ...]
     notes: tuple[str, ...]
@@ -84,14 +91,20 @@ def denoise_file(
     profile: NDArray[np.float64] | None = None,
     weights: str | Path | None = None,
     device: str | None = None,
+    mask: float | None = None,
     **reading: Any,
 ) -> Denoised:
-    """Denoises the depth in a file; writes `NAME.npy` (all frames), `NAME.exr` and `NAME.png` (the first) to `out`.
+    """Denoises the depth in a file.
+
+    Writes to `out`: `NAME.npy`, `NAME_target.npy`, `NAME_confidence.npy` (depth and the two probabilities of all
+    frames), `NAME.exr` (all three of the first), and `NAME.png`, in which open water is left out. From counts also
+    `NAME_second.npy`, the depth of a second return in the same pixel, NaN where there is none.
 
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
         out: The folder.
-        model, weights, device: See `spadwarp.denoise.apply`.
+        model, weights, device: See `spadwarp.denoise.estimate`.
+        mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
         gate: (start, stop) in depth [m]; default: the file's, else from the nearest to the farthest depth in it.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
         reading: Arguments of `read_depth`.
@@ -105,6 +118,8 @@ def denoise_file(
         raise ArgumentError(
             f"out = {folder} is the folder of {path}; another is needed, so that nothing is overwritten"
         )
+    if mask is not None and not 0.0 <= mask <= 1.0:
+        raise ArgumentError(f"mask = {mask} is outside [0, 1]")
     read = read_depth(path, **reading)
     notes = [read.source]
     gate = gate or read.gate
@@ -117,30 +132,49 @@ def denoise_file(
         notes.append(f"gate {gate[0]:.4g} to {gate[1]:.4g} m, from the nearest to the farthest depth of the file")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        features = None
-        counts = read.histograms if model in ("pyramid", "histograms") else None
-        if counts is not None and (weights is None or weights_metadata(model, weights).get("model") == "histograms"):
-            model = "histograms"
+        counts = read.histograms if model in ("pyramid", "histograms", *CLASSICAL) else None
+        counting = counts is not None and (weights is None or weights_metadata(model, weights)["model"] == "histograms")
+        if counts is not None and counting:
+            model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
-            features = _features(counts, group_index=reading.get("group_index"), device=device)
-        profile = read.profile if profile is None else profile
-        frames = depth_frames(read.depth, gate=gate, profile=profile, features=features)
-        found, seen = denoise_frames(frames, model=model, weights=weights, device=device)
-        depth = np.where(seen, found, np.float32(np.nan))
+            found, second = _from_counts(
+                read, counts, gate, profile, model, weights, reading.get("group_index"), device
+            )
+        else:
+            second = None
+            frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
+            found = estimate_frames(frames, model=model, weights=weights, device=device)
+        depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
     empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
     if empty:
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
-    with atomic_path(folder / f"{name}.npy") as temporary, temporary.open("wb") as file:
-        np.save(file, depth if read.frames else depth[0])
-    metadata = {"content": "denoised depth", "method": model, "frame": "+x right, +y down, +z forward"}
+    if second is not None:
+        notes.append(f"{100 * np.isfinite(second).mean():.2g} % of the pixels have a second return")
+    shown = found.masked(0.5 if mask is None else mask)[0]
+    files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
     title = f"{Path(path).name}: {model}"
-    files = (
-        folder / f"{name}.npy",
-        write_exr(folder / f"{name}.exr", {"Z": np.ascontiguousarray(depth[0])}, metadata),
-        draw_denoised(read.depth[0], depth[0], folder / f"{name}.png", gate=gate, title=title),
-    )
-    return Denoised(depth=depth, gate=gate, files=files, notes=tuple(notes))
+    files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, title=title))
+    return Denoised(
+        depth=depth, target_probability=found.target_probability, confidence=found.confidence, gate=gate,
+        files=tuple(files), notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _write(
+    folder: Path, name: str, read: DepthReading, found: Estimate, second: NDArray[np.float32] | None, method: str
+) -> list[Path]:
+    """Writes the arrays and the EXR of `denoise_file`; their paths."""
+    arrays = {"": found.depth, "_target": found.target_probability, "_confidence": found.confidence}
+    if second is not None:
+        arrays["_second"] = second
+    for ending, values in arrays.items():
+        with atomic_path(folder / f"{name}{ending}.npy") as temporary, temporary.open("wb") as file:
+            np.save(file, values if read.frames else values[0])
+    metadata = {"content": "denoised depth", "method": method, "frame": "+x right, +y down, +z forward"}
+    channels = {"Z": found.depth, "target_probability": found.target_probability, "confidence": found.confidence}
+    first = {channel: np.ascontiguousarray(values[0]) for channel, values in channels.items()}
+    return [*(folder / f"{name}{ending}.npy" for ending in arrays), write_exr(folder / f"{name}.exr", first, metadata)]
 
 
 def read_depth(
@@ -242,24 +276,56 @@ def _estimate_depth(
     )
 
 
-def _features(histograms: Histograms, *, group_index: float | None, device: str | None) -> NDArray[np.float32]:
-    """Features of counts, `[N, FEATURES, H, W]`, pooled depths in metres."""
-    values, scene = histograms.values, histograms.scene
-    width = float(histograms.bin_width or 0.0)
+def _from_counts(
+    read: DepthReading,
+    histograms: Histograms,
+    gate: tuple[float, float],
+    profile: NDArray[np.float64] | None,
+    model: str,
+    weights: str | Path | None,
+    group_index: float | None,
+    device: str | None,
+) -> tuple[Estimate, NDArray[np.float32]]:
+    """The estimate of a method that uses counts, in the bins that hold the target; and second returns [m]."""
+    scene, width = histograms.scene, float(histograms.bin_width or 0.0)
     known = np.asarray(histograms.background, np.float32)
+    shape = histograms.values.shape
+    known = np.broadcast_to(known, shape[-3:] if known.ndim == 3 else shape[-1:])
     assert histograms.response is not None
+    response = histograms.response.per_bin(width)
+    first, stop, part = target_bins(histograms.values, known, response, gate)
+    values, start = histograms.values[..., first:stop], histograms.gate_start + first * width
 
-    def to_depth(part: NDArray[np.float32]) -> NDArray[np.float64]:
-        time = histograms.gate_start + part.astype(np.float64) * (values.shape[-1] * width)
+    def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
+        time = start + place.astype(np.float64) * (values.shape[-1] * width)
         return range_from_time(time, float(group_index or 1.0)) if scene is None else depth_from_time(time, scene=scene)
 
-    return features_of_histograms(
-        values,
-        background=np.broadcast_to(known, values.shape[-3:] if known.ndim == 3 else values.shape[-1:]),
-        response=histograms.response.per_bin(width),
-        device=device,
-        to_depth=to_depth,
-    )
+    given: dict[str, Any] = {
+        "counts": values, "background": known[..., first:stop], "response": response, "device": device,
+    }  # fmt: skip
+    if model in CLASSICAL:
+        place = classical_depth(method=model, **given)  # type: ignore[arg-type]
+        depth = to_depth(place).astype(np.float32).reshape(read.depth.shape)
+        found = Estimate(depth, np.ones_like(depth), np.full_like(depth, np.nan))
+        return found, _second(found.depth, to_depth, given)
+    features = features_of_histograms(**given, to_depth=to_depth)
+    if profile is None or values.shape[-1] < shape[-1]:
+        profile = _profile(dataclasses.replace(histograms, values=values, background=known[..., first:stop]))
+    with warnings.catch_warnings():
+        if values.shape[-1] < shape[-1]:
+            warnings.simplefilter("ignore")  # depths outside this part are false peaks
+        frames = depth_frames(read.depth, gate=part, profile=profile, features=features)
+    found = estimate_frames(frames, model=model, weights=weights, device=device)
+    return found, _second(found.depth, to_depth, given)
+
+
+def _second(
+    depth: NDArray[np.float32], to_depth: Callable[[NDArray[np.float32]], NDArray[Any]], given: dict[str, Any]
+) -> NDArray[np.float32]:
+    """Depth of second returns [m]; depth is linear in the place over the gate."""
+    start, stop = (to_depth(np.full_like(depth, place)) for place in (0.0, 1.0))
+    place = ((depth - start) / (stop - start)).reshape(given["counts"].shape[:-1])
+    return to_depth(second_return(place, **given).reshape(depth.shape)).astype(np.float32)
 
 
 def _profile(histograms: Histograms) -> NDArray[np.float64] | None:

@@ -12,7 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_real, shown
 
-__all__ = ["LOG_DENSITY_LIMIT", "MARGIN", "POOLED", "SMALLEST_SIDE", "DepthFrames", "depth_frames", "fill_missing"]
+__all__ = [
+    "LOG_DENSITY_LIMIT",
+    "MARGIN",
+    "POOLED",
+    "SCORED",
+    "SMALLEST_SIDE",
+    "DepthFrames",
+    "depth_frames",
+    "fill_missing",
+]
 
 LOG_DENSITY_LIMIT = 4.0
 """The logarithm of a backscatter density is clipped at ± this."""
@@ -20,8 +29,11 @@ LOG_DENSITY_LIMIT = 4.0
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
-POOLED = 3
-"""Number of depths among the features of histograms: one for each window over which histograms are pooled."""
+POOLED = 6
+"""Number of depths among the features of histograms: see `spadwarp.denoise.histogram_features`."""
+
+SCORED = 3
+"""Windows whose log-likelihood of each of these depths is among the features."""
 
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
@@ -56,29 +68,32 @@ class DepthFrames:
         start, stop = self.gate
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
-    def network_input(self, *, histograms: bool = False) -> NDArray[np.float32]:
+    def network_input(
+        self, *, histograms: bool = False, fills: bool = False, gates: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
         """Channels for a network, `[N, 3, H, W]`, and with `histograms` also their features.
 
-        `spadwarp.denoise.networks` describes the channels. Without histograms, missing pixels are filled with the
-        nearest depth where pixels around them report nearly as often as elsewhere: networks of depth are trained on
-        frames in which few pixels are missing.
+        `spadwarp.denoise.networks` describes the channels. `gates`: (start, stop) of each frame `[N, 2]` [m], narrower
+        than `gate`; depths beyond `MARGIN` around it count as not reported. `fills`: for networks that do not see which
+        pixels reported: missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
-        scaled, density = self.scaled, self.density
-        if not histograms and np.isnan(scaled).any():
-            density = density.copy()
-            for depth, level in zip(scaled, density, strict=True):
-                source = _fill_source(depth, level)
-                depth[:], level[:] = depth[source], level[source]
-        reported = ~np.isnan(scaled)
+        if gates is None:
+            gates = np.tile(np.asarray(self.gate, np.float64), (len(self.depth), 1))
+        start, width = gates[:, 0, None, None], (gates[:, 1] - gates[:, 0])[:, None, None]
+        scaled = ((self.depth - start) / width).astype(np.float32)
+        if fills:
+            for depth, level in zip(scaled, self.density, strict=True):
+                depth[:] = depth[_fill_source(depth, level)]
+        with np.errstate(invalid="ignore"):
+            reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
         limit = LOG_DENSITY_LIMIT
-        log_density = np.log(np.clip(density, math.exp(-limit), math.exp(limit)))
+        log_density = np.log(np.clip(self.density, math.exp(-limit), math.exp(limit)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
         frame = np.stack([channel.astype(np.float32) for channel in channels], axis=1)
         if not histograms:
             return frame
         assert self.features is not None
-        start, stop = self.gate
-        pooled = (self.features[:, :POOLED] - start) / (stop - start) - 0.5
+        pooled = (self.features[:, :POOLED] - start[:, None]) / width[:, None] - 0.5
         return np.concatenate([frame, pooled, self.features[:, POOLED:]], axis=1, dtype=np.float32)
 
 

@@ -1,19 +1,24 @@
-"""Features of histograms beyond the depth of each pixel: depth of pooled histograms, and the shape of the return.
+"""Features of histograms: candidates for the depth of each pixel, their log-likelihoods, and the shape of the return.
 
 A single pixel with one photon among twenty of the background says little; nine pixels, or 225, say more. Pooling blurs
-sharp edges, so depth is estimated over windows of several sizes, and a network chooses. The shape of the return shows
-how late the light arrives that water scattered forward.
+sharp edges, so depth is estimated over windows of several sizes and by semi-global matching, and a network chooses. The
+log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows how late the light
+arrives that water scattered forward.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.frames import POOLED
+from spadwarp.denoise.frames import POOLED, SCORED
+from spadwarp.denoise.semi_global import aggregate, usual_jump
 
-__all__ = ["EDGES", "FEATURES", "TAIL", "WINDOWS", "extract_features", "toeplitz"]
+__all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
+__all__ += ["log_likelihood", "pooled", "toeplitz"]
 
 WINDOWS = (3, 7, 15)
 """Sides of the windows over which histograms are pooled [pixels]."""
@@ -24,8 +29,13 @@ EDGES = (-0.12, -0.06, -0.03, -0.01, 0.01, 0.03, 0.06, 0.12, 0.25)
 TAIL = 0.04
 """Mean delay of the scattered light in the template of the largest window [gate widths]."""
 
-assert len(WINDOWS) == POOLED
-FEATURES = len(WINDOWS) + len(EDGES) - 1 + 2
+MOST = 20.0
+"""Differences of log-likelihoods are clipped at this."""
+
+SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2
+"""Number of channels of `extract_features` that go through the network's layers."""
+
+FEATURES = SEEN + POOLED
 """Number of channels that `extract_features` gives."""
 
 _UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
@@ -33,13 +43,13 @@ _MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
 
 
 def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """Depth of pooled histograms and the shape of the return.
+    """Candidates for depth, their log-likelihoods and the shape of the return.
 
     The score of a return in bin k is its log-likelihood ratio less what background alone gives on average,
     Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
     mean signal of the frame; B' is B plus 0.3 S spread evenly over the gate. Scores of pixels add. The template h is
-    the instrument response for the two smaller windows; for the largest it is that response with an exponential tail,
-    as light arrives that was scattered forward.
+    the instrument response; for the largest window it is that response with an exponential tail, as light arrives that
+    was scattered forward.
 
     Args:
         counts: Histograms over the gate, `[B, H, W, T]`.
@@ -47,9 +57,12 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
         response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
 
     Returns:
-        `[B, FEATURES, H, W]`: depth over the gate for each of `WINDOWS`; the excess over the background between
-        `EDGES` around the last of these depths, as shares over 7 × 7 pixels; and how significant the excess is, in the
-        pixel and in 7 × 7.
+        `[B, FEATURES, H, W]`. `POOLED` depths over the gate: of the highest score of the pixel, of its highest score
+        elsewhere, of semi-global matching, and of the highest scores over `WINDOWS`. Then `SCORED` times `POOLED`
+        scores at these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to
+        `MOST`: of the pixel, of 3 × 3 and of 7 × 7 pixels. Then the excess over the background between `EDGES` around
+        the last depth, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in 7 × 7. Last,
+        beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
     """
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
     if merged > 1:
@@ -57,32 +70,77 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
     bins = counts.shape[-1]
     above = counts - background
     background = background.mean(dim=(1, 2))  # scores are sums over pixels: these have one template
-    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(0.05)
     narrow = toeplitz(response, bins)
+    score = torch.bmm(above.flatten(1, 2), _template(above, background, narrow)).view_as(counts)
+    found = [highest(score), _elsewhere(score, response), highest(aggregate(score, jump=usual_jump(score)))]
+    cubes = [score, *(pooled(score, side) * side**2 for side in WINDOWS[:-1])]
+    found += [highest(cube) for cube in cubes[1:]]
     delays = torch.arange(bins, device=counts.device)
     tail = torch.exp(-delays / (TAIL * bins))
     distance = delays[:, None] - delays
     late = torch.where(distance >= 0, tail[distance.clamp_min(0)], 0.0) / tail.sum()
-    floor = _UNIFORM_SHARE * signal[:, None] / bins
-    ratio = signal[:, None, None] / (background + floor)[:, :, None]
+    wide = torch.bmm(above.flatten(1, 2), _template(above, background, late @ narrow)).view_as(counts)
+    found.append(highest(pooled(wide, WINDOWS[-1])))
+    del wide, score
+    places = torch.stack(found, dim=-1)
+    near = [_near(cube, places) for cube in cubes]
+    tops = [cube.amax(dim=-1, keepdim=True) for cube in cubes]
+    scores = [0.1 * (one - top).clamp_min(-MOST) for one, top in zip(near, tops, strict=True)]
+    peaks = [0.1 * top.clamp(0.0, MOST) for top in tops]
+    shares = _shape(above, background, found[-1])
+    places = places * (merged * bins / given)  # the last of merged bins may reach beyond the gate
+    return torch.cat([places, *scores, *peaks, *shares, 0.1 * near[0]], dim=-1).movedim(-1, 1)
 
-    score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * narrow)).view_as(counts)
-    found = [_highest(_pooled(score, side)) for side in WINDOWS[:-1]]
-    score = torch.bmm(above.flatten(1, 2), torch.log1p(ratio * (late @ narrow))).view_as(counts)
-    found.append(_highest(_pooled(score, WINDOWS[-1])))
-    del score
 
-    anchor = found[-1]
-    edges = anchor[..., None] + torch.tensor(EDGES, device=counts.device)
+def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
+    """Score of a return in each bin, as `extract_features` describes it, `[B, H, W, T]`; arguments as there."""
+    above = counts - background
+    narrow = toeplitz(response, counts.shape[-1])
+    template = _template(above, background.mean(dim=(1, 2)), narrow)
+    return torch.bmm(above.flatten(1, 2), template).view_as(counts)
+
+
+def _template(above: Tensor, background: Tensor, response: Tensor) -> Tensor:
+    """ln(1 + S h / B') in bin j for a return in bin k, `[B, j, k]`."""
+    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(0.05)
+    floor = _UNIFORM_SHARE * signal[:, None] / above.shape[-1]
+    return torch.log1p(signal[:, None, None] / (background + floor)[:, :, None] * response)
+
+
+def _elsewhere(score: Tensor, response: Tensor) -> Tensor:
+    """Place of the highest score beyond the response around the highest one."""
+    bins = score.shape[-1]
+    apart = torch.arange(-(response.shape[-1] // 2), response.shape[-1] // 2 + 1, device=score.device)
+    width = (response * apart.square()).sum(dim=1).clamp_min(0.1).sqrt()
+    best = score.argmax(dim=-1, keepdim=True)
+    near = (torch.arange(bins, device=score.device) - best).abs() <= (3.0 * width + 1.0)[:, None, None, None]
+    return highest(torch.where(near, score.amin(), score))
+
+
+def _near(cube: Tensor, places: Tensor) -> Tensor:
+    """The highest score within a bin of places over the gate, `[B, H, W, n]`."""
+    bins = cube.shape[-1]
+    middle = (places * bins).long()
+    return torch.stack([cube.gather(-1, (middle + step).clamp(0, bins - 1)) for step in (-1, 0, 1)]).amax(dim=0)
+
+
+@lru_cache(maxsize=4)
+def _edges(device: torch.device) -> Tensor:
+    """`EDGES` on a device; kept, so that a CUDA graph finds them there."""
+    with torch.inference_mode(False):
+        return torch.tensor(EDGES, device=device)
+
+
+def _shape(above: Tensor, background: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
+    """Shares of the excess between `EDGES` around the anchor over the gate `[B, H, W]`, and its significances."""
+    edges = anchor[..., None] + _edges(above.device)
     level = _within(background[:, None, None, :].cumsum(dim=-1), edges[..., [0, -1]])[..., 0]
     pixel = _within(above.cumsum(dim=-1), edges[..., [0, -1]])[..., 0] / (level + 1.0).sqrt()
-    excess = 49.0 * _within(_pooled(above, 7).cumsum(dim=-1), edges)
+    excess = 49.0 * _within(pooled(above, 7).cumsum(dim=-1), edges)
     spread = ((excess.sum(dim=-1) + 49.0 * level).clamp_min(0.0) + 1.0).sqrt()
     shares = excess / (excess.abs().sum(dim=-1) + spread)[..., None]
-    pooled = excess.sum(dim=-1) / (49.0 * level + 1.0).sqrt()
-    significance = [0.5 * torch.asinh(pixel), 0.3 * torch.asinh(pooled)]
-    found = [depth * (merged * bins / given) for depth in found]  # the last of merged bins may reach beyond the gate
-    return torch.stack([*found, *shares.unbind(dim=-1), *significance], dim=1)
+    window = excess.sum(dim=-1) / (49.0 * level + 1.0).sqrt()
+    return shares, torch.stack([0.5 * torch.asinh(pixel), 0.3 * torch.asinh(window)], dim=-1)
 
 
 def _rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -106,7 +164,7 @@ def toeplitz(response: Tensor, bins: int) -> Tensor:
     return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
 
 
-def _pooled(cube: Tensor, side: int) -> Tensor:
+def pooled(cube: Tensor, side: int) -> Tensor:
     """Mean over `side` × `side` pixels around each, of those within the frame; `[B, H, W, T]`.
 
     Windows on a CPU, products with banded matrices on a GPU: each is several times faster on its device.
@@ -127,7 +185,7 @@ def _pooled(cube: Tensor, side: int) -> Tensor:
     return torch.matmul(band(width), torch.matmul(band(height), cube.flatten(2)).view_as(cube))
 
 
-def _highest(score: Tensor) -> Tensor:
+def highest(score: Tensor) -> Tensor:
     """Place of the highest score over the gate, to fractions of a bin by the parabola through its neighbours."""
     bins = score.shape[-1]
     best = score.argmax(dim=-1, keepdim=True)

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, denoise_frames, features_of_histograms, own_weights
+from spadwarp.denoise.histogram_inputs import features_of_histograms
+from spadwarp.denoise.inference import METHODS, denoise_frames
+from spadwarp.denoise.network_files import own_weights
 from spadwarp.errors import SpadwarpError
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.estimators import arrival_time

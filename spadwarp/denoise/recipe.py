@@ -61,7 +61,8 @@ class Noise(_Table):
     own_gate: Share = Field(0.5, description="samples with the scene's own gate")
     own_profile: Share = Field(0.7, description="of these, samples with the scene's own backscatter profile")
     gate_width: Positive = Field((1.0, 8.0), description="width of other gates [m], uniform in the logarithm")
-    behind: Share = Field(0.4, description="samples with backscatter from behind the target too: multiple scattering")
+    wide_gate: Share = Field(0.5, description="samples whose camera's gate is wider than what the network is given")
+    behind: Share = Field(0.55, description="samples with backscatter from behind the target too: multiple scattering")
     slanted_gate: Share = Field(0.5, description="samples whose gate opens up to 15 % of its width nearer in depth")
     counting: Share = Field(0.2, description="samples whose depth was estimated from histograms of few photons")
     photons: Positive = Field((0.7, 150.0), description="signal counts per pixel of these, uniform in the logarithm")
@@ -72,6 +73,10 @@ class Noise(_Table):
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
+    two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
+    sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
+    tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")
+    hot: Share = Field(0.01, description="highest part of the pixels that report any depth because they are defective")
     dead: Share = Field(0.1, description="highest part of the pixels that report nothing because they are defective")
     unknown_water: Share = Field(0.2, description="samples whose backscatter profile is hidden from the network")
 
@@ -82,6 +87,8 @@ class Optimiser(_Table):
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
     batch: Whole = Field(64, ge=1, le=10**6, description="crops per update, on all GPUs together")
     crop: Whole = Field(96, ge=32, le=16384, description="side of a crop [pixels]")
+    scenes: Whole = Field(512, ge=1, le=10**6, description="scenes that are drawn at a time; without a dataset")
+    redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")
     learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; decreases along a cosine to a hundredth")
     warm_up: Whole = Field(500, ge=0, le=10**12, description="updates in which the learning rate rises")
     weight_decay: float = Field(1e-4, ge=0, le=1e3)
@@ -103,7 +110,11 @@ class TrainingRecipe(_Table):
     start: Literal["pyramid"] | None = Field(
         None, description="network of the package whose weights the training starts from"
     )
-    data: str = Field(..., min_length=1, description="dataset (folder), relative to the working directory")
+    data: str | None = Field(
+        None,
+        min_length=1,
+        description="dataset (folder), relative to the working directory; without it, scenes are drawn",
+    )
     seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
     optimiser: Optimiser = Optimiser()

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from spadwarp.denoise.evaluation import Evaluation
 from spadwarp.denoise.metrics import LARGER_IS_BETTER
+from spadwarp.denoise.scene_scores import SceneScores
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.text import json_text
-from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_samples, draw_scores
+from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_reliability, draw_samples, draw_scores
 from spadwarp.viz.pages import write_page
 
-__all__ = ["TITLES", "write_report"]
+__all__ = ["TITLES", "scene_table", "write_report", "write_scene_report"]
 
 _NBSP = "\N{NO-BREAK SPACE}"
 
@@ -42,6 +44,60 @@ def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
         frames=sum(evaluation.frames.values()),
         targets=evaluation.targets,
         summary=evaluation.summary,
+        tables=tables,
+        pictures=[(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()],
+    )
+    return [place / "report.html", *pictures.values(), place / "scores.json"]
+
+
+def scene_table(scores: SceneScores, setting: str, water: str) -> tuple[list[str], list[list[str]]]:
+    """Names of the columns and rows of text for a scene type: gains by level, errors, pixels missed and invented."""
+    names = ["method", *(f"{level:g}" for level in scores.levels()), "mean [dB]", "RMSE [mm]", "rim", "inside"]
+    names += ["missed", "invented", "steps"]
+    rows = []
+    for method in scores.methods:
+        where: dict[str, Any] = {"setting": setting, "water": water}
+        field = "psnr" if method == "input" else "gain"
+        form = "{:.1f}" if method == "input" else "{:+.1f}"
+        cells = [form.format(scores.mean(field, method, level=level, **where)) for level in scores.levels()]
+        cells.append(form.format(scores.mean(field, method, **where)))
+        cells += [f"{scores.mean(name, method, **where):.0f}" for name in ("rmse_mm", "rim_mm", "inside_mm")]
+        for name in ("missed", "invented"):
+            value = scores.mean(name, method, **where)
+            cells.append("–" if math.isnan(value) else f"{100 * value:.2f}{_NBSP}%")
+        resolved, total = (scores.mean(name, method, shape="stairs", **where) for name in ("resolved", "steps"))
+        cells.append("–" if math.isnan(total) else f"{resolved:.1f} of {total:.1f}")
+        rows.append([TITLES[method], *cells])
+    return names, rows
+
+
+def write_scene_report(scores: SceneScores, folder: str | Path) -> list[Path]:
+    """Writes `report.html`, `reliability.png` and `scores.json` to a folder; returns the paths, the report first.
+
+    A table for each scene type, and how often the probabilities were true. Raises `FileError`.
+    """
+    place = Path(folder)
+    note = "scenes of spadwarp.denoise.evaluation_scenes"
+    pictures = {
+        "Probabilities given, and how often they were true": draw_reliability(
+            scores.reliability, place / "reliability.png", note=note
+        )
+    }
+    with atomic_path(place / "scores.json") as temporary:
+        temporary.write_text(json_text(scores.to_dict(), indent=1))
+    tables: list[_Table] = []
+    for setting, water in scores.types():
+        names, rows = scene_table(scores, setting, water)
+        cells = [(name, [(text, False) for text in texts]) for name, *texts in rows]
+        tables.append((f"{setting.capitalize()}, backscatter {water}: PSNR of the input, gains [dB]", names, cells))
+    worse = ", ".join(f"{TITLES[name]} {scores.worse_than_input(name)}" for name in scores.methods[1:])
+    write_page(
+        place / "report.html",
+        "evaluation.html",
+        data="Scenes that no training saw",
+        frames=len(scores.rows) // len(scores.methods),
+        targets=list(dict.fromkeys(key[4] for key in scores.rows)),
+        summary=f"All pixels count; frames whose PSNR is below the input's: {worse}",
         tables=tables,
         pictures=[(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()],
     )

@@ -7,23 +7,23 @@ alike. Depth is over the gate: 0 at its start, 1 at its end.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
-from spadwarp.denoise.histogram_features import WINDOWS, extract_features, toeplitz
+from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN, POOLED
+from spadwarp.denoise.histogram_features import extract_features, toeplitz
 from spadwarp.denoise.recipe import Noise
+from spadwarp.denoise.shapes import Random, draw_scenes, smooth_noise
 
-__all__ = ["BINS", "Batch", "CleanScenes", "draw_batch", "log_density"]
+__all__ = ["BINS", "Batch", "CleanScenes", "draw_batch", "log_density", "procedural_scenes"]
 
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
 _COUNT_BINS = 192  # of the histograms behind frames with few photons
-_TAPS = 5  # a response extends over this many bins to each side
+_TAPS = 9  # a response extends over this many bins to each side
 
 
 class CleanScenes(NamedTuple):
@@ -57,39 +57,22 @@ class Batch(NamedTuple):
 
 class _Crops(NamedTuple):
     """Clean crops: depth and its bound over the gate, where a target is hit, `[B, h, w]`; the depth behind which no
-    backscatter comes from, `[B, h, w]`; the backscatter profile `[B, BINS]`."""
+    backscatter comes from, `[B, h, w]`; the backscatter profile `[B, BINS]`, over the camera's gate; and start and
+    width of that gate, in widths of the one that the network is given, which is narrower, `[B, 2]`."""
 
     clean: Tensor
     sigma: Tensor
     hit: Tensor
     reach: Tensor
     profile: Tensor
+    camera: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Random:
-    """Random numbers for `size` samples from one generator, in the order of the calls."""
-
-    size: int
-    generator: torch.Generator
-
-    def uniform(self, *shape: int) -> Tensor:
-        return torch.rand((self.size, *shape), generator=self.generator, device=self.generator.device)
-
-    def between(self, limits: tuple[float, float], *shape: int) -> Tensor:
-        return limits[0] + (limits[1] - limits[0]) * self.uniform(*shape)
-
-    def log_between(self, limits: tuple[float, float], *shape: int) -> Tensor:
-        return torch.exp(math.log(limits[0]) + math.log(limits[1] / limits[0]) * self.uniform(*shape))
-
-    def coin(self, probability: float, *shape: int) -> Tensor:
-        return self.uniform(*shape) < probability
-
-    def normal(self, shape: torch.Size) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.generator.device)
-
-    def integer(self, stop: int, *shape: int) -> Tensor:
-        return torch.randint(stop, (self.size, *shape), generator=self.generator, device=self.generator.device)
+def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str) -> CleanScenes:
+    """Scenes of `spadwarp.denoise.shapes`, `side` × `side` pixels, in water of flat backscatter."""
+    generator = torch.Generator(device).manual_seed(seed)
+    depth, sigma, gate = draw_scenes(count, side, generator)
+    return CleanScenes(depth, sigma, gate, torch.ones(count, BINS, device=depth.device))
 
 
 def draw_batch(
@@ -107,19 +90,9 @@ def draw_batch(
     A tenth of the samples has no pixels that report backscatter, unless `always_replaced`. With `histograms`, all
     samples are of counts and have the channels of their features.
     """
-    random = _Random(size, generator)
+    random = Random(size, generator)
     crops = _draw_crops(scenes, noise, crop, random)
-    clean, sigma, hit, reach, profile = crops
-    reported = clean + sigma * random.normal(clean.shape)
-    none = random.coin(0.0 if always_replaced else 0.1)
-    share = torch.where(none, 0.0, random.between(noise.backscatter))[:, None, None]
-    replaced = random.uniform(crop, crop) < share
-    backscatter = _backscatter_depth(profile, reach, random.uniform(crop, crop))
-    # A gate opens at one range, which is nearer in depth towards the corners of the view.
-    nearer = torch.where(random.coin(noise.slanted_gate), 0.15 * random.uniform(), 0.0)[:, None, None]
-    reported = torch.where(replaced, backscatter - nearer * (1.0 - backscatter), reported)
-    present = hit | (replaced & random.coin(0.5)[:, None, None])
-
+    reported, present = _report(crops, noise, random, always_replaced)
     counted = round(noise.counting * size)
     features = None
     if counted:
@@ -127,17 +100,57 @@ def draw_batch(
         some = _Crops(*(values[:counted] for values in crops))
         counts = _draw_counts(some, photons, photons / sbr, noise, generator)
         reported[:counted], present[:counted], features = _estimate(*counts, photons, histograms=histograms)
-    dead = torch.where(random.coin(0.7), 0.0, noise.dead * random.uniform())[:, None, None]
-    present &= (random.uniform(crop, crop) >= dead) & (reported > -MARGIN) & (reported < 1.0 + MARGIN)
-
+    reported, present = _defects(reported, present, noise, random)
+    clean, hit, profile = crops.clean, crops.hit, crops.profile
     reported = torch.where(present, reported, 1.0)
     known = torch.where(random.coin(noise.unknown_water)[:, None], 1.0, profile)
-    density = torch.where(present, log_density(known, reported), 0.0)
+    start, width = crops.camera[:, 0, None, None], crops.camera[:, 1, None, None]
+    density = torch.where(present, log_density(known, (reported - start) / width), 0.0)
     frame = torch.stack([reported, present.float(), density], dim=1)
     if features is not None:
-        features[:, : len(WINDOWS)] -= 0.5
+        features[:, :POOLED] -= 0.5
         frame = torch.cat([frame, features], dim=1)
     return Batch(frame, clean[:, None], hit[:, None].float())
+
+
+def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) -> tuple[Tensor, Tensor]:
+    """Reported depths over the gate, and which pixels report, `[B, h, w]`: the target's, or backscatter's."""
+    clean, sigma, hit, reach, profile, camera = crops
+    start, width = camera[:, 0, None, None], camera[:, 1, None, None]
+    reported = clean + sigma * random.normal(clean.shape)
+    late = (sigma * random.between((0.5, 3.0), 1, 1)) * -torch.log1p(-random.uniform(*clean.shape[1:]))
+    reported = reported + torch.where(random.coin(noise.tail, 1, 1), late, 0.0)
+    none = random.coin(0.0 if always_replaced else 0.1)
+    share = torch.where(none, 0.0, random.between(noise.backscatter))[:, None, None]
+    # Dark pixels report backscatter more often.
+    typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
+    darker = (sigma / typical.clamp_min(1e-9)[:, None, None]).clamp(0.3, 2.5)
+    uneven = random.coin(0.0 if always_replaced else 0.4, 1, 1)
+    share = torch.where(uneven & hit, (share * darker).clamp_max(0.75), share)
+    # Open water reports as often as targets are outshone, or at a rate of its own, or always, or never.
+    kind, rate = random.uniform(1, 1), random.uniform(1, 1)
+    rate = torch.where(kind < 0.1, 0.0, torch.where(kind > 0.9, 1.0, rate))
+    share = torch.where(hit | (kind.sub(0.5).abs() < 0.25), share, rate)
+    replaced = random.uniform(*clean.shape[1:]) < share
+    backscatter = _backscatter_depth(profile, (reach - start) / width, random.uniform(*clean.shape[1:]))
+    backscatter = start + width * backscatter
+    # A gate opens at one range, which is nearer in depth towards the corners of the view.
+    nearer = torch.where(random.coin(noise.slanted_gate), 0.15 * random.uniform(), 0.0)[:, None, None]
+    reported = torch.where(replaced, backscatter - nearer * (1.0 - backscatter), reported)
+    return reported, hit | replaced
+
+
+def _defects(reported: Tensor, present: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
+    """The same with hot pixels, dead ones, pixels that saw no photon, and nothing far outside the gate."""
+    shape = reported.shape[1:]
+    hot = torch.where(random.coin(0.3, 1, 1), noise.hot * random.uniform(1, 1), 0.0)
+    stuck = random.uniform(*shape) < hot
+    reported = torch.where(stuck, random.uniform(*shape), reported)
+    present = present | stuck
+    dead = torch.where(random.coin(0.7, 1, 1), 0.0, noise.dead * random.uniform(1, 1))
+    answering = torch.where(random.coin(noise.sparse, 1, 1), random.log_between((0.03, 1.0), 1, 1), 1.0)
+    present = present & (random.uniform(*shape) >= dead) & (random.uniform(*shape) < answering)
+    return reported, present & (reported > -MARGIN) & (reported < 1.0 + MARGIN)
 
 
 def log_density(profile: Tensor, depth: Tensor) -> Tensor:
@@ -148,7 +161,7 @@ def log_density(profile: Tensor, depth: Tensor) -> Tensor:
     return profile.gather(1, place).clamp(math.exp(-limit), math.exp(limit)).log().view_as(depth)
 
 
-def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: _Random) -> _Crops:
+def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random) -> _Crops:
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
     depth, sigma = _cut(scenes, index, crop, random)
@@ -167,16 +180,20 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: _Random) -
     sigma = torch.where(hit, sigma / width[:, None, None], 0.0) * scale
 
     centres = (torch.arange(BINS, device=depth.device) + 0.5) / BINS
-    decay = torch.where(random.coin(0.2), 0.0, random.log_between(noise.decay))
+    decay = torch.where(random.coin(0.45), 0.0, random.log_between(noise.decay))
     flat = torch.where(random.coin(0.5), 0.0, 0.3 * random.uniform())[:, None]
     falling = torch.softmax(-decay[:, None] * centres, dim=1) * BINS
     own_profile = (own & random.coin(noise.own_profile))[:, None]
     profile = torch.where(own_profile, scenes.profile[index], (1 - flat) * falling + flat)
-    reach = torch.where(random.coin(noise.behind)[:, None, None], 1.0, clean)
-    return _Crops(clean, sigma, hit, reach, profile)
+    around = torch.where(random.coin(noise.wide_gate)[:, None], random.log_between((0.05, 3.0), 2), 0.0)
+    around[: round(noise.counting * len(clean))] = 0.0
+    camera = torch.stack([-around[:, 0], 1.0 + around.sum(dim=1)], dim=1)
+    end = camera.sum(dim=1)[:, None, None]
+    reach = torch.where(random.coin(noise.behind)[:, None, None] | ~hit, end, clean)
+    return _Crops(clean, sigma, hit, reach, profile, camera)
 
 
-def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: _Random) -> tuple[Tensor, Tensor]:
+def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random) -> tuple[Tensor, Tensor]:
     """Depth and bound of crops, rotated and mirrored in one of eight ways."""
 
     def positions(length: int) -> Tensor:
@@ -218,9 +235,10 @@ def _draw_counts(
     crops: _Crops, photons: Tensor, background: Tensor, noise: Noise, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Poisson counts `[B, h, w, T]`, expected background per bin `[B, T]`, and σ of the response `[B, 1]` [bins]."""
-    clean, sigma, hit, reach, profile = crops
+    clean, sigma, hit, reach, profile, _ = crops
     bins, device = _COUNT_BINS, clean.device
-    width = (0.6 + 1.2 * _Random(len(clean), generator).uniform())[:, None]
+    random = Random(len(clean), generator)
+    width = random.log_between((0.6, 2.6))[:, None]
     # Signal follows the bound: σ ∝ 1/√signal.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     shade = (typical[:, None, None] / sigma.clamp_min(1e-9)).square().clamp(0.05, 4.0)
@@ -229,13 +247,34 @@ def _draw_counts(
     edges = torch.arange(bins + 1, device=device, dtype=torch.float32)
     level = torch.nn.functional.interpolate(profile[:, None], size=bins, mode="nearest")[:, 0]
     level = background[:, None] * level / bins + 1e-4
-    phase = (edges - (clean * bins)[..., None]).div_(width[:, None, None])
-    rate = torch.special.ndtr(phase).diff(dim=-1).mul_(signal[..., None])
+
+    def returns(depth: Tensor, signal: Tensor) -> Tensor:
+        phase = (edges - (depth * bins)[..., None]).div_(width[:, None, None])
+        return torch.special.ndtr(phase).diff(dim=-1).mul_(signal[..., None])
+
+    second, share = _second_surface(clean, hit, noise, random)
+    rate = returns(clean, signal * (1.0 - share))
+    rate += returns(second, signal * share)
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], noise, generator)
     rate += level[:, None, None] * (edges[:-1] < (reach * bins)[..., None])
     return torch.poisson(rate.add_(1e-4), generator=generator), level, width
+
+
+def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
+    """Depth of a weaker second surface in a pixel, and its part of the pixel's signal, `[B, h, w]`.
+
+    Either the neighbour's, where a pixel straddles an edge, or a veil before or behind parts of the scene.
+    """
+    side = clean.shape[-1]
+    apart = random.between((0.03, 0.4), 1, 1) * (1.0 - 2.0 * random.coin(0.5, 1, 1).float())
+    veiled = smooth_noise(len(clean), side, random.generator)[:, : clean.shape[1]] > random.between((-0.5, 1.0), 1, 1)
+    beside = random.coin(0.5, 1, 1)
+    second = torch.where(beside, clean.roll(1, 2), (clean + apart).clamp(0.01, 0.99))
+    there = hit & torch.where(beside, hit.roll(1, 2) & ((second - clean).abs() > 0.005), veiled)
+    share = torch.where(beside, random.between((0.0, 0.45), *clean.shape[1:]), random.between((0.05, 0.45), 1, 1))
+    return second, torch.where(there & random.coin(noise.two_returns, 1, 1), share, 0.0)
 
 
 def _estimate(
@@ -253,7 +292,7 @@ def _estimate(
     features = extract_features(counts, level[:, None, None], response) if histograms else None
 
     # Centroid of the counts within 2σ around the best bin.
-    offsets = torch.arange(-4, 5, device=device)
+    offsets = torch.arange(-6, 7, device=device)
     near = (best + offsets).clamp(0, bins - 1)
     weight = counts.gather(-1, near) * (offsets.abs() <= 2 * width)[:, None, None]
     total = weight.sum(dim=-1)
@@ -270,7 +309,7 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
     except for what leaves the gate. The rate may be rough, as histograms of a simulation with few photons are.
     """
     size, height, width, bins = rate.shape
-    device, random = rate.device, _Random(size, generator)
+    device, random = rate.device, Random(size, generator)
 
     def delayed(mean: Tensor) -> Tensor:
         """Share of a return in bin k that arrives in bin j, `[B, k, j]`."""

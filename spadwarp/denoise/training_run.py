@@ -13,7 +13,7 @@ import numpy as np
 
 from spadwarp.dataset import read_manifest
 from spadwarp.dataset.shard_file import SceneFile
-from spadwarp.denoise.inference import require_torch
+from spadwarp.denoise.network_files import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError
 from spadwarp.limits import environment_integer
@@ -32,6 +32,7 @@ def train(
     *,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Trained:
     """Trains a denoiser, or resumes an interrupted training.
 
@@ -43,6 +44,7 @@ def train(
         out: The run's folder; new, or with an interrupted run of the same recipe.
         device: torch device; default: the GPU of this process (torchrun gives one each), else the CPU.
         progress: Called with ("steps", done, total) after every step.
+        notify: Called with how long the training will take, once the first steps show it.
 
     Raises:
         ConfigError: A recipe that cannot be used, or a run of another recipe in the folder.
@@ -54,8 +56,10 @@ def train(
 
     if not isinstance(recipe, TrainingRecipe):
         recipe = load_training_recipe(recipe)
-    training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
-    trained = fit(recipe, training, validation, Path(out), device=device, progress=progress)
+    training = validation = None
+    if recipe.data is not None:
+        training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
+    trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
     if environment_integer("RANK", 0) == 0:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]
         draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")

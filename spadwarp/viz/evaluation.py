@@ -28,7 +28,8 @@ from spadwarp.viz.style import (
     save,
 )
 
-__all__ = ["COLOURS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_samples", "draw_scores"]
+__all__ = ["COLOURS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_reliability", "draw_samples"]
+__all__ += ["draw_scores"]
 
 _METHODS = {
     "input": ("noisy input", "0.55"),
@@ -39,6 +40,10 @@ _METHODS = {
     "dncnn": ("DnCNN", RED),
     "pyramid": ("PyramidNet", BLUE),
     "histograms": ("PyramidNet, histograms", "black"),
+    "likelihood": ("likelihood of each pixel", "0.4"),
+    "pooled": ("pooled likelihood", "0.5"),
+    "semi-global": ("semi-global matching", "0.6"),
+    "total-variation": ("total variation", "0.7"),
 }
 
 TITLES = {method: title for method, (title, _) in _METHODS.items()}
@@ -190,6 +195,27 @@ def draw_photon_sweep(
     axes[0].set_ylabel("RMSE of depth [mm]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5)
+    return save(figure, path, note=note)
+
+
+def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: str | Path, *, note: str) -> Path:
+    """How often it was true, against the probability that was given, by tenths; returns the path.
+
+    `tables`: by method and what the probability is of, pixels and those of which it was true, `[10, 2]`.
+    """
+    figure = new_figure(9.0, 3.9)
+    axes = figure.subplots(1, 2, sharey=True)
+    kinds = {"target": "the pixel sees a target", "confidence": "its depth is right to 1 % of the gate"}
+    for axis, (kind, title) in zip(axes, kinds.items(), strict=True):
+        axis.plot([0, 1], [0, 1], color="0.7", linestyle=":")
+        for (method, of), table in tables.items():
+            if of == kind:
+                some = table[:, 0] >= 20
+                middle, part = (np.arange(10) + 0.5) / 10, table[:, 1] / np.maximum(table[:, 0], 1)
+                axis.plot(middle[some], part[some], **_line(method, True))
+        axis.set(xlabel="probability given", title=title, xlim=(0, 1), ylim=(0, 1))
+        plain_axis(axis)
+    axes[0].set_ylabel("part of the pixels of which it is true")
     return save(figure, path, note=note)
 
 

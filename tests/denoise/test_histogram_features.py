@@ -8,8 +8,8 @@ from scipy.stats import exponnorm, norm
 
 from helpers.stepped_frames import denoised
 from spadwarp import ArgumentError
-from spadwarp.denoise import inference, synthetic_noise
-from spadwarp.denoise.histogram_features import EDGES, FEATURES, WINDOWS, extract_features
+from spadwarp.denoise import histogram_inputs, synthetic_noise
+from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features
 from spadwarp.denoise.recipe import Noise
 
 BINS, SIGMA = 128, 1.2  # bins of the gate, response [bins]
@@ -44,17 +44,17 @@ def test_pooled_histograms_find_what_pixels_cannot():
     counts, level = histograms(70.3, 1.0, 20.0)
     found = features_of(counts, level)
     assert found.shape == (FEATURES, 32, 32) and len(WINDOWS) == 3
-    places = best_bin(counts - level, level), *(BINS * found[:2])
+    places = best_bin(counts - level, level), *(BINS * found[3:5])
     right = [np.mean(np.abs(place - 70.3) < 2) for place in places]
     assert right[0] < 0.4 < 0.7 < right[1] < right[2] and right[2] > 0.99
     # Centroid of 49 photons on their background: some tenths of a bin.
-    assert np.std(BINS * found[1]) < 0.6
+    assert np.std(BINS * found[4]) < 0.6
 
 
 def test_many_photons_give_depth_to_fractions_of_a_bin():
     slope = np.linspace(40.0, 80.0, 32) + np.zeros((32, 1))
     counts, level = histograms(slope, 500.0, 5.0)
-    found = BINS * features_of(counts, level)[:2]
+    found = BINS * features_of(counts, level)[3:5]
     inner = (slice(4, -4), slice(4, -4))
     assert np.sqrt(np.mean((found[0] - slope)[inner] ** 2)) < 0.3  # a window of 3 pixels sees 2.6 bins of slope
 
@@ -65,9 +65,9 @@ def test_the_shape_of_the_return_is_that_of_its_light():
     law = exponnorm(delay / SIGMA, scale=SIGMA)
     counts, level = histograms(60.0, 300.0, 30.0, law=law)
     found = features_of(counts, level)
-    anchor = BINS * found[2, 16, 16]
+    anchor = BINS * found[5, 16, 16]
     expected = np.diff(law.cdf(anchor - 60.0 + BINS * np.array(EDGES)))
-    shares = found[len(WINDOWS) : len(WINDOWS) + len(EDGES) - 1, 16, 16]
+    shares = found[SEEN - len(EDGES) - 1 : SEEN - 2, 16, 16]
     assert np.abs(shares - expected / expected.sum()).max() < 0.03
     assert abs(anchor - 60.0) < delay  # the template has a tail of its own
 
@@ -76,7 +76,7 @@ def test_fine_histograms_are_rebinned():
     taps = norm.pdf(np.arange(-60, 61), scale=SIGMA * 1000 / BINS)
     counts, level = histograms(603.0, 20.0, 20.0, bins=1000, side=16)
     found = features_of(counts, level, taps)
-    assert abs(np.median(1000 * found[1]) - 603.0) < 1.0
+    assert abs(np.median(1000 * found[4]) - 603.0) < 1.0
 
 
 def test_each_pixel_may_have_its_background():
@@ -89,7 +89,7 @@ def test_each_pixel_may_have_its_background():
     each = np.broadcast_to(np.maximum(beam, 1.0) * level, (32, 32, BINS))
     sides = np.abs(np.linspace(-1, 1, 32)) > 0.6
     wrong = [
-        np.mean(np.abs(BINS * features_of(counts, one)[2] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)
+        np.mean(np.abs(BINS * features_of(counts, one)[5] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)
     ]
     assert wrong[1] < 0.1 < wrong[0]
 
@@ -122,7 +122,7 @@ def test_histograms_help_where_photons_are_few():
     alone = denoised(depth, profile=level)
     together = denoised(depth, profile=level, counts=counts, background=level, response=TAPS)
     before, after = (np.sqrt(np.nanmean((found - clean) ** 2)) for found in (alone, together))
-    assert after < 0.7 * before
+    assert after < before and after < 0.025
 
 
 def test_a_rotated_frame_gives_the_same_depth():
@@ -138,7 +138,7 @@ def test_a_rotated_frame_gives_the_same_depth():
     [
         ({"counts": np.zeros((16, 16))}, "counts are float64"),
         ({"background": np.zeros(5)}, "background has shape"),
-        ({"background": None}, "counts need background and response"),
+        ({"background": None}, "needs counts, background and response"),
         ({"response": np.ones(4)}, "response has shape"),
         ({"counts": np.zeros((20, 16, 8))}, "histograms are 1 frames"),
     ],
@@ -152,6 +152,6 @@ def test_errors_name_what_is_wrong(changed, message):
 def test_shapes_of_features():
     counts = np.random.default_rng(1).poisson(0.1, (2, 9, 10, 32))
     options = {"background": np.full(32, 0.1), "response": np.ones(3), "device": "cpu"}
-    found = inference.features_of_histograms(counts, **options)
+    found = histogram_inputs.features_of_histograms(counts, **options)
     assert found.shape == (2, FEATURES, 9, 10) and found.dtype == np.float32
-    assert np.array_equal(inference.features_of_histograms(counts[1], **options)[0], found[1])
+    assert np.array_equal(histogram_inputs.features_of_histograms(counts[1], **options)[0], found[1])

@@ -5,25 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors.torch import load_file
 
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
-from spadwarp.denoise import baselines, inference, weights_metadata
+from spadwarp.denoise import baselines, estimate, inference, weights_metadata
+from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth
 from spadwarp.denoise.frames import depth_frames
+from spadwarp.denoise.gates import bins_of_target, gate_of_target
+from spadwarp.denoise.network_files import WEIGHTS
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.io.exr import read_exr
 
 OF_DEPTH = [name for name in MODELS if name != "histograms"]
 of_depth = pytest.mark.parametrize("model", OF_DEPTH)
-
-
-def test_old_names_of_layers_are_those_of_the_package_s_weights():
-    """They were written when features of histograms had another name; `load_network` accepts both names."""
-    stored = load_file(inference.WEIGHTS / "histograms.safetensors")
-    loaded = inference.load_network("histograms").state_dict()
-    assert {name.replace("_clues.", "_features.") for name in stored} == set(loaded)
-    assert "enter_clues.weight" in stored and "enter_features.weight" in loaded
 
 
 # Networks with the weights of the package
@@ -43,6 +37,7 @@ def test_pyramid_beats_the_median_and_knows_where_no_target_is():
     clean[:40, :40] = np.nan
     frames = depth_frames(noisy_frame(clean, 0.48), gate=GATE)
     found, seen = inference.denoise_frames(frames, model="pyramid", device="cpu")
+    assert np.isfinite(found).all()
     assert scores(clean, found[0]).psnr > scores(clean, baselines.median_filter(frames, window=5)[0]).psnr + 6
     assert np.mean(seen[0] == np.isfinite(clean)) > 0.97
 
@@ -69,7 +64,7 @@ def test_frames_with_few_reports(model, missing):
     errors = []
     for depth in (noisy, few):
         found, seen = inference.denoise_frames(depth_frames(depth, gate=GATE), model=model, device="cpu")
-        assert model != "pyramid" or seen.mean() > 0.97
+        assert model != "pyramid" or seen.mean() > 0.94
         errors.append(np.median(np.abs(found[0] - clean)))
     assert errors[1] < 1.5 * errors[0] + 0.001
 
@@ -77,27 +72,76 @@ def test_frames_with_few_reports(model, missing):
 @pytest.mark.parametrize("share", [0.1, 0.4])
 @pytest.mark.parametrize("decay", [0.0, 5.0])
 def test_backscatter_alone_is_no_target(share, decay):
-    """A frame of open water, where few pixels report and none of them a target, stays empty."""
+    """In a frame of open water, where few pixels report and none of them a target, no target is invented."""
     generator = np.random.default_rng(6)
     profile = np.exp(-decay * np.arange(64) / 64)
     place = generator.choice(64, size=(96, 128), p=profile / profile.sum()) + generator.random((96, 128))
     depth = GATE[0] + (GATE[1] - GATE[0]) * place / 64
     depth[generator.random(depth.shape) >= share] = np.nan
-    assert np.isfinite(denoised(depth, profile=profile)).mean() < 0.01
+    assert np.isfinite(denoised(depth, profile=profile, mask=0.5)).mean() < 0.01
 
 
-def test_missing_pixels_are_filled_on_a_target_and_not_beside_it():
-    """The nearest report fills a pixel missing inside a disc, but not the pixels around the disc."""
-    y, x = np.mgrid[:96, :128]
-    distance = np.hypot(y - 48, x - 64)
-    inside = distance < 30
-    some = inside & (np.random.default_rng(7).random(inside.shape) > 0.2)
-    filled, whole = (
-        depth_frames(np.where(reported, 15.0, np.nan), gate=GATE).network_input()[0, 1] > 0
-        for reported in (some, inside)
-    )
-    assert filled[distance < 26].all() and not filled[distance > 33].any()
-    assert np.count_nonzero(whole & ~inside) < 0.05 * np.count_nonzero(inside)
+def test_every_pixel_has_a_depth_and_the_mask_is_a_choice():
+    clean = scene(96, 128)
+    clean[:40, :40] = np.nan
+    noisy = np.where(np.isnan(clean), np.nan, noisy_frame(clean, 0.1))
+    found = estimate(noisy, gate=GATE, device="cpu")
+    assert np.isfinite(found.depth).all() and np.array_equal(denoised(noisy), found.depth)
+    assert found.target_probability.min() >= 0 and found.confidence.max() <= 1
+    masked = denoised(noisy, mask=0.5)
+    assert np.array_equal(np.isnan(masked), found.target_probability < 0.5)
+    assert np.mean(np.isnan(masked) == np.isnan(clean)) > 0.98
+    right = np.abs(found.depth - clean) < 0.01 * 2.5
+    assert found.confidence[right].mean() > found.confidence[np.isfinite(clean) & ~right].mean()
+    with pytest.raises(ArgumentError, match=r"mask = 1\.5"):
+        denoised(noisy, mask=1.5)
+
+
+@pytest.mark.parametrize("turn", range(1, 8))
+def test_turns_and_reflections_of_a_frame_are_those_of_the_answer(turn):
+    """Sizes are multiples of 16; only rounding differs."""
+
+    def turned(image):
+        return np.ascontiguousarray(np.rot90(image[:, ::-1] if turn >= 4 else image, turn % 4))
+
+    noisy = noisy_frame(np.nan_to_num(scene(64, 64), nan=15.0))
+    assert np.abs(denoised(turned(noisy)) - turned(denoised(noisy))).max() < 5e-3
+    assert np.median(np.abs(denoised(turned(noisy)) - turned(denoised(noisy)))) < 1e-5
+
+
+def test_a_shift_by_a_pixel_hardly_changes_the_answer():
+    noisy = noisy_frame(np.nan_to_num(scene(97, 129), nan=15.0))
+    first, second = denoised(noisy[:-1, :-1]), denoised(noisy[1:, 1:])
+    assert np.median(np.abs(first[1:, 1:] - second[:-1, :-1])) < 1e-3
+
+
+def test_a_gate_twice_too_wide_changes_little():
+    target = evaluation_scene("vase", "open water", size=(96, 128))
+    noisy, seen = noisy_depth(target, water="front", level=0.264, seed=3), np.isfinite(target.clean)
+    errors = []
+    for gate in (GATE, (12.25, 17.25)):
+        found = denoised(noisy, gate=gate)
+        errors.append(np.sqrt(np.mean((found - target.clean)[seen] ** 2)))
+    assert errors[1] < 1.3 * errors[0]
+
+
+def test_the_gate_is_narrowed_to_where_depths_agree():
+    target = evaluation_scene("spiral", "open water")
+    frames = depth_frames(noisy_depth(target, water="uniform", level=0.264, seed=1), gate=(12.0, 20.0))
+    start, stop = gate_of_target(frames.depth[0], frames.density[0], frames.gate)
+    assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
+    water = evaluation_scene("nothing", "open water")
+    frames = depth_frames(noisy_depth(water, water="uniform", level=0.264, seed=1), gate=GATE)
+    assert gate_of_target(frames.depth[0], frames.density[0], GATE) == GATE
+
+
+def test_the_bins_of_the_target_are_those_of_the_excess():
+    generator = np.random.default_rng(2)
+    rate = np.full((24, 24, 512), 0.1)
+    rate[..., 200:240] += 0.05
+    first, stop = bins_of_target(generator.poisson(rate), np.full(512, 0.1), np.ones(5))
+    assert 170 < first <= 200 and 240 <= stop < 270
+    assert bins_of_target(generator.poisson(np.full((24, 24, 512), 0.1)), np.full(512, 0.1), np.ones(5)) == (0, 512)
 
 
 @pytest.mark.parametrize("model", [*OF_DEPTH, "median", "gating"])
@@ -157,7 +201,7 @@ def test_weights_must_be_weights(tmp_path):
     for error, message, options in (
         (FileError, "no such file", {"weights": tmp_path / "none.safetensors"}),
         (FileError, "junk.safetensors", {"weights": tmp_path / "junk.safetensors"}),
-        (FileError, "of 'usdn', not of 'dncnn'", {"model": "dncnn", "weights": inference.WEIGHTS / "usdn.safetensors"}),
+        (FileError, "of 'usdn', not of 'dncnn'", {"model": "dncnn", "weights": WEIGHTS / "usdn.safetensors"}),
         (DeviceError, "cuda:77", {"device": "cuda:77"}),
     ):
         with pytest.raises(error, match=message):
@@ -168,10 +212,10 @@ def test_weights_must_be_weights(tmp_path):
 def test_weights_hold_how_they_were_made(model):
     metadata = weights_metadata(model)
     assert metadata["model"] == metadata["recipe"]["model"] == model
-    assert metadata["recipe"]["data"] == "data/training"
+    assert metadata["recipe"].get("data") == (None if model in ("pyramid", "histograms") else "data/training")
     assert float(metadata["hours"]) < 8 / 60
     assert min(metadata["validation_psnr"].values()) > 10
-    assert sum(file.stat().st_size for file in inference.WEIGHTS.iterdir()) < 8e6
+    assert sum(file.stat().st_size for file in WEIGHTS.iterdir()) < 8e6
 
 
 EXTRA = Path(os.environ.get("SPADWARP_EXTRA_DATA", "")) / "ue_exr"

@@ -1,0 +1,87 @@
+"""Counts as the network for histograms and the classical estimates take them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.denoise.frames import POOLED
+from spadwarp.denoise.gates import bins_of_target
+from spadwarp.denoise.network_files import require_torch, torch_device
+from spadwarp.errors import ArgumentError
+
+__all__ = ["features_of_histograms", "histogram_tensors", "target_bins"]
+
+
+def features_of_histograms(
+    counts: ArrayLike,
+    *,
+    background: ArrayLike,
+    response: ArrayLike,
+    device: str | None = None,
+    to_depth: Callable[[NDArray[np.float32]], NDArray[Any]] | None = None,
+) -> NDArray[np.float32]:
+    """Features of histograms over the gate, as `spadwarp.denoise.histogram_features` makes them, frame by frame.
+
+    Args:
+        counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
+        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
+        response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
+        device: torch device.
+        to_depth: Converts parts of the gate `[N, POOLED, H, W]` to depths [m].
+
+    Returns:
+        float32 `[N, FEATURES, H, W]`; first the pooled depths, as parts of the gate where `to_depth` is not given.
+
+    Raises:
+        ArgumentError: Shapes or values that cannot be.
+    """
+    torch = require_torch()
+    from spadwarp.denoise.histogram_features import extract_features
+
+    with torch.inference_mode():
+        parts = histogram_tensors(counts, background, response, device)
+        features = np.concatenate([extract_features(*part).cpu().numpy() for part in parts])
+    if to_depth is not None:
+        features[:, :POOLED] = to_depth(features[:, :POOLED])
+    return features
+
+
+def histogram_tensors(
+    counts: ArrayLike, background: ArrayLike, response: ArrayLike, device: str | None
+) -> Iterator[tuple[Any, Any, Any]]:
+    """Counts `[1, H, W, T]`, background and response of each frame as `extract_features` takes them.
+
+    Arguments and errors are those of `features_of_histograms`.
+    """
+    torch = require_torch()
+    cubes = np.asarray(counts)
+    levels, taps = (np.array(given, np.float32) for given in (background, response))
+    if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
+        raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
+    one, each = cubes.shape[-1:], cubes.shape[-3:]
+    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
+        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
+    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
+        raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
+    place = torch_device(device)
+    tap = torch.from_numpy((taps / taps.sum())[None]).to(place)
+    level = torch.from_numpy(levels if levels.ndim == 3 else levels[None, None])[None].to(place)
+    level = level.clamp_min(1e-6 * float(level.mean()) + 1e-9)
+    for cube in cubes.reshape(-1, *cubes.shape[-3:]):
+        yield torch.from_numpy(cube.astype(np.float32)[None]).to(place), level, tap
+
+
+def target_bins(
+    counts: NDArray[Any], background: ArrayLike, response: ArrayLike, gate: tuple[float, float]
+) -> tuple[int, int, tuple[float, float]]:
+    """First and last bin of the part of the gate that holds the target, and that part in depth [m]."""
+    cubes, level = np.asarray(counts), np.asarray(background, np.float32)
+    if cubes.ndim not in (3, 4) or level.shape not in (cubes.shape[-1:], cubes.shape[-3:]):
+        return 0, cubes.shape[-1], gate  # refused by what follows
+    first, stop = bins_of_target(cubes, level, np.asarray(response, np.float32))
+    width = (gate[1] - gate[0]) / cubes.shape[-1]
+    return first, stop, (gate[0] + first * width, gate[0] + stop * width)

@@ -1,0 +1,108 @@
+"""Networks with their weights, from the package or from files of `spadwarp train`, and the torch that runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from spadwarp.denoise.recipe import MODELS
+from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
+from spadwarp.io.parsing import parse_json
+from spadwarp.io.paths import existing_file
+
+__all__ = ["WEIGHTS", "load_network", "own_weights", "require_torch", "torch_device", "weights_metadata"]
+
+WEIGHTS = Path(__file__).parent / "weights"
+"""Folder of the package's weights."""
+
+
+def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str, Any]:
+    """How the weights in a file were made: model, recipe, seed, hours, machine, validation PSNR.
+
+    `weights`: the file; default: the package's for `model`. Raises `FileError`; `ArgumentError` for an unknown model.
+    """
+    path = _weights_path(model, weights)
+    try:
+        return {name: parse_json(text) if text[:1] in ("{", "[") else text for name, text in _header(path).items()}
+    except ValueError as error:
+        raise FileError(f"{path}: its header is damaged: {error}") from error
+
+
+@lru_cache(maxsize=8)
+def load_network(model: str, weights: str | Path | None = None, device: str = "cpu") -> Any:
+    """A network with its weights, ready to run."""
+    torch = require_torch()
+    from safetensors.torch import load_file
+
+    from spadwarp.denoise.networks import build_network
+
+    path = _weights_path(model, weights)
+    named = _header(path).get("model", model)
+    if named != model:
+        raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
+    try:
+        network: Any = build_network(model)
+        values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
+        network.load_state_dict(values)
+        if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
+            raise ValueError(f"{wrong[0]} is not finite")
+    except Exception as error:  # safetensors and torch have errors of their own
+        raise FileError(f"{path}: not weights of {model!r}: {error}") from error
+    network = network.to(torch.device(device)).to(memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False)
+
+
+def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, Path]:
+    """`weights` by the network that the file names; empty without. Raises `ArgumentError` if it is none of `models`."""
+    if weights is None:
+        return {}
+    model = _header(existing_file(weights)).get("model")
+    if model not in MODELS:
+        raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
+    if model not in models:
+        raise ArgumentError(f"weights = '{weights}' are of {model!r}, which is not among models: {', '.join(models)}")
+    return {model: Path(weights)}
+
+
+def require_torch() -> Any:
+    """The module torch. Raises `SpadwarpError` where it or safetensors is not installed."""
+    try:
+        import safetensors  # noqa: F401
+        import torch
+    except ModuleNotFoundError as error:
+        raise SpadwarpError(f"denoising needs {error.name}: pip install 'spadwarp[denoise]'") from error
+    return torch
+
+
+def torch_device(name: str | None) -> Any:
+    """The torch device "cpu", "cuda" or "cuda:N"; default: the first GPU, else the CPU. Raises `DeviceError`."""
+    torch = require_torch()
+    if name is None:
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if not (name == "cpu" or name.split(":")[0] == "cuda"):
+        raise DeviceError(f"device = {name!r} is not 'cpu' or 'cuda:N'")
+    if name != "cpu":
+        index = int(name.partition(":")[2] or 0)
+        if not (torch.cuda.is_available() and index < torch.cuda.device_count()):
+            raise DeviceError(f"device = {name!r}: torch sees {torch.cuda.device_count()} GPUs")
+    return torch.device(name)
+
+
+def _weights_path(model: str, weights: str | Path | None) -> Path:
+    if model not in MODELS:
+        raise ArgumentError(f"model = {model!r} is not one of {', '.join(map(repr, MODELS))}")
+    return existing_file(WEIGHTS / f"{model}.safetensors" if weights is None else weights)
+
+
+def _header(path: Path) -> dict[str, str]:
+    """Metadata in the header of a safetensors file."""
+    require_torch()
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return dict(file.metadata() or {})
+    except (OSError, ValueError, SafetensorError) as error:
+        raise FileError(f"{path}: not a safetensors file: {error}") from error

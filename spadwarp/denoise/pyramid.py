@@ -1,0 +1,278 @@
+"""PyramidNet: weighted means of depths that come from the target, with weights from a pyramid of features."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spadwarp.denoise.frames import POOLED, SCORED
+from spadwarp.denoise.histogram_features import MOST, SEEN
+from spadwarp.denoise.symmetric import SymmetricConv, SymmetricWindow, symmetric_mean
+
+__all__ = ["CLOSE", "LONGEST_DELAY", "OUTPUTS", "PyramidNet"]
+
+LONGEST_DELAY = 0.2
+"""Largest delay of forward-scattered light that the network can correct [gate widths]."""
+
+OUTPUTS = ("depth", "target", "confidence", "true")
+"""The channels of the output: depth over the gate, and three logits."""
+
+CLOSE = 0.01
+"""Two depths this near belong to one return, and a depth this near to the truth is right [gate widths]."""
+
+_WIDEST = 0.1  # depths this far from the first answer still count for the second [gate widths]
+
+# Scores, a tenth of them as among the features of histograms.
+_CLEAR = 1.4  # of the median pixel's return, from which semi-global matching decides between surfaces
+_OUTWEIGHED = 1.4  # by which a pixel's own return has to exceed the answer, to replace it
+_SUPPORTED = 0.8  # of a return besides what is usual elsewhere in a histogram
+
+
+class _Residual(nn.Module):
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.first = SymmetricConv(features, features, 3)
+        self.second = SymmetricConv(features, features, 3)
+        nn.init.zeros_(self.second.weight)  # begins as the identity
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(F.relu(self.first(F.relu(x)), inplace=True))
+
+
+class PyramidNet(nn.Module):
+    """Weighted means of depths that come from the target, with weights from a pyramid of features.
+
+    A pixel's depth is a convex combination of the 5×5 depths around it, of the mean depths of 3×3 wider windows (9 and
+    36 pixels), and of one value of the network's own; with `refines`, what is far from it is then left out, so that two
+    surfaces are not mixed. The weight of a depth is the product of two factors: one belongs to the pixel that it comes
+    from (the probability that it is the target's depth), the other to the pixel that it goes to (whether the two belong
+    together). Depths of signal photons are thereby used as they are, to the millimetre; where there are none, the
+    network's own value is used. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017); means weighted by certainty:
+    Knutsson & Westin, CVPR 1993. All its layers commute with turns and reflections of the image. `widths` are the
+    features of the levels, `last` those of the last layer.
+
+    Its inputs: depth, which pixels reported, how probable backscatter is at the reported depth, and three order
+    statistics of each 3×3 neighbourhood, which leave out the scattered photons. The pyramid has the full size, then
+    blocks of 2, 4, 8 and 16 pixels.
+
+    The output, `[batch, 4, height, width]`, is `OUTPUTS`: depth over the gate; the logits of "the pixel sees a target",
+    of "the depth is right to `CLOSE`", and of "the reported depth is the target's".
+
+    With `histograms` it also sees the channels of `spadwarp.denoise.histogram_features`. Each pixel then first gets a
+    depth from the candidates among them, which replaces the reported one in all that follows: the most probable one,
+    never the mean of two returns. The delay of scattered light, which the shape of the return shows, is subtracted from
+    the result. Where photons are enough for semi-global matching, an answer beside its surface that 3×3 pixels find
+    less likely is replaced by it; and one that the pixel's own histogram refutes, by the pixel's own return.
+    A fifth output is the depth of the candidates, and one for each candidate its logit.
+    """
+
+    radius = 2
+    boxes = (9, 36)  # sides of the wider windows
+    steps = (6, 24)  # between them
+    stride = 16  # sizes are padded to multiples of it
+
+    def __init__(
+        self,
+        *,
+        widths: tuple[int, ...] = (4, 5, 8, 10, 14),
+        last: int = 6,
+        refines: bool = True,
+        histograms: bool = False,
+    ) -> None:
+        super().__init__()
+        self.refines = refines
+        pairs, deep = list(pairwise(widths)), len(widths) - 1
+        self.enter = SymmetricConv(6, widths[0], 3, lifts=True)
+        self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
+        self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
+        self.before = nn.ModuleList(
+            nn.Sequential(*(_Residual(width) for _ in range(1 + (level == deep - 1))))
+            for level, width in enumerate(widths[1:])
+        )
+        self.after = nn.ModuleList(_Residual(width) for width in widths[1:-1])
+        self.finish = SymmetricConv(widths[0], widths[0], 3)
+        self.spread = SymmetricConv(widths[0], last, 1)
+        near = 2 * self.radius + 1
+        self.near = SymmetricWindow(last, near)
+        self.wide = nn.ModuleList(SymmetricWindow(last, 3) for _ in self.boxes)
+        self.scalars = nn.Conv2d(
+            last, 5 + refines, 1
+        )  # of the network's own depth, weight and value; logits; reach of refining
+        self.enter_features: nn.Module | None = None
+        with torch.no_grad():  # begins near the identity
+            assert self.scalars.bias is not None
+            self.near.bias[0] = 3.0  # of the pixel itself
+            for window in self.wide:
+                for bias in window.parameters(recurse=False):
+                    if bias.ndim == 1:
+                        bias.fill_(-2.0)
+            self.scalars.weight.mul_(0.3)
+            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, -1.0][: 5 + refines]))
+        if histograms:
+            self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
+            self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
+            self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1]))  # weights of log-likelihoods in these logits
+            with torch.no_grad():
+                assert self.choose.bias is not None
+                self.enter_features.weight.mul_(0.3)
+                self.choose.weight.mul_(0.3)
+                self.choose.bias.zero_()
+                self.choose.bias[-1] = -5.0
+
+    def forward(self, frame: Tensor) -> Tensor:
+        """See the class; `frame` as `spadwarp.denoise.networks` describes it."""
+        height, width = frame.shape[-2:]
+        bottom, right = -height % self.stride, -width % self.stride
+        if bottom or right:
+            frame = F.pad(frame, (0, right, 0, bottom), mode="replicate")
+        depth, reported = frame[:, :1].float(), frame[:, 1:2].float()
+        x = self._features(frame)
+        scalars = self.scalars(symmetric_mean(x)).float()
+        delay: Tensor | None = None
+        extra: list[Tensor] = []
+        if self.enter_features is not None:
+            depth, delay, extra = self._chosen(depth, frame[:, 3:].float(), x)
+            reported = torch.ones_like(depth)
+        own, own_value, others = scalars[:, :1], scalars[:, 1:2], scalars[:, 2:5]
+        values, trusts = _candidates(depth, reported, others[:, 2:], self.radius, self.boxes, self.steps)
+        heads = [self.near(x), *(window(x) for window in self.wide)]
+        parts = [torch.cat(heads, dim=1), trusts, own, values, own_value, scalars[:, 5:]]
+        if torch.is_grad_enabled() or x.is_cuda:
+            found = _answer(*parts)
+        else:  # strips of a few rows stay in a CPU's cache
+            found = torch.cat(
+                [_answer(*strips) for strips in zip(*(part.split(16, 2) for part in parts), strict=True)], 2
+            )
+        if delay is not None:
+            found = _decided(found, frame[:, 3:].float()) - delay
+        return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
+
+    def _features(self, frame: Tensor) -> Tensor:
+        """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""
+        depth, reported, density = (channel.contiguous() for channel in frame[:, :3].split(1, dim=1))
+        ranked = [rank - depth for rank in ranks(depth)]
+        x = self.enter(torch.cat([(depth - 0.5) * reported, reported, 0.25 * density, *ranked], dim=1))
+        if self.enter_features is not None:
+            x = x + self.enter_features(frame[:, 3 : 3 + SEEN])
+        skipped = []
+        for down, before in zip(self.down, self.before, strict=True):
+            skipped.append(x)
+            x = before(down(F.relu(x)))
+        for level in reversed(range(len(skipped))):
+            finer = F.interpolate(self.up[level](x), scale_factor=2.0, mode="bilinear", align_corners=False)
+            x = skipped[level] + finer
+            x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
+        return F.relu(self.spread(F.relu(x)))
+
+    def _chosen(self, depth: Tensor, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """A depth for each pixel, the delay of its light; and that depth and the candidates' logits as outputs."""
+        candidates = torch.cat([depth, 0.5 + features[:, :POOLED]], dim=1)
+        scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
+        scores = torch.cat([scores[:, :, :1], scores], dim=2)  # the reported depth has those of the own return
+        head = self.choose(symmetric_mean(x)).float()
+        logits = head[:, :-1] + 10.0 * (scores * self.evidence[:, None, None, None]).sum(dim=1)
+        weight = torch.softmax(logits, dim=1)
+        best = candidates.gather(1, weight.argmax(dim=1, keepdim=True))
+        weight = weight * torch.exp(-((candidates - best) / CLOSE).square())
+        chosen = (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
+        return chosen, LONGEST_DELAY * torch.sigmoid(head[:, -1:]), [chosen, logits]
+
+
+def _answer(heads: Tensor, trusts: Tensor, own: Tensor, values: Tensor, own_value: Tensor, reach: Tensor) -> Tensor:
+    """Weighted mean of the values, then one in which those far from it count less, `[B, 1, H, W]`.
+
+    What comes from another surface keeps little part in the answer. The fall with distance is a power, not an
+    exponential: a depth that is not trusted stays so where it is near. At `_WIDEST` sigmoid(reach) it is a quarter.
+    There is no second mean where `reach` has no channel.
+    """
+    weight = torch.softmax(torch.cat([heads.float() + trusts, own], dim=1), dim=1)
+    values = torch.cat([values, 0.5 + own_value], dim=1)
+    found = (weight * values).sum(dim=1, keepdim=True)
+    if reach.shape[1]:
+        near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
+        near = weight / torch.addcmul(torch.ones_like(reach), near, near).square()
+        found = (near * values).sum(dim=1, keepdim=True) / (near.sum(dim=1, keepdim=True) + 1e-12)
+    return found
+
+
+def _decided(found: Tensor, features: Tensor) -> Tensor:
+    """The answer, or one that the scores among the features make far more likely."""
+    candidates, own = 0.5 + features[:, :POOLED], features[:, SEEN : SEEN + POOLED]
+    around = features[:, 2 * POOLED : 3 * POOLED]  # of 3×3 pixels, below the highest
+    tops = features[:, POOLED + SCORED * POOLED :]
+    strong = (_median(tops[:, :1]) > _CLEAR) & (tops[:, 1:2] > 0.1 * MOST - 0.01)
+    usual = _median(own[:, 1:2])  # elsewhere in a histogram
+
+    def at(scores: Tensor, answer: Tensor, otherwise: float, reach: float) -> Tensor:
+        near = (candidates - answer).abs() < reach
+        return torch.where(near, scores, otherwise).amax(dim=1, keepdim=True)
+
+    matched = candidates[:, 2:3]
+    apart = (matched - found).abs() > CLOSE
+    better = around[:, 2:3] >= at(around, found, -0.1 * MOST, CLOSE)
+    found = torch.where(strong & apart & better, matched, found)
+
+    answer = at(own, found, 0.0, 2.0 * CLOSE)
+    outweighed = own[:, :1] - torch.maximum(answer, usual) > _OUTWEIGHED
+    return torch.where(outweighed & (answer < usual + _SUPPORTED), candidates[:, :1], found)
+
+
+def _median(scores: Tensor) -> Tensor:
+    """Of all pixels, `[B, 1, 1, 1]`."""
+    return scores.flatten(1).median(dim=1).values[:, None, None, None]
+
+
+def _candidates(
+    depth: Tensor, reported: Tensor, true: Tensor, radius: int, boxes: tuple[int, ...], steps: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """Depths around each pixel and the logarithms of their certainty, `[B, n, H, W]`."""
+    certainty = torch.sigmoid(true) * reported
+    values = [_windows(depth, 2 * radius + 1, 1)]
+    trusts = [_windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), 2 * radius + 1, 1)]
+    both = torch.cat([certainty * depth, certainty], dim=1)
+    for box, step in zip(boxes, steps, strict=True):
+        coarse = 1 if box < 16 else 4
+        mean = F.avg_pool2d(both, coarse) if coarse > 1 else both
+        side = box // coarse
+        mean = F.avg_pool2d(mean, (side, 1), 1, (side // 2, 0))
+        mean = F.avg_pool2d(mean, (1, side), 1, (0, side // 2))
+        if coarse > 1:
+            mean = F.interpolate(mean, scale_factor=float(coarse), mode="bilinear", align_corners=False)
+        share = mean[:, 1:] + 1e-6
+        values.append(_windows(mean[:, :1] / share, 3, step))
+        trusts.append(_windows(torch.log(share), 3, step))
+    return torch.cat(values, dim=1), torch.cat(trusts, dim=1)
+
+
+def _windows(image: Tensor, side: int, step: int) -> Tensor:
+    """`[B, 1, H, W]` to `[B, side², H, W]`: the values `step` pixels apart around each pixel."""
+    height, width = image.shape[-2:]
+    reach = side // 2 * step
+    padded = F.pad(image, (reach, reach, reach, reach), mode="replicate")
+    starts = range(0, 2 * reach + 1, step)
+    return torch.cat([padded[..., y : y + height, x : x + width] for y in starts for x in starts], dim=1)
+
+
+def ranks(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The third, fifth and seventh of the nine sorted values of each 3×3 neighbourhood.
+
+    Columns are sorted, then rows, after which columns are still so: what can be third is the second in size of two
+    sorted pairs, and the fifth is the middle one of the diagonal (Paeth, Graphics Gems, 1990).
+    """
+    height, width = depth.shape[-2:]
+    padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
+    column = _sorted(*(padded[..., row : row + height, :] for row in range(3)))
+    least, middle, most = (_sorted(*(line[..., first : first + width] for first in range(3))) for line in column)
+    third = torch.minimum(torch.maximum(least[1], middle[0]), torch.minimum(least[2], most[0]))
+    fifth = _sorted(least[2], middle[1], most[0])[1]
+    seventh = torch.maximum(torch.minimum(middle[2], most[1]), torch.maximum(least[2], most[0]))
+    return third, fifth, seventh
+
+
+def _sorted(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    a, b = torch.minimum(a, b), torch.maximum(a, b)
+    b, c = torch.minimum(b, c), torch.maximum(b, c)
+    return torch.minimum(a, b), torch.maximum(a, b), c

@@ -1,0 +1,126 @@
+"""Convolutions that commute with the eight turns and reflections of a square.
+
+A feature has eight channels, one for each turn or reflection of its filter: turning the image turns the channels and
+permutes them. Cohen & Welling, ICML 2016 (group-equivariant convolutional networks, p4m).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+__all__ = ["GROUP", "SymmetricConv", "SymmetricWindow", "symmetric_mean"]
+
+GROUP = 8
+"""Turns and reflections of a square."""
+
+
+def _turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
+    """An image `[..., k, k]` acted on by one of the eight elements."""
+    return np.rot90(np.flip(image, -1) if element >= 4 else image, element % 4, axes=(-2, -1))
+
+
+@lru_cache(maxsize=1)
+def _left_quotients() -> NDArray[np.int64]:
+    """Index of g⁻¹ h for elements g and h, `[8, 8]`."""
+    probe = np.arange(9).reshape(3, 3)
+    images = [_turned(probe, element).tolist() for element in range(GROUP)]
+    table = np.empty((GROUP, GROUP), np.int64)
+    for g in range(GROUP):
+        for other in range(GROUP):  # g ∘ other = h
+            product = _turned(_turned(probe, other), g).tolist()
+            table[g, images.index(product)] = other
+    return table
+
+
+@lru_cache(maxsize=32)
+def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
+    """Places in a filter `[channels, size, size]` that the expanded one `[8, channels, size, size]` takes, flat."""
+    places = np.arange(channels * size * size).reshape(channels, size, size)
+    quotients = _left_quotients()
+    parts = [_turned(places[quotients[g]] if channels == GROUP else places, g) for g in range(GROUP)]
+    return torch.from_numpy(np.ascontiguousarray(np.stack(parts))).flatten()
+
+
+class SymmetricConv(nn.Module):
+    """Convolution of features, or of an image's scalar channels with `lifts`, that commutes with `GROUP`.
+
+    Args:
+        inputs: Features, each of eight channels; scalar channels with `lifts`.
+        outputs: Features.
+        size: Side of the filters [pixels].
+        stride: Only with filters and images of even sides is the symmetry kept for a stride of 2.
+        lifts: Whether the input is scalar channels.
+        bias: Whether each feature has a bias.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, size: int, *, stride: int = 1, lifts: bool = False, bias: bool = True
+    ) -> None:
+        super().__init__()
+        channels = 1 if lifts else GROUP
+        self.size, self.stride, self.padding = size, stride, (size - stride + 1) // 2
+        self.weight = nn.Parameter(torch.empty(outputs, inputs, channels * size * size))
+        nn.init.normal_(self.weight, std=(2.0 / (inputs * channels * size * size)) ** 0.5)
+        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
+        self.register_buffer("places", _expansion(size, channels).clone(), persistent=False)
+        self._kept: Tensor | None = None
+
+    def expanded(self) -> Tensor:
+        """The filters of an ordinary convolution, `[8 outputs, inputs, size, size]`."""
+        if self._kept is not None and not torch.is_grad_enabled() and self._kept.device == self.weight.device:
+            return self._kept
+        assert isinstance(self.places, Tensor)
+        outputs, inputs = self.weight.shape[:2]
+        shape = (outputs, inputs, GROUP, -1, self.size, self.size)
+        filters = self.weight.index_select(2, self.places).view(shape).transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        self._kept = None if torch.is_grad_enabled() or self.training else filters.detach()
+        return filters
+
+    def train(self, mode: bool = True) -> SymmetricConv:
+        self._kept = None
+        return super().train(mode)
+
+    def _load_from_state_dict(self, *arguments: object) -> None:
+        self._kept = None
+        super()._load_from_state_dict(*arguments)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        bias = None if self.bias is None else self.bias[:, None].expand(-1, GROUP).flatten()
+        return F.conv2d(x, self.expanded(), bias, self.stride, self.padding)
+
+
+class SymmetricWindow(nn.Module):
+    """Values for the places of a `side` × `side` window around each pixel, which turn with the image.
+
+    Args:
+        inputs: Features, each of eight channels.
+        side: Of the window.
+    """
+
+    def __init__(self, inputs: int, side: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(inputs, side * side) * (0.3 / (GROUP * inputs) ** 0.5))
+        distance = (torch.arange(side) - side // 2).abs()
+        classes = torch.stack([torch.minimum(distance[:, None], distance), torch.maximum(distance[:, None], distance)])
+        _, index = torch.unique(classes.flatten(1), dim=1, return_inverse=True)
+        self.bias = nn.Parameter(torch.zeros(int(index.max()) + 1))
+        self.register_buffer("classes", index, persistent=False)
+        self.register_buffer("places", _expansion(side, 1).clone(), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        assert isinstance(self.places, Tensor) and isinstance(self.classes, Tensor)
+        inputs, area = self.weight.shape
+        weight = self.weight.index_select(1, self.places).view(inputs * GROUP, area)
+        return F.conv2d(x, weight.t()[:, :, None, None].contiguous(), self.bias.index_select(0, self.classes))
+
+
+def symmetric_mean(x: Tensor) -> Tensor:
+    """Mean of each feature over its eight channels: scalars that turn with the image."""
+    return x.unflatten(1, (-1, GROUP)).mean(dim=2)

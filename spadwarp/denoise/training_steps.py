@@ -1,0 +1,294 @@
+"""A training's processes, steps and files."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from spadwarp.denoise.losses import loss_of
+from spadwarp.denoise.network_files import load_network, torch_device
+from spadwarp.denoise.networks import build_network, reads_histograms
+from spadwarp.denoise.recipe import TrainingRecipe
+from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.io.atomic import atomic_path
+from spadwarp.limits import environment_integer
+
+__all__ = ["Run", "Trained", "Workers", "save_weights"]
+
+_EAGER = 12  # steps before one is recorded as a CUDA graph
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trained:
+    """Files and validation of a training.
+
+    Attributes:
+        weights: The network, safetensors.
+        log: JSON lines: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, seconds.
+        psnr: Validation PSNR, mean over the levels [dB].
+        seconds: Duration of all parts of the run together [s].
+    """
+
+    weights: Path
+    log: Path
+    psnr: float
+    seconds: float
+
+
+def save_weights(network: nn.Module, path: str | Path, metadata: dict[str, str]) -> Path:
+    """Weights as float16 safetensors, with metadata (text by name) in the file's header."""
+    from safetensors.torch import save
+
+    values = {
+        name: (value.half() if value.is_floating_point() else value).contiguous().cpu()
+        for name, value in network.state_dict().items()
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(values, metadata=metadata))
+    return Path(path)
+
+
+@torch.no_grad()
+def _update_mean(average: nn.Module, network: nn.Module, decay: float) -> None:
+    """Updates the running mean of the weights and of the statistics of batch normalisation."""
+    pairs = list(zip(average.state_dict().values(), network.state_dict().values(), strict=True))
+    floats = [(kept, new) for kept, new in pairs if kept.is_floating_point()]
+    torch._foreach_lerp_([kept for kept, _ in floats], [new for _, new in floats], 1.0 - decay)
+    for kept, new in pairs:
+        if not kept.is_floating_point():
+            kept.copy_(new)
+
+
+def learning_rate(step: int, recipe: TrainingRecipe) -> float:
+    settings = recipe.optimiser
+    rise = min(1.0, (step + 1) / max(settings.warm_up, 1))
+    fall = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+    return settings.learning_rate * rise * (0.01 + 0.99 * fall)
+
+
+class Workers:
+    """The processes of a run: this one alone, or those that torchrun started."""
+
+    def __init__(self, device: str | None) -> None:
+        self.size, self.rank = environment_integer("WORLD_SIZE", 1), environment_integer("RANK", 0)
+        self.is_cuda = torch.cuda.is_available() if device is None else device.startswith("cuda")
+        if self.is_cuda and device in (None, "cuda"):
+            device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
+        elif self.is_cuda and self.size > 1:
+            raise ConfigError(f"device = {device!r} is one for all {self.size} processes; leave it out")
+        self.device = torch_device(device)
+        if self.is_cuda:
+            torch.cuda.set_device(self.device)
+        if self.size > 1:
+            torch.distributed.init_process_group("nccl" if self.is_cuda else "gloo")
+            self._on_host = torch.distributed.new_group(backend="gloo")
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in any of the processes; asked on the host, so that no GPU has to wait."""
+        if self.size == 1:
+            return flag
+        flags = torch.tensor(int(flag))
+        torch.distributed.all_reduce(flags, torch.distributed.ReduceOp.MAX, group=self._on_host)
+        return bool(flags)
+
+    def close(self) -> None:
+        if self.size > 1:
+            torch.distributed.destroy_process_group()
+
+
+class Run:
+    """Network, optimiser and files of a training; resumes from the checkpoint in its folder."""
+
+    def __init__(self, recipe: TrainingRecipe, folder: Path, workers: Workers) -> None:
+        self.recipe, self.folder, self.workers = recipe, folder, workers
+        self.log, self.checkpoint = folder / "log.jsonl", folder / "checkpoint.pt"
+        torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = workers.is_cuda
+        torch.manual_seed(recipe.seed)
+        network: Any = build_network(recipe.model)
+        if recipe.start is not None:
+            keys = network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
+            new = [
+                name for name in keys.missing_keys if not name.startswith(("enter_features.", "choose.", "evidence"))
+            ]
+            if new or keys.unexpected_keys:
+                raise FileError(f"start = {recipe.start!r}: its layers are not those of {recipe.model!r}")
+        self.network = network.to(workers.device).to(memory_format=torch.channels_last)
+        self.learner = self.network
+        if workers.size > 1:
+            devices = [workers.device.index] if workers.is_cuda else None
+            self.learner = nn.parallel.DistributedDataParallel(self.network, device_ids=devices)
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        rate, decay = recipe.optimiser.learning_rate, recipe.optimiser.weight_decay
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=torch.tensor(rate, device=workers.device) if workers.is_cuda else rate,
+            weight_decay=decay, fused=workers.is_cuda, capturable=workers.is_cuda,
+        )  # fmt: skip
+        self.generator = torch.Generator(workers.device).manual_seed(recipe.seed * 1009 + workers.rank)
+        self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
+        self.loss_sum = torch.zeros((), device=workers.device)  # of the steps since the last report
+        self.step, spent = self._resume()
+        self.steps_here, self.recorded = 0, False
+        self.graph: Any = None
+        self.graph_loss = torch.zeros(())
+        self.scenes: CleanScenes | None = None
+        self.static: tuple[Tensor, ...] = ()
+        self.side: Any = torch.cuda.Stream() if workers.is_cuda else None
+        self.last_report, self.timed_from = time.monotonic(), self.step
+        self.began = self.last_report - spent
+
+    def _resume(self) -> tuple[int, float]:
+        """Steps done and seconds spent by an earlier part of the run, whose state is restored."""
+        rank = self.workers.rank
+        if not self.checkpoint.is_file():
+            if rank == 0:
+                self.log.unlink(missing_ok=True)
+            return 0, 0.0
+        try:
+            kept = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+        except Exception as error:  # what a damaged file raises depends on where it is damaged
+            raise FileError(f"{self.checkpoint}: damaged; remove it to start anew ({type(error).__name__})") from error
+        if not isinstance(kept, dict) or kept.get("recipe") != self.recipe.model_dump_json():
+            raise ConfigError(f"{self.checkpoint} belongs to another recipe; remove it, or choose another folder")
+        try:
+            for name, part in self.state.items():
+                part.load_state_dict(kept[name])
+            if rank < len(kept["random"]):
+                self.generator.set_state(kept["random"][rank])
+            kept = {**kept, "step": int(kept["step"]), "seconds": float(kept["seconds"])}
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
+        if rank == 0 and self.log.is_file():  # a line is written before its checkpoint
+            lines = self.log.read_text().splitlines(keepends=True)
+            settings = self.recipe.optimiser
+            reports = kept["step"] // settings.report_every
+            lines = lines[
+                : reports if kept["step"] < settings.steps else math.ceil(kept["step"] / settings.report_every)
+            ]
+            with atomic_path(self.log) as temporary:
+                temporary.write_text("".join(lines))
+        self.loss_sum += kept.get("loss_sum", 0.0)
+        return int(kept["step"]), float(kept["seconds"])
+
+    def report(self, psnr: dict[float, float]) -> None:
+        """Writes a line of the log and a checkpoint."""
+        settings, now = self.recipe.optimiser, time.monotonic()
+        line = {
+            "step": self.step,
+            "loss": float(self.loss_sum) / (self.step % settings.report_every or settings.report_every),
+            "psnr": {f"{level:.3f}": round(value, 3) for level, value in psnr.items()},
+            "mean_psnr": round(sum(psnr.values()) / len(psnr), 3),
+            "pairs_per_second": round((self.step - self.timed_from) * settings.batch / (now - self.last_report)),
+            "seconds": round(now - self.began, 1),
+        }
+        if self.workers.rank == 0:
+            with self.log.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+        self.loss_sum.zero_()
+        self.save_checkpoint()
+        self.last_report, self.timed_from = time.monotonic(), self.step
+
+    def update(self, scenes: CleanScenes) -> None:
+        """One step. On a single GPU steps are replayed as a CUDA graph, which launches faster."""
+        rate = learning_rate(self.step, self.recipe)
+        for group in self.optimiser.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        if self.graph is not None:
+            if scenes is not self.scenes:
+                for kept, new in zip(self.static, scenes, strict=True):
+                    kept.copy_(new)
+                self.scenes = scenes
+            self.graph.replay()
+            loss = self.graph_loss
+        elif self.workers.is_cuda:
+            side = self.side
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                loss = self._work(scenes)
+            torch.cuda.current_stream().wait_stream(side)
+        else:
+            loss = self._work(scenes)
+        self.loss_sum += loss
+        self.step += 1
+        self.steps_here += 1
+        settled = self.steps_here >= _EAGER and self.step > self.recipe.optimiser.warm_up + 1
+        if self.side is not None and self.workers.size == 1 and settled and not self.recorded:
+            self.recorded = True
+            self._capture(scenes)
+
+    def _capture(self, scenes: CleanScenes) -> None:
+        """Records a step as a CUDA graph; where that fails, training goes on step by step."""
+        self.scenes, self.static = scenes, tuple(values.clone() for values in scenes)
+        graph = torch.cuda.CUDAGraph()
+        torch.cuda.synchronize()
+        try:
+            graph.register_generator_state(self.generator)
+            self.optimiser.zero_grad(set_to_none=True)
+            with torch.cuda.graph(graph):
+                self.graph_loss = self._work(CleanScenes(*self.static))
+        except (RuntimeError, AttributeError) as error:
+            warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
+            torch.cuda.synchronize()
+            return
+        self.graph = graph
+
+    def _work(self, scenes: CleanScenes) -> Tensor:
+        settings, workers = self.recipe.optimiser, self.workers
+        precision = torch.bfloat16 if settings.precision == "bfloat16" and workers.is_cuda else torch.float32
+        self.learner.train()
+        batch = draw_batch(
+            scenes, self.recipe.noise, size=settings.batch // workers.size, crop=settings.crop,
+            generator=self.generator, histograms=reads_histograms(self.network),
+        )  # fmt: skip
+        mixed = precision != torch.float32
+        with torch.autocast(workers.device.type, dtype=precision, enabled=mixed, cache_enabled=False):
+            output = self.learner(batch.frame.contiguous(memory_format=torch.channels_last))
+        loss = loss_of(output.float(), batch, kind=settings.loss)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
+        return loss.detach()
+
+    def save_checkpoint(self) -> None:
+        """Writes all from which the run can be resumed; every process has to call it."""
+        random: list[Any] = [self.generator.get_state()]
+        if self.workers.size > 1:
+            random = [None] * self.workers.size
+            torch.distributed.all_gather_object(random, self.generator.get_state())
+        if self.workers.rank == 0:
+            kept = {name: part.state_dict() for name, part in self.state.items()}
+            kept.update(recipe=self.recipe.model_dump_json(), random=random, step=self.step)
+            kept.update(loss_sum=float(self.loss_sum), seconds=time.monotonic() - self.began)
+            with atomic_path(self.checkpoint) as temporary:
+                torch.save(kept, temporary)
+
+    def finish(self, psnr: dict[float, float]) -> Trained:
+        """Writes the weights, the running mean of the network."""
+        recipe, workers, seconds = self.recipe, self.workers, time.monotonic() - self.began
+        weights = self.folder / f"{recipe.model}.safetensors"
+        if workers.rank == 0:
+            metadata = {
+                "model": recipe.model,
+                "seed": str(recipe.seed),
+                "recipe": recipe.model_dump_json(),
+                "validation_psnr": json.dumps({f"{level:.3f}": round(value, 2) for level, value in psnr.items()}),
+                "hours": f"{seconds / 3600:.3f}",
+                "machine": f"{workers.size} x {torch.cuda.get_device_name()}" if workers.is_cuda else "CPU",
+            }
+            save_weights(self.average, weights, metadata)
+        return Trained(weights=weights, log=self.log, psnr=sum(psnr.values()) / len(psnr), seconds=seconds)
