@@ -110,10 +110,8 @@ class TrainingRecipe(_Table):
     start: Literal["pyramid"] | None = Field(
         None, description="network of the package whose weights the training starts from"
     )
-    data: str | None = Field(
-        None,
-        min_length=1,
-        description="dataset (folder), relative to the working directory; without it, scenes are drawn",
+    data: Annotated[str, Field(min_length=1)] | None = Field(
+        None, description="dataset (folder), relative to the working directory; without it, scenes are drawn"
     )
     seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()

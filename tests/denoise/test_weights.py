@@ -125,6 +125,14 @@ def test_a_gate_twice_too_wide_changes_little():
     assert errors[1] < 1.3 * errors[0]
 
 
+def test_a_line_one_pixel_wide_is_kept_where_backscatter_is_rare():
+    clean = np.full((64, 96), 14.6, np.float32)
+    clean[:, 20::25] = 14.95
+    noisy = noisy_frame(clean, 0.042, seed=4)
+    found, line = denoised(noisy), clean > 14.9
+    assert np.sqrt(np.mean((found - clean)[line] ** 2)) < 0.1
+
+
 def test_the_gate_is_narrowed_to_where_depths_agree():
     target = evaluation_scene("spiral", "open water")
     frames = depth_frames(noisy_depth(target, water="uniform", level=0.264, seed=1), gate=(12.0, 20.0))

@@ -53,9 +53,15 @@ def test_kernels_import_warp_numpy_and_the_standard_library_only():
 # Themselves loaded when there are pictures to draw, or a network to run.
 LOADED_LATE = {
     "denoise/histogram_features.py",
+    "denoise/losses.py",
     "denoise/networks.py",
+    "denoise/pyramid.py",
+    "denoise/semi_global.py",
+    "denoise/shapes.py",
+    "denoise/symmetric.py",
     "denoise/synthetic_noise.py",
     "denoise/training.py",
+    "denoise/training_steps.py",
     "transport/device_worker.py",
     "transport/local_workers.py",
     "transport/model.py",
