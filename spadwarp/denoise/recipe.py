@@ -107,8 +107,8 @@ class TrainingRecipe(_Table):
     """Everything a training depends on, checked and frozen."""
 
     model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
-    start: Literal["pyramid"] | None = Field(
-        None, description="network of the package whose weights the training starts from"
+    start: Literal["pyramid", "histograms"] | None = Field(
+        None, description="network of the package whose weights the training starts from: the model itself"
     )
     data: Annotated[str, Field(min_length=1)] | None = Field(
         None, description="dataset (folder), relative to the working directory; without it, scenes are drawn"
@@ -122,7 +122,7 @@ class TrainingRecipe(_Table):
     def _is_consistent(self) -> Self:
         if self.model == "histograms" and self.noise.counting != 1:
             raise ValueError(f'noise.counting = {self.noise.counting} with model = "histograms", which needs 1')
-        if self.start is not None and self.model not in ("pyramid", "histograms"):
+        if self.start is not None and self.start != self.model:
             raise ValueError(f"start = {self.start!r}: its layers are not those of {self.model!r}")
         return self
 

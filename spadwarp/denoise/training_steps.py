@@ -117,12 +117,7 @@ class Run:
         torch.manual_seed(recipe.seed)
         network: Any = build_network(recipe.model)
         if recipe.start is not None:
-            keys = network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
-            new = [
-                name for name in keys.missing_keys if not name.startswith(("enter_features.", "choose.", "evidence"))
-            ]
-            if new or keys.unexpected_keys:
-                raise FileError(f"start = {recipe.start!r}: its layers are not those of {recipe.model!r}")
+            network.load_state_dict(load_network(recipe.start).state_dict())
         self.network = network.to(workers.device).to(memory_format=torch.channels_last)
         self.learner = self.network
         if workers.size > 1:
