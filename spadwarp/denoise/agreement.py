@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 __all__ = ["agreeing_depths"]
 
-_NEAR = 0.008  # part of the gate within which two depths agree
+_NEAR = 0.008, 0.02  # parts of the gate within which two depths agree: at least, and at most where they scatter more
 _APART = 0.01  # a depth this far from the answer was taken for backscatter
 _CHANCE = 5e-5  # highest probability that backscatter agrees as often by chance
 
@@ -28,16 +28,19 @@ def agreeing_depths(
     from scipy.special import bdtrc
 
     height, width = scaled.shape
+    with np.errstate(invalid="ignore"):
+        error = np.abs(scaled - found)
+    scatter = 1.48 * float(np.median(error[error <= _APART])) if (error <= _APART).any() else 0.0
+    near = float(np.clip(4.0 * scatter, *_NEAR))
     padded = np.pad(scaled, 1, constant_values=np.nan)
     count = np.zeros(scaled.shape, np.int64)
     with np.errstate(invalid="ignore"):
         for y in range(3):
             for x in range(3):
                 if (y, x) != (1, 1):
-                    count += np.abs(padded[y : y + height, x : x + width] - scaled) < _NEAR
-        apart = np.abs(scaled - found) > _APART
-    share = apart.sum() / scaled.size
-    chance = np.clip(2.0 * _NEAR * density * share, 0.0, 1.0)
+                    count += np.abs(padded[y : y + height, x : x + width] - scaled) < near
+    share = np.count_nonzero(error > _APART) / scaled.size
+    chance = np.clip(2.0 * near * density * share, 0.0, 1.0)
     agreeing = count >= 2
     agreeing[agreeing] = bdtrc(count[agreeing] - 1, 8, chance[agreeing]) < _CHANCE
     return agreeing

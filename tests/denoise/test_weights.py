@@ -130,7 +130,7 @@ def test_a_line_one_pixel_wide_is_kept_where_backscatter_is_rare():
     clean[:, 20::25] = 14.95
     noisy = noisy_frame(clean, 0.042, seed=4)
     found, line = denoised(noisy), clean > 14.9
-    assert np.sqrt(np.mean((found - clean)[line] ** 2)) < 0.1
+    assert np.mean(np.abs(found - clean)[line] < 0.05) > 0.8  # the others report backscatter, or one beside them does
 
 
 def test_the_gate_is_narrowed_to_where_depths_agree():
