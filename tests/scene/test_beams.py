@@ -1,9 +1,12 @@
 """Lasers: a measured profile leaves as it was measured, a scene's checks and its tallies know where the beam is."""
 
 import math
+import struct
+import zlib
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import stats
 
 import spadwarp
@@ -12,6 +15,7 @@ from helpers.scenes import scene
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
+from spadwarp.scene import beam_profile
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import photon_capacity, tally_scale
 from spadwarp_kernels import profile_tables
@@ -196,3 +200,32 @@ def test_the_beam_of_a_laser_in_the_world():
     np.testing.assert_allclose(one.beam.position, turn.T @ [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(one.beam.axis, turn.T @ [0, 1, 0], atol=1e-12)
     assert scene(camera=camera).beam == scene(camera=camera).laser
+
+
+@pytest.mark.parametrize("ending", ["png", "npy", "exr"])
+def test_profiles_of_too_many_pixels_are_refused_before_they_are_decoded(ending, tmp_path, monkeypatch):
+    """A small file can hold a huge image of one colour."""
+    monkeypatch.setattr(beam_profile, "_LARGEST", 64 * 64)
+    monkeypatch.setattr("matplotlib.image.imread", lambda *_: pytest.fail("it was decoded"))
+    path, image = tmp_path / f"beam.{ending}", np.ones((65, 256), np.float32)
+    if ending == "png":
+        Image.new("L", (256, 65), 255).save(path)
+    elif ending == "npy":
+        np.save(path, image)
+    else:
+        write_exr(path, {"Y": image})
+    laser = scene(laser=measured(path)).laser
+    with pytest.raises(FileError, match=rf"beam\.{ending}.*at most \d+ are"):
+        beam_profile.load_profile(laser)
+
+
+def test_a_png_of_ten_billion_pixels_is_refused(tmp_path):
+    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(b"\0" * 1000)), (b"IEND", b""))
+    content = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+    (tmp_path / "beam.png").write_bytes(b"\x89PNG\r\n\x1a\n" + content)
+    laser = scene(laser=measured(tmp_path / "beam.png")).laser
+    with pytest.raises(FileError, match=r"beam\.png.*pixels"):
+        beam_profile.load_profile(laser)
