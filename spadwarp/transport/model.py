@@ -131,7 +131,7 @@ def _guiding(scene: Scene, max_path: float) -> Any:
     """Probabilities of guided flights, measured on plane, staircase, harbour and a tank 7.5 attenuation lengths long.
 
     Each event divides the weight of light that was not guided by 1 - probability, so that optically thick water, where
-    events are many, needs smaller ones.
+    events are many, needs smaller ones; vessels do too, see `guided_part` of the kernel library.
     """
     beam = scene.beam
     if scene.medium.layers:

@@ -30,6 +30,9 @@ from .contribution import Request, make_event_request, make_score
 from .estimator import Direction, Estimator, FlightPlan
 from .flight_sampling import sample_lens
 
+# A photon's weight is at most this times its analog weight, see `guided_part`.
+LARGEST_WEIGHT_RATIO = wp.constant(64.0)
+
 
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
@@ -101,6 +104,30 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     return request_flight, make_event_request(spec, flights=True)
 
 
+@wp.func
+def guided_part(weight: float, analog_weight: float, surfaces_met: int, probability: float) -> float:
+    """By which an event multiplies the probability that it guides its direction, in [0, 1].
+
+    A direction that is left to the physics multiplies the weight by up to 1/(1 - probability), and with it the second
+    moment of all scores to come: guiding pays where they are few beside the flight that it improves. A photon that has
+    met m surfaces is probably in a vessel and meets about as many again, with a share of the light that is its analog
+    weight a: the part 1/(1 + a (m - 1)). In a white vessel the weights of undirected photons, which were
+    (1 - probability)^-m, then grow as m^probability.
+
+    The ratio r of weight to analog weight is bounded, too, by R = LARGEST_WEIGHT_RATIO: a probability of at most
+    1 - r/R leaves r <= R. The second moment of a score r f is then at most R times that of the walk without guiding,
+    E[r^2 f^2] <= R E[r f^2], whatever the water, its layers and the surfaces.
+
+    Args:
+        weight, analog_weight: Of the photon; > 0.
+        surfaces_met: Surfaces up to and including this event.
+        probability: That of all guided directions together, in [0, 1).
+    """
+    vessel = analog_weight * float(wp.max(surfaces_met - 1, 0))
+    bound = 1.0 - weight / (LARGEST_WEIGHT_RATIO * analog_weight)
+    return wp.clamp(bound / wp.max(probability, 1.0e-6), 0.0, 1.0 / (1.0 + vessel))
+
+
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
@@ -128,6 +155,13 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
+        here = water_at(medium, layers, s.x)
+        to_lens_chance = guiding.probability
+        met = s.surface_count
+        if on_surface:
+            met += 1
+            # For what the water scatters on the way to the lens: where it is clear there is nothing to gain.
+            to_lens_chance = guiding.surface_probability * wp.min(2.0 * here.extinction * wp.length(s.x), 1.0)
         snapped = snap_direction(s.u, medium.axis_threshold)
         v = -wp.normalize(s.x)
         if wp.static(has_phase_guide):
@@ -137,13 +171,14 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
         view = view_of(camera, s.view)
         to_axis = toward_axis(view, s.x)
-        to_lens_chance = wp.where(on_surface, guiding.surface_probability, guiding.probability)
         to_view_chance = float(0.0)
         if wp.dot(to_axis, to_axis) > 0.0 and not in_view(camera, view, s.x):
             to_view_chance = guiding.return_probability
             to_axis = wp.normalize(to_axis)
+        part = guided_part(s.weight.value, s.analog_weight, met, to_lens_chance + to_view_chance)
+        to_lens_chance *= part
+        to_view_chance *= part
         choice = u01(s.flight.block[3])
-        here = water_at(medium, layers, s.x)
         axis = snapped
         t = phase_sample(u01_fine(s.flight.block[1]), here)
         if on_surface:

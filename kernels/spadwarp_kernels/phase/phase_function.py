@@ -7,7 +7,8 @@ import warp as wp
 
 @wp.struct
 class Guiding:
-    """How strongly directions are drawn towards the lens.
+    """How strongly directions are drawn towards the lens; where weights have grown or a vessel is likely, `guided_part`
+    lowers the probabilities.
 
     Attributes:
         probability: Chance that a water collision draws its direction from the lobe about the lens, in [0, 1).
