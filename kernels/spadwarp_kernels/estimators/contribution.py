@@ -121,8 +121,9 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.weight = s.weight.value
                 q.path = s.path
                 if wp.static(flights):
-                    q.lens = s.flight.lens  # that of the flight; others draw one from `first`
-                    q.weight *= s.flight.lens_weight
+                    # An even draw, from the words that the flight's point comes from: a surface has nothing to gain
+                    # from a point close to the flight's line. Others draw one from `first`.
+                    q.lens = lens_point(camera, u01(s.flight.sample_block[2]), u01(s.flight.sample_block[3]))
                 q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
                 q.rounding_sample = s.flight.block[2]  # of the azimuth to come
