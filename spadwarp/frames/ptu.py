@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.time_tags import most_values
+from spadwarp.limits import shown
 
 __all__ = ["read_ptu"]
+
+_MARKERS = 16  # of T3 records; four today
 
 
 def read_ptu(
@@ -33,6 +36,7 @@ def read_ptu(
     import ptufile
 
     with ptufile.PtuFile(path) as file:
+        _check_tags(file, path)
         if not file.is_t3:
             raise FileError(f"{path}: T2 records have no time since the pulse; T3 records are needed")
         width = float(file.tcspc_resolution)
@@ -43,6 +47,16 @@ def read_ptu(
         else:
             counts, text = _scan(file, image_size)
         return counts, width, _own_gate(file), text
+
+
+def _check_tags(file: Any, path: Path) -> None:
+    """Refuses numbers of the header that its reader would compute with for minutes."""
+    for name in ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame"):  # a marker, a power of two of it
+        if not 0 <= (marker := file.tags.get(name) or 0) <= _MARKERS:
+            raise FileError(f"{path}: {name} = {shown(marker)} is outside [0, {_MARKERS}], the markers of a record")
+    count, size = file.tags.get("TTResult_NumberOfRecords") or 0, path.stat().st_size
+    if not 4 * count <= size:
+        raise FileError(f"{path}: TTResult_NumberOfRecords = {shown(count)} is more than a file of {size} bytes holds")
 
 
 def _image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
