@@ -20,6 +20,10 @@ settings.register_profile("spadwarp", deadline=None, derandomize=True, suppress_
 settings.load_profile("spadwarp")
 
 
+def pytest_addoption(parser):
+    parser.addoption("--fuzz", type=int, default=500, metavar="N", help="cases of the fuzzing harness, tests/fuzz")
+
+
 def pytest_collection_modifyitems(items):
     """What is marked neither `physics` nor `slow` is `fast`."""
     for item in items:

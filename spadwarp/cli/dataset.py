@@ -169,8 +169,10 @@ def preview(
     Example:
       spadwarp dataset preview data/small/ --out sheet.png
     """
+    from spadwarp.dataset import read_manifest
     from spadwarp.viz import draw_dataset
 
+    read_manifest(folder)  # before a folder is made for the picture
     picture = out or folder / "preview.png"
     opt.check_outputs(files={"--out": picture}, inputs=(folder,), overwrite=overwrite)
     path = draw_dataset(folder, picture, split=split.value, frames=frames)

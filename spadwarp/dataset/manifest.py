@@ -97,6 +97,9 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
         _Manifest.model_validate(manifest)
     except ValidationError as error:
         raise FileError(f"{path}: not a whole manifest: {_first_problem(error)}") from error
+    placed = {name for split in manifest["splits"].values() for name in split["targets"]}
+    if lost := sorted(set(manifest["targets"]) - placed):
+        raise FileError(f"{path}: not a whole manifest: the target {shown(lost[0])} is in no split")
     return manifest
 
 

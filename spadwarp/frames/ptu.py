@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from spadwarp.limits import shown
 __all__ = ["read_ptu"]
 
 _MARKERS = 16  # of T3 records; four today
+# What ptufile says about a damaged file stands in our errors, too.
+logging.getLogger("ptufile").addHandler(logging.NullHandler())
 
 
 def read_ptu(
@@ -39,6 +42,9 @@ def read_ptu(
         _check_tags(file, path)
         if not file.is_t3:
             raise FileError(f"{path}: T2 records have no time since the pulse; T3 records are needed")
+        file.cache_records = True
+        if (there := len(file.read_records())) < file.number_records:
+            raise FileError(f"{path}: cut: of {file.number_records} records {there} are there")
         width = float(file.tcspc_resolution)
         if not 1e-15 < width < 1e-3:
             raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from spadwarp.scene import Scene, Target
 
 __all__ = ["TriangleMesh", "build_mesh", "load_target"]
+
+# What trimesh says about a damaged file, with a stack, is for those who have set up logging; an error says the rest.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MAX_FACES = 2**31 - 1
 FARTHEST = 1e9  # [m], as for all coordinates of a scene

@@ -154,3 +154,5 @@ def test_a_dataset_is_no_output(tmp_path):
     refused("dataset", "preview", folder, "--frames", 1, words=("preview.png exists",))
     run("dataset", "preview", folder, "--frames", 1, "--overwrite")
     assert (folder / "manifest.json").read_bytes() == before and not (folder / "x.json").exists()
+    run("dataset", "preview", tmp_path / "nosuch", code=1)
+    assert not (tmp_path / "nosuch").exists()

@@ -85,6 +85,14 @@ def test_a_manifest_that_is_no_table_is_refused(text, folder):
         assert "manifest.json" in outcome.stderr
 
 
+def test_a_target_that_is_in_no_split_is_refused(folder):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["targets"][0] += "x"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(FileError, match=r"manifest\.json: not a whole manifest: the target .*x' is in no split"):
+        read_manifest(folder)
+
+
 @pytest.mark.parametrize(
     "text", ["[]", "{", '{"../x.h5": {"bytes": 1, "sha256": "0"}}', '{"frames-00000.h5": 3}', "9" * 5000]
 )

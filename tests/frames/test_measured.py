@@ -126,6 +126,28 @@ def test_axes_are_inferred_where_one_order_is_clear(shape, order, tmp_path):
         read_histograms(tmp_path / "a.npy", axes="xxt", **START)
 
 
+def test_cells_that_all_hold_as_many_tags(tmp_path):
+    counts = np.zeros((3, 5, 9), np.uint16)
+    counts[..., 4] = 2
+    scipy_io.savemat(tmp_path / "tags.mat", {"Ts": cells(counts, 0)})
+    found = read_histograms(tmp_path / "tags.mat", tag_unit=4e-12, **START)
+    assert np.array_equal(found.values, counts[..., 4:5]) and found.gate_start == pytest.approx(16e-12)
+
+
+@pytest.mark.slow
+def test_a_mat_file_that_brings_its_reader_down_is_an_error(tmp_path):
+    """A change of one byte near the class and the sizes of the array, after which scipy's reader faults or fails."""
+    scipy_io.savemat(tmp_path / "a.mat", {"Ts": cells(COUNTS, 7)})
+    whole = (tmp_path / "a.mat").read_bytes()
+    place = whole.index(b"Ts")
+    for k in range(place - 40, place + 60, 9):
+        (tmp_path / "b.mat").write_bytes(whole[:k] + b"\x7f" + whole[k + 1 :])
+        try:
+            read_histograms(tmp_path / "b.mat", tag_unit=4e-12, **START)
+        except (FileError, ArgumentError):
+            continue
+
+
 def test_floats_are_counts_if_all_are_whole(tmp_path):
     for name, factor, kind in (("counts", 1.0, "i"), ("rates", 0.5, "f")):
         np.save(tmp_path / f"{name}.npy", factor * COUNTS)

@@ -365,3 +365,22 @@ def test_an_open_mesh_and_one_of_no_likely_unit_are_told(tmp_path):
     assert found.unit is None and found.scale == 1.0 and any("neither" in hint for hint in found.hints)
     with pytest.raises(MeshError, match="no such file"):
         describe_mesh(tmp_path / "nothing.stl")
+
+
+def test_a_damaged_image_is_an_error_of_the_mesh(tmp_path, capfd) -> None:
+    """Pillow opens it and fails when the pixels are read; trimesh's own warnings do not reach the terminal."""
+    from PIL import Image
+
+    pixels = np.random.default_rng(1).integers(0, 255, (32, 32, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    whole = (tmp_path / "a.png").read_bytes()
+    middle = len(whole) // 2
+    (tmp_path / "a.png").write_bytes(whole[:middle] + bytes(200) + whole[middle + 200 :])
+    (tmp_path / "a.mtl").write_text("newmtl one\nmap_Kd a.png\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl one\nf 1/1 2/2 3/3\n"
+    )
+    scene = scene_of({"mesh": str(tmp_path / "a.obj"), "translation": [0.0, 0.0, 5.0], "reflectance": "from_file"})
+    with pytest.raises(MeshError, match="an image that is damaged"):
+        build_mesh(scene)
+    assert "Traceback" not in capfd.readouterr().err

@@ -1,0 +1,94 @@
+"""Command lines that a beginner, a typo or an attacker writes: options of every command with odd values."""
+
+import functools
+import itertools
+import random
+
+import typer
+
+ODD = (
+    "", " ", "-1", "0", "1e5", "1.5", "nan", "inf", "-inf", "1e308", "1e-320", "9" * 5000, "99999999999999999999",
+    "0x10", "--", "-", "--help", "-h", "~nosuchuser", "~", "/dev/null", "nowhere/a", ".", "a" * 300, "a/" * 200,
+    "x\ty", "é𝕏", "²", "٣", "\udcff", "%s", "{}", "$(ls)", "scene.toml", "result.h5", "frames.h5", "counts.npy",
+    "depth.npy", "box.stl", "recipe.toml", "missing.h5", "out", "out/", "out/x.html", "out.json", "cpu", "cpu,cpu",
+    "cuda:99", "cuda:all", "ray", "local", "1:2", "1:5:3", "1:5:999999999", "1:5", "a,b,c", "3/2", "1/0", "2/3",
+    "0:1", "5:1", "16x12", "medium.extinction=1", "medium.extinction=-1", "medium.extinction=nan", "targets.².x=1",
+    "targets[0].scale=2", "targets[9].scale=2", "=", "a=", "=1", "medium=1", "transport.seed=1e3",
+    "camera.width=1e9", "gate.bins=0", "transport.photons=07:32:00", "[" * 500, "{" * 500, "json", "html", "mat",
+    "npy", "exr", "peak", "likelihood", "test", "nosuch", "pyramid", "median", "uwoc-clear", "staircase_15m", "1 m",
+    "3km", "1e3ps", "20 ns", "1e300", "True", "null",
+)  # fmt: skip
+
+# What would run for minutes, reach for a network or a browser, or write where it should not.
+_LEFT_OUT = {("validate",), ("bench",), ("doctor",), ("train",), ("evaluate",), ("plan",), ("dataset", "make")}
+_SETTINGS = {"--install-completion", "--show-completion", "--ray-address", "--engine"}
+
+BASES = {
+    ("check",): ("scene.toml",),
+    ("simulate",): ("scene.toml", "--photons", "200", "--out", "out", "--device", "cpu"),
+    ("analytic",): ("scene.toml", "--out", "out", "--frames", "2", "--device", "cpu"),
+    ("budget",): ("scene.toml", "--range", "1,2", "--device", "cpu"),
+    ("sweep",): ("scene.toml", "--vary", "medium.extinction=0.1:1:2", "--out", "out", "--device", "cpu"),
+    ("detect",): ("result.h5", "--pulses", "20", "--method", "peak", "--out", "out", "--device", "cpu"),
+    ("depth",): ("result.h5", "--out", "out", "--device", "cpu"),
+    ("denoise",): ("depth.npy", "--model", "median", "--out", "out", "--device", "cpu"),
+    ("info",): ("result.h5",),
+    ("view",): ("result.h5", "--out", "out.html", "--device", "cpu"),
+    ("video",): ("result.h5", "--out", "out.gif", "--pictures", "2"),
+    ("export",): ("frames.h5", "--format", "npy", "--out", "out"),
+    ("merge",): ("result.h5", "result.h5", "--out", "out"),
+    ("targets",): ("box.stl",),
+    ("water",): ("532",),
+    ("presets",): (),
+    ("init",): ("mine",),
+    ("schema",): (),
+    ("examples",): (),
+    ("dataset", "info"): ("out",),
+}
+OUTPUTS = ("out", "out.json", "out.html", "out.gif", "mine.toml", "view.html", "light.gif", "scene.toml.new")
+
+
+@functools.cache
+def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
+    """Of each command its options, and whether they take a value."""
+    from spadwarp.cli import app
+
+    found: dict[tuple[str, ...], list[tuple[str, bool]]] = {}
+
+    def walk(command, path):
+        for name, one in getattr(command, "commands", {}).items():
+            walk(one, (*path, name))
+        if not hasattr(command, "commands") and path not in _LEFT_OUT:
+            found[path] = [
+                (parameter.opts[-1], not getattr(parameter, "is_flag", False))
+                for parameter in command.params
+                if parameter.param_type_name == "option" and parameter.opts[-1] not in _SETTINGS
+            ]
+
+    walk(typer.main.get_command(app), ())
+    return found
+
+
+def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Arguments, and the names that they name for output."""
+    path = r.choice(sorted(options()))
+    words = list(BASES.get(path, ()))
+    for _ in range(r.choice((1, 1, 2, 3))):
+        action = r.random()
+        if action < 0.45 and options()[path]:
+            name, takes_value = r.choice(options()[path])
+            words += [name, r.choice(ODD)] if takes_value else [name]
+        elif action < 0.75 and words:
+            words[r.randrange(len(words))] = r.choice(ODD)
+        elif action < 0.85 and words:
+            del words[r.randrange(len(words))]
+        elif action < 0.93:
+            words.insert(r.randrange(len(words) + 1), r.choice(ODD))
+        else:
+            r.shuffle(words)
+    named = [value for option, value in itertools.pairwise(words) if option in _NAMING]
+    initial = [f"{word.removesuffix('.toml')}.toml" for word in words] if path == ("init",) else []
+    return (*path, *words), (*OUTPUTS, *named, *initial)
+
+
+_NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback"}

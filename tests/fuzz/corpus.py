@@ -1,0 +1,186 @@
+"""Valid files of every kind, small, made by spadwarp itself and by the libraries that others use."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+import spadwarp
+from helpers.datasets import recipe
+from spadwarp.io.exr import write_exr
+from spadwarp.transport import save_records, trace
+
+SCENE = b"""[medium]
+extinction = 0.5            # 1/m
+albedo = 0.8
+anisotropy = 0.9
+group_index = "seawater"
+[laser]
+half_angle_deg = 20.0
+position = [-0.05, 0.0, 0.0]
+pulse_energy = 1e-14
+repetition_rate = 1e7
+[camera]
+width = 10
+height = 8
+horizontal_fov_deg = 20.0
+aperture_diameter = 0.02
+[gate]
+start_ns = 16.0
+bin_width_ps = 200.0
+bins = 30
+[detector]
+dark_count_rate = 1e3
+pulses_per_frame = 500
+[[targets]]
+builtin = "plane"
+size = [1.5, 1.5]
+translation = [0.0, 0.0, 2.0]
+reflectance = 0.5
+[transport]
+photons = 2000
+seed = 3
+[output]
+png = false
+"""
+
+CALIBRATED = b"""[medium]
+extinction = 0.5
+albedo = 0.8
+phase_function = "tabulated"
+phase_table = "phase.csv"
+[laser]
+profile = "measured"
+profile_image = "beam.npy"
+half_angle_deg = 10
+[camera]
+calibration = "camera.yaml"
+aperture_diameter = 0.02
+[gate]
+bin_width_ps = 200.0
+bins = 30
+[detector]
+irf = "irf.csv"
+[[targets]]
+mesh = "target.obj"
+translation = [0, 0, 2.0]
+reflectance = "from_file"
+[transport]
+photons = 500
+"""
+
+CAMERA = b"""%YAML:1.0
+---
+image_width: 10
+image_height: 8
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 17.0, 0.0, 3.0, 0.0, 17.0, 2.0, 0.0, 0.0, 1.0 ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -0.01, 0.001, 0.0, 0.0, 0.0 ]
+"""
+
+TRAINING = b"""model = "usdn"
+data = "none"
+seed = 4
+[noise]
+backscatter = [0.0, 0.5]
+photons = [1.0, 300.0]
+[optimiser]
+steps = 6
+batch = 2
+crop = 32
+learning_rate = 1e-3
+report_every = 3
+"""
+
+PHASE = b"# angle, value\nangle_deg,value\n0.1,1000\n1,100\n10,5\n60,0.3\n120,0.1\n180,0.12\n"
+IRF = b"time_ps,value\n-200,0\n-100,1\n0,4\n100,2\n300,0\n"
+COUNTS = np.random.default_rng(1).poisson(1.0, (8, 10, 30)).astype(np.uint16)
+
+
+def make_corpus(folder: Path) -> None:
+    """Writes all files; takes a few seconds."""
+    for name, content in {
+        "scene.toml": SCENE, "calibrated.toml": CALIBRATED, "camera.yaml": CAMERA, "training.toml": TRAINING,
+        "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
+    }.items():  # fmt: skip
+        (folder / name).write_bytes(content)
+    matrix = [[17.0, 0.0, 3.0], [0.0, 17.0, 2.0], [0.0, 0.0, 1.0]]
+    camera = {"image_width": 10, "image_height": 8, "camera_matrix": matrix, "distortion_coefficients": [-0.01] * 5}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    _meshes(folder)
+    _ours(folder)
+    _theirs(folder)
+
+
+def _meshes(folder: Path) -> None:
+    box = trimesh.creation.box((1.0, 1.0, 0.2))
+    box.visual.face_colors = np.arange(48, dtype=np.uint8).reshape(12, 4)
+    for ending in ("stl", "ply", "off", "glb"):
+        box.export(folder / f"box.{ending}")
+    (folder / "box.ascii.stl").write_text(trimesh.exchange.stl.export_stl_ascii(box))
+    (folder / "target.mtl").write_text("newmtl one\nKd 0.5 0.4 0.3\nmap_Kd target.png\n")
+    (folder / "target.obj").write_text(
+        "mtllib target.mtl\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 -1\n"
+        "usemtl one\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
+    )
+    from PIL import Image
+
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "target.png")
+
+
+def _ours(folder: Path) -> None:
+    """HDF5 of every kind, and a dataset."""
+    scene = spadwarp.load_scene(folder / "scene.toml")
+    result = spadwarp.simulate(scene, photons=2000, seed=3, device="cpu", uncertainty=True)
+    result.save(folder / "result.h5")
+    from spadwarp.frames import record_frames
+
+    record_frames(result, folder / "frames.h5", pulses=300, frames=2, seed=1, tags=True, device="cpu")
+    spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu").save(folder / "analytic.h5")
+    save_records(trace(scene, photons=20, device="cpu"), folder / "records.h5", scene=scene)
+    small = recipe(**{"scenes_per_target": 1, "frames.per_scene": 2, "gate.bins": 32})
+    spadwarp.dataset.make_dataset(small, folder / "data", device="cpu")
+
+
+def _theirs(folder: Path) -> None:
+    import ptufile
+    import scipy.io
+    import scipy.sparse
+
+    np.save(folder / "counts.npy", COUNTS)
+    np.save(folder / "beam.npy", np.outer([1.0, 3.0, 2.0], [1.0, 4.0, 5.0, 1.0]))
+    np.save(folder / "response.npy", np.array([1.0, 4.0, 2.0]))
+    np.save(folder / "depth.npy", np.linspace(1.0, 2.0, 192, dtype=np.float32).reshape(12, 16))
+    tags = np.empty((8, 10), object)
+    for index in np.ndindex(tags.shape):
+        tags[index] = np.repeat(np.arange(30), COUNTS[index])[:, None]
+    sparse = scipy.sparse.csc_array(COUNTS.transpose(1, 0, 2).reshape(80, 30).astype(float))
+    scipy.io.savemat(folder / "counts.mat", {"counts": COUNTS.astype(float), "bin_size": 2e-10})
+    scipy.io.savemat(folder / "packed.mat", {"counts": COUNTS}, do_compression=True)
+    scipy.io.savemat(folder / "tags.mat", {"Ts": tags})
+    scipy.io.savemat(folder / "sparse.mat", {"spad": sparse, "depth": np.ones((8, 10))})
+    options = {"global_resolution": 50e-9, "tcspc_resolution": 2e-10}
+    ptufile.imwrite(folder / "counts.ptu", COUNTS, **options)
+    depth = np.full((8, 10), 2.0, np.float32)
+    write_exr(folder / "depth.exr", {"Z": depth, "A": depth, "R": depth}, {"content": "test"})
+    weights = Path(spadwarp.__file__).parent / "denoise" / "weights" / "usdn.safetensors"
+    (folder / "usdn.safetensors").write_bytes(weights.read_bytes())
+
+
+@dataclasses.dataclass(frozen=True)
+class Corpus:
+    """The folder, and its files read as they are asked for."""
+
+    folder: Path
+
+    def __getitem__(self, name: str) -> bytes:
+        return (self.folder / name).read_bytes()

@@ -1,0 +1,131 @@
+"""A case run in a child process: how it ended, what it wrote, and whether something that is not finite got in."""
+
+import contextlib
+import hashlib
+import io
+import math
+import os
+import re
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+from fuzz.cases import Case, write
+from fuzz.isolation import Outcome, run_isolated
+
+BUG = 70  # exit code of a command that met an error nobody thought of
+# Fields in which infinity has a meaning.
+UNBOUNDED = re.compile(
+    r"(transport\.lateral_limit|scan\.distance|camera\.focus_distance|domain\.(lower|upper)|.*\.(lower|upper)|medium\.layers.*|.*max_path)"
+)
+
+
+def run_case(case: Case, corpus: Path) -> tuple[str, str]:
+    """The verdict, "done", "refused" or what went wrong, and a text about it."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
+        folder = Path(name)
+        try:
+            write(case, folder, corpus)
+        except (OSError, ValueError):
+            return "refused", "no such file can be written"
+        before = _digests(folder)
+        outcome = run_isolated(lambda: _child(case, folder))
+        return _judge(case, outcome, before, _digests(folder))
+
+
+def _judge(case: Case, outcome: Outcome, before: dict[str, str], after: dict[str, str]) -> tuple[str, str]:
+    if outcome.kind != "done":
+        return outcome.kind, f"{outcome.value} after {outcome.seconds:.1f} s\n{outcome.text[-1500:]}"
+    code, errors, unbounded = outcome.value
+    changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+    allowed = [one.rstrip("/") for one in case.outputs]
+    anywhere = bool({"", "."} & set(allowed))  # the folder itself
+    strange = [name for name in changed if not any(name == one or name.startswith(f"{one}/") for one in allowed)]
+    strange = [] if anywhere else strange
+    if code == BUG or "Traceback (most recent call last)" in errors:
+        return "traceback", errors[-1500:]
+    if strange:
+        return "output", f"{strange} changed"
+    if unbounded:
+        return "non-finite", f"{unbounded} accepted"
+    return ("done" if code == 0 else "refused"), errors[-300:]
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    found = {}
+    for place in folder.rglob("*"):
+        with contextlib.suppress(OSError):
+            if place.is_file() and not place.is_symlink():
+                found[place.relative_to(folder).as_posix()] = hashlib.md5(place.read_bytes()).hexdigest()
+            else:
+                found[place.relative_to(folder).as_posix()] = "folder"
+    return found
+
+
+def _child(case: Case, folder: Path) -> tuple[int, str, list[str]]:
+    """Exit code, stderr, and fields that are not finite though they should be."""
+    os.chdir(folder)
+    os.environ["HOME"] = str(folder / "out")
+    os.environ["TMPDIR"] = tempfile.tempdir = str(folder.parent)
+    warnings.simplefilter("ignore")
+    sys.stdin = open(os.devnull)  # noqa: SIM115
+    command, *rest = case.arguments
+    if command.startswith("load"):
+        return _load(command, rest[0])
+    from spadwarp.cli import app
+
+    out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO(), errors="replace")
+    code = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            app(list(case.arguments), prog_name="spadwarp")
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        err.flush()
+    text = err.buffer.getvalue().decode(errors="replace")
+    if bug := re.search(r"report it with (\S+)", text):
+        with contextlib.suppress(OSError):
+            text += Path(bug[1].rstrip(",")).read_text()[-1200:]
+            os.unlink(bug[1].rstrip(","))
+    scene = [name for name in case.files if name.endswith("scene.toml") or name == "calibrated.toml"]
+    accepted = code == 0 and case.injected and scene
+    return code, text, _load("load_scene", scene[0])[2] if accepted else []
+
+
+def _load(what: str, path: str) -> tuple[int, str, list[str]]:
+    """A loader called from Python: its errors are those of spadwarp, and what it returns is finite."""
+    import spadwarp
+    from spadwarp.dataset.recipe import load_recipe
+    from spadwarp.denoise.recipe import load_training_recipe
+    from spadwarp.errors import SpadwarpError
+
+    loaders = {
+        "load": spadwarp.load,
+        "load_scene": spadwarp.load_scene,
+        "load_recipe": load_recipe,
+        "load_training": load_training_recipe,
+    }
+    try:
+        found = loaders[what](path)
+    except (SpadwarpError, MemoryError) as error:
+        return 1, str(error), []
+    if what == "load":
+        return 0, "", []
+    return 0, "", [name for name, value in _numbers(found.model_dump(), "") if not _is_fine(name, value)]
+
+
+def _numbers(value: Any, name: str):
+    if isinstance(value, dict):
+        for key, one in value.items():
+            yield from _numbers(one, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _numbers(one, name)
+    elif isinstance(value, float):
+        yield name, value
+
+
+def _is_fine(name: str, value: float) -> bool:
+    return math.isfinite(value) or (math.isinf(value) and UNBOUNDED.fullmatch(name) is not None)

@@ -1,0 +1,102 @@
+# ruff: noqa: E402  (threads are switched off before anything is loaded)
+"""The fuzzing harness by itself: `python tests/fuzz/run.py 20000 --out findings.jsonl`.
+
+Each case runs in a child process of its own, forked from this one in which everything is loaded, with 20 s and 2 GB.
+"""
+
+import argparse
+import collections
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"  # threads do not survive a fork
+sys.path[:0] = [str(Path(__file__).parents[1])]
+
+from fuzz import kernel_calls
+from fuzz.cases import CATEGORIES, Case, draw
+from fuzz.corpus import Corpus, make_corpus
+from fuzz.executed import run_case
+
+FINE = ("done", "refused")
+
+
+def warm_up(corpus: Path) -> None:
+    """Loads what the commands load, and compiles or loads the kernels."""
+    files = ("scene.toml", "calibrated.toml", "result.h5", "frames.h5", "counts.npy", "counts.ptu", "depth.exr")
+    options = ("--bin-width-ps", "200", "--gate-start-ns", "1", "--group-index", "1", "--irf-fwhm-ps", "300")
+    sys.stderr.flush()
+    import contextlib
+    import io
+
+    from typer.testing import CliRunner
+
+    import spadwarp.cli
+
+    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
+        place = dict(zip(files, (str(corpus / name) for name in files), strict=True))
+        for number, arguments in enumerate(
+            (
+                ("simulate", place["calibrated.toml"], "--photons", "50"),
+                ("analytic", place["scene.toml"], "--frames", "1"),
+                ("detect", place["result.h5"], "--pulses", "9"),
+                ("depth", place["counts.npy"], *options, "--method", "likelihood"),
+                ("depth", place["counts.ptu"], *options, "--method", "peak"),
+                ("denoise", str(corpus / "depth.npy"), "--model", "usdn"),
+                ("export", place["frames.h5"], "--format", "mat"),
+                ("video", place["result.h5"], "--pictures", "2"),
+                ("view", place["result.h5"]),
+            )
+        ):
+            where = {"video": f"{out}/v.gif", "view": f"{out}/v.html"}.get(arguments[0], f"{out}/{number}")
+            device = () if arguments[0] in ("video", "export") else ("--device", "cpu")
+            done = CliRunner().invoke(spadwarp.cli.app, [*arguments, "--out", where, *device])
+            assert done.exit_code == 0, (arguments, done.output, done.exception)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", type=int)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--only", default=",".join([*CATEGORIES, "kernels"]), help="categories, separated by commas")
+    parser.add_argument("--out", help="findings as JSON lines")
+    options = parser.parse_args()
+    names = options.only.split(",")
+    counts = {name: collections.Counter() for name in names}
+    findings = []
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="corpus-") as folder:
+        corpus = Corpus(Path(folder))
+        make_corpus(corpus.folder)
+        warm_up(corpus.folder)
+        if "kernels" in names:
+            kernel_calls.warm_up()
+        for number in range(options.first, options.first + options.cases):
+            category = names[number % len(names)]
+            if category == "kernels":
+                about, (verdict, text) = "kernels", kernel_calls.run(number)
+            else:
+                case: Case = draw(number, corpus, category)
+                about, (verdict, text) = " ".join(case.arguments)[:300], run_case(case, corpus.folder)
+            counts[category][verdict] += 1
+            if verdict not in FINE:
+                finding = {"case": number, "category": category, "verdict": verdict, "about": about, "text": text}
+                findings.append(finding)
+                print(f"{category} {number}: {verdict}: {about}\n{text}\n", file=sys.stderr, flush=True)
+                if options.out:
+                    with open(options.out, "a") as file:
+                        file.write(json.dumps(finding) + "\n")
+    verdicts = sorted({verdict for one in counts.values() for verdict in one}, key=lambda one: (one not in FINE, one))
+    print(f"{'':12}" + "".join(f"{verdict:>12}" for verdict in verdicts))
+    for name, one in counts.items():
+        print(f"{name:12}" + "".join(f"{one[verdict]:12}" for verdict in verdicts))
+    print(f"{options.cases} cases, {len(findings)} findings, {time.monotonic() - began:.0f} s")
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
