@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from spadwarp.errors import FileError
 
-__all__ = ["existing_file", "file_problem", "file_within", "is_stream"]
+__all__ = ["check_apart", "existing_file", "file_problem", "file_within", "is_stream"]
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
 
@@ -40,6 +41,16 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
         held = " and ".join(path.name for path in found) if found else f"no {' and no '.join(names)}"
         raise FileError(f"{path}: holds {held}; name the file")
     return found[0]
+
+
+def check_apart(output: str | Path, source: Any) -> None:
+    """Raises `FileError` where a file would be written over the one that it is made from, or over one beside it that
+    holds data, if `source` is their directory; any other `source` than a path passes."""
+    if not isinstance(source, str | os.PathLike) or not (os.path.exists(output) and os.path.exists(source)):
+        return
+    inside = os.path.isdir(source) and Path(output).suffix == ".h5" and os.path.samefile(Path(output).parent, source)
+    if inside or os.path.samefile(output, source):
+        raise FileError(f"{output}: is what the output is made from; it is not replaced")
 
 
 def is_stream(path: str | Path) -> bool:

@@ -17,6 +17,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile
 from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
 from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure
@@ -62,6 +63,7 @@ def video(
         raise ArgumentError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
     pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
     check_choice("scale", scale, ("log", "linear"))
+    check_apart(path, source)
     cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
     cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]

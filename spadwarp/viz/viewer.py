@@ -15,6 +15,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
+from spadwarp.io.paths import check_apart
 from spadwarp.result import Result
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
@@ -95,6 +96,7 @@ def view(
         from plotly.offline import get_plotlyjs
     except ModuleNotFoundError as error:
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
+    check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)
     if isinstance(held, Result):
         page = _of_result(held, method, device)

@@ -229,3 +229,18 @@ def test_commands_write_page_and_video(result, tmp_path):
         outcome = run(command[0], tmp_path, "--out", out, *command[1:])
         assert outcome.stdout.startswith(f"written: {out} (") and out.is_file()
     assert "two numbers" in run("video", tmp_path, "--window", "a", code=2).output
+
+
+def test_a_page_is_never_written_over_its_source(tmp_path):
+    path = make_result(make_scene(width=4, height=4, bins=8)).save(tmp_path / "result.h5")
+    before = path.read_bytes()
+    (tmp_path / "link").symlink_to(path)
+    for source, page in (
+        (path, path),
+        (tmp_path, path),
+        (str(tmp_path / "link"), str(path)),
+        (path, tmp_path / "link"),
+    ):
+        with pytest.raises(spadwarp.FileError, match="is not replaced"):
+            spadwarp.viz.view(source, page)
+    assert path.read_bytes() == before
