@@ -89,7 +89,9 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.wanted = True
         q.x = s.x
         q.u = s.u
-        q.weight = s.flight.lens_weight * wp.where(wp.static(local_albedo), s.weight.value, s.weight.value * s.albedo)
+        # In this order, so that layers of one water have the bits of that water.
+        q.weight = s.flight.lens_weight * s.weight.value
+        q.weight = wp.where(wp.static(local_albedo), q.weight, q.weight * s.albedo)
         q.path = s.path
         q.lens = s.flight.lens
         q.interval = s.flight.interval
