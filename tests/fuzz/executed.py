@@ -42,7 +42,9 @@ def _judge(case: Case, outcome: Outcome, before: dict[str, str], after: dict[str
     changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
     allowed = [one.rstrip("/") for one in case.outputs]
     anywhere = bool({"", "."} & set(allowed))  # the folder itself
-    strange = [name for name in changed if not any(name == one or name.startswith(f"{one}/") for one in allowed)]
+    within = [(f"{name}/", f"{one}/") for name in changed for one in allowed]  # and the folders on the way to an output
+    fine = {name[:-1] for name, one in within if name.startswith(one) or one.startswith(name)}
+    strange = [name for name in changed if name not in fine]
     strange = [] if anywhere else strange
     if code == BUG or "Traceback (most recent call last)" in errors:
         return "traceback", errors[-1500:]

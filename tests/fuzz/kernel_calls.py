@@ -261,6 +261,8 @@ def _array(r, like=None):
 
 
 def _numpy(r, like, *, always=False):
+    if always and not like.size:
+        return np.array(like)
     if not like.size or (not always and r.random() < 0.4):
         return r.choice(
             (np.zeros(0), np.zeros((0, 3)), np.zeros(3), np.zeros((2, 3, 4)), np.array(["a"]), np.full(9, np.nan))
