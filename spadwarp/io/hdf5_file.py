@@ -222,12 +222,12 @@ class Hdf5File:
             value = parse_json(self.text(name))
             return value if isinstance(value, dict) else self.refuse(name, "is not a table")
 
-    def integers(self, name: str) -> dict[str, int]:
-        """A dataset that is the text of a JSON object of integers, of less than 128 bits."""
+    def integers(self, name: str, *, bits: int = 128) -> dict[str, int]:
+        """A dataset that is the text of a JSON object of integers, of less than so many bits."""
         table = self.table(name)
         for entry, value in table.items():
-            if not isinstance(value, int) or isinstance(value, bool) or abs(value) >> 127:
-                self.refuse(f"{name}, {entry}", "is not an integer of less than 128 bits")
+            if not isinstance(value, int) or isinstance(value, bool) or abs(value) >> (bits - 1):
+                self.refuse(f"{name}, {entry}", f"is not an integer of less than {bits} bits")
         return table
 
     def numbers(self, name: str) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """The result of a simulation as plain data, its files, the sum of results, and truth maps from other programs."""
 
+from spadwarp.result.batch_moments import ComponentError, component_errors, dominance_warnings
 from spadwarp.result.file import (
     ResultLike,
     as_result,
@@ -19,6 +20,7 @@ __all__ = [
     "COMPONENTS",
     "EXR_PRESETS",
     "Component",
+    "ComponentError",
     "ExrPreset",
     "Result",
     "ResultLike",
@@ -27,6 +29,8 @@ __all__ = [
     "TorchTruth",
     "Truth",
     "as_result",
+    "component_errors",
+    "dominance_warnings",
     "load_result",
     "load_truth_exr",
     "load_truth_maps",

@@ -17,6 +17,7 @@ from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
+from spadwarp.result.batch_moments import moments_of
 from spadwarp.result.photon_ids import Ranges, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
 from spadwarp.scene import Scene
@@ -42,7 +43,7 @@ FORMAT_VERSION = 1
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _PHOTONS = f"[1, {2**64 - 1}]"
 _UNITS = "[1e-30, 1e30]"  # photons
-_RECORDS = ("ledger", "counters", "timing", "provenance")  # stored as JSON, whose integers have no limit
+_RECORDS = ("ledger", "counters", "batch_moments", "timing", "provenance")  # as JSON: its integers have no limit
 _TRUTH = ("depth", "range", "normal", "reflectance")
 _OLDER_NAMES = {"second_moment": "squares", "importance_sampling_residual": "directed"}  # in files of format version 1
 _READ_ME = (
@@ -122,6 +123,7 @@ def load_result(path: str | Path) -> Result:
             truth=_truth(file, (height, width)),
             ledger=read_ledger(file),
             counters=file.integers("counters"),
+            batch_moments=_batch_moments(file) if moments else {},
             timing=file.numbers("timing"),
             provenance=_provenance(file),
         )
@@ -195,6 +197,16 @@ def _head(file: Hdf5File) -> ResultHead:
         requested=requested,
         focus_distance=_focus_distance(file),
     )
+
+
+def _batch_moments(file: Hdf5File) -> dict[str, int]:
+    """Of the components' totals; files of older versions have none."""
+    if "batch_moments" not in file:
+        return {}
+    found = file.integers("batch_moments", bits=256)
+    if found and found.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
+        file.refuse("batch_moments", "are not those of the components")
+    return found
 
 
 def _truth(file: Hdf5File, shape: tuple[int, int]) -> Truth:

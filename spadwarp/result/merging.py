@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 from spadwarp.limits import shown
+from spadwarp.result.batch_moments import joined_moments
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.photon_ids import Range, joined
 from spadwarp.result.result import Result, Truth, physics_of
@@ -27,12 +28,15 @@ class Tallies:
     ledger: dict[str, int]
     counters: dict[str, int]
     second_moment: NDArray[np.uint64] | None = None
+    batch_moments: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, result: Tallies | Result) -> Tallies:
         """A copy, with arrays of its own."""
         second_moment = None if result.second_moment is None else result.second_moment.copy()
-        return cls(result.tallies.copy(), dict(result.ledger), dict(result.counters), second_moment)
+        return cls(
+            result.tallies.copy(), dict(result.ledger), dict(result.counters), second_moment, result.batch_moments
+        )
 
     def add(self, other: Tallies | Result) -> None:
         """Adds the tallies of other photons; `ConfigError` where they count other things."""
@@ -49,6 +53,9 @@ class Tallies:
             low += other.second_moment[0]
             high += other.second_moment[1]
             high += low < other.second_moment[0]  # the carry
+        # Older results have none, and their sum with others has none.
+        known = self.batch_moments and other.batch_moments
+        self.batch_moments = joined_moments(self.batch_moments, other.batch_moments) if known else {}
 
 
 def merge(results: Iterable[ResultLike]) -> Result:

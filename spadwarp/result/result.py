@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.result.batch_moments import dominance_warnings
 from spadwarp.scene.geometry import path_from_range, pixel_directions
 
 if TYPE_CHECKING:
@@ -81,6 +82,8 @@ class Result:
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
         second_moment: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of
             all components; None without batches.
+        batch_moments: By component, over batches of its tally summed over voxels: `…_squares` (their sum),
+            `…_smallest` and `…_largest`; empty without batches, and in results of older versions.
     """
 
     scene: Scene
@@ -98,6 +101,7 @@ class Result:
     photon_ranges: Sequence[tuple[int, int]] = ()
     batch_size: int = 0
     second_moment: NDArray[np.uint64] | None = None
+    batch_moments: Mapping[str, int] = field(default_factory=dict)
     requested: tuple[int, int] = (0, 0)
     focus_distance: float | None = None
 
@@ -200,6 +204,14 @@ class Result:
         error = np.take_along_axis(self.standard_error, peak, axis=2)[..., 0]
         returned = value > 0
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What may mislead in the errors: components whose standard error rests on few heavy photons.
+
+        They show in results with batches (`uncertainty=True`, or `relative_error`).
+        """
+        return tuple(dominance_warnings(self))
 
     @property
     def rounding_error(self) -> dict[str, float]:
@@ -308,6 +320,7 @@ class Result:
             "ledger": self.ledger_report(),
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
+            "warnings": list(self.warnings),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }

@@ -14,6 +14,7 @@ import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.errors import DeviceError, SpadwarpError, kernel_errors
 from spadwarp.result import COMPONENTS, Tallies
+from spadwarp.result.batch_moments import joined_moments, moments_of
 from spadwarp.result.merging import OVERFLOW
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
 
@@ -57,6 +58,7 @@ class DeviceWorker:
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)
         self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
+        self._moments: dict[str, int] = {}
 
     def launch(self, first: int, stop: int) -> None:
         """Traces the photons of one launch to their end."""
@@ -137,9 +139,11 @@ class DeviceWorker:
         assert self._batches is not None
         with device_errors(self.model.device):
             self._batches.close(self.data.tally)
+            moments = moments_of(COMPONENTS, self._batches.take_sums())
             batch = sk.read_ledger(self.data)
             self.data.ledger.zero_()
         self._closed = batch if self._closed is None else tuple(map(_added, self._closed, batch))
+        self._moments = joined_moments(self._moments, moments) if self._moments else moments
 
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
@@ -151,11 +155,11 @@ class DeviceWorker:
                 halves = self._batches.second_moment
                 second_moment = np.stack([half.numpy().reshape(self._shape[1:]) for half in halves])
             ledger, counters = self._closed or sk.read_ledger(self.data)
-            return Tallies(total.numpy().reshape(self._shape), ledger, counters, second_moment)
+            return Tallies(total.numpy().reshape(self._shape), ledger, counters, second_moment, dict(self._moments))
 
     def clear(self) -> None:
         """Empties the tallies."""
-        self._closed = None
+        self._closed, self._moments = None, {}
         arrays = [self.data.tally, self.data.ledger]
         if self._batches is not None:
             arrays += [self._batches.total, *self._batches.second_moment]

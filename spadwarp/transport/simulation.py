@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from spadwarp.device import pick_devices, processor_name
-from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.errors import ConfigError, DeviceError, SpadwarpWarning
 from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, Tallies
@@ -136,6 +136,8 @@ def simulate(
                 raise DeviceError(f"{error}\n{kept}") from error
             raise
     _warn_of_rounding(result)
+    for text in result.warnings:
+        warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return result
 
 

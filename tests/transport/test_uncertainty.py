@@ -1,6 +1,8 @@
 """Errors of every bin, the stopping rule, resuming and merging."""
 
+import dataclasses
 import signal
+import warnings
 
 import numpy as np
 import pytest
@@ -127,3 +129,66 @@ def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     assert batches >= 8 and batches & (batches - 1) == 0
     never = spadwarp.simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)
     assert never.photons == 2**14 and not never.partial and never.relative_error > 1e-6
+
+
+def test_moments_of_the_components_are_those_of_the_batches(device):
+    """A run of 32 batches against a run of each; merged and resumed runs have the same."""
+    one, size = scene(), 1024
+    whole = spadwarp.simulate(one, photons=32 * size, seed=5, device=device, uncertainty=True)
+    assert whole.batch_size == size
+    each = [spadwarp.simulate(one, photons=size, seed=5, device=device, first_photon=k * size) for k in range(32)]
+    totals = np.array([run.tallies.sum(axis=(1, 2, 3)) for run in each])
+    for name, total in zip(("ballistic", "forward_scattered", "backscatter"), totals.T.tolist(), strict=True):
+        assert whole.batch_moments[f"{name}_squares"] == sum(x * x for x in total)
+        assert whole.batch_moments[f"{name}_smallest"] == min(total)
+        assert whole.batch_moments[f"{name}_largest"] == max(total)
+        error = spadwarp.result.component_errors(whole)[name]
+        assert error.relative_error == pytest.approx(np.std(total, ddof=1) / np.mean(total) / np.sqrt(32))
+        squares = (np.array(total, float) - np.mean(total)) ** 2
+        assert error.largest_share == pytest.approx(32 / 31 * squares.max() / squares.sum())
+    parts = [
+        spadwarp.simulate(one, photons=32 * size, seed=5, device=device, uncertainty=True, shard=(k, 2)) for k in (1, 2)
+    ]
+    assert spadwarp.merge(parts).batch_moments == whole.batch_moments
+
+
+def test_a_heavy_batch_is_named(tmp_path):
+    """Nothing is said of many equal photons; a batch with thirty times the light is, and files keep it."""
+    run = spadwarp.simulate(scene(), photons=2**15, seed=5, device="cpu", uncertainty=True)
+    assert run.warnings == () and run.summary()["warnings"] == []
+    heavy = dict(run.batch_moments)
+    spike = 30 * int(run.tallies[2].sum()) // 32
+    largest = heavy["backscatter_largest"]
+    heavy["backscatter_largest"] = largest + spike
+    heavy["backscatter_squares"] += (largest + spike) ** 2 - largest**2
+    tallies = run.tallies.copy()
+    tallies[2, 0, 0, 0] += spike
+    run = dataclasses.replace(run, tallies=tallies, batch_moments=heavy)
+    for one in (run, spadwarp.load_result(run.save(tmp_path / "heavy.h5"))):
+        (text,) = one.warnings
+        assert text.startswith("backscatter: one of 32 batches has 9") and "more photons" in text
+        assert one.summary()["warnings"] == [text]
+    # Results of older versions have no moments, and warn of nothing.
+    older = dataclasses.replace(run, batch_moments={})
+    assert older.warnings == ()
+
+
+@pytest.mark.slow
+def test_guided_warns_of_no_heavy_photons_where_next_event_does():
+    """Narrow lens, forward-peaked water: next events close to the lens are rare and large."""
+    one = spadwarp.load_scene("plane_5m")
+    warned = {
+        estimator: sum(
+            bool(_warnings(one.with_overrides({"transport.estimator": estimator}), seed)) for seed in range(12)
+        )
+        for estimator in ("guided", "next_event")
+    }
+    assert warned["guided"] == 0 and warned["next_event"] >= 2
+
+
+def _warnings(one, seed):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = spadwarp.simulate(one, photons=100_000, seed=seed, device="cpu", uncertainty=True)
+    assert [str(one.message) for one in caught if "of the variance" in str(one.message)] == list(result.warnings)
+    return result.warnings

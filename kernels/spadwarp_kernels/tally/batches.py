@@ -4,6 +4,11 @@ import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
 
+from .ledger import atomic_add_int64
+
+# Copies of a component's sum, so that threads seldom add to one address at the same time.
+_SLOTS = wp.constant(4096)
+
 _LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
 
 
@@ -15,8 +20,11 @@ def close_batch_kernel(
     total: wp.array(dtype=wp.int64),
     squares_low: wp.array(dtype=wp.uint64),
     squares_high: wp.array(dtype=wp.uint64),
+    sums: wp.array(dtype=wp.int64),
 ):
     """Adds a batch to the total and the square of its sum over components to a 128-bit sum, and empties it.
+
+    `sums` takes its components, over voxels.
 
     Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
     Launch: voxels of one component.
@@ -27,6 +35,8 @@ def close_batch_kernel(
     for component in range(component_count):
         index = component * voxels + voxel
         t += batch[index]
+        if batch[index] != wp.int64(0):
+            atomic_add_int64(sums, component * _SLOTS + voxel % _SLOTS, batch[index])
         total[index] = total[index] + batch[index]
         batch[index] = wp.int64(0)
     # t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with t < 2^63.
@@ -65,6 +75,7 @@ class Batches:
         if total is not None:
             check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
         voxels = tally.size // component_count
+        self._sums = wp.zeros(component_count * _SLOTS, dtype=wp.int64, device=tally.device)
         self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device) if total is None else total
         self.second_moment = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
         self.count = 0
@@ -76,7 +87,16 @@ class Batches:
             close_batch_kernel,
             dim=self.second_moment[0].size,
             inputs=[self._component_count, tally],
-            outputs=[self.total, *self.second_moment],
+            outputs=[self.total, *self.second_moment, self._sums],
             device=tally.device,
         )
         self.count += 1
+
+    def take_sums(self) -> list[int]:
+        """Each component of the batches closed since the last call, summed over voxels; waits for the device."""
+        sums = self._sums.numpy().reshape(self._component_count, _SLOTS)
+        # In halves, since a sum over all voxels may exceed 64 bits.
+        halves = zip((sums >> 32).sum(axis=1), (sums & 0xFFFFFFFF).sum(axis=1), strict=True)
+        found = [(int(high) << 32) + int(low) for high, low in halves]
+        self._sums.zero_()
+        return found
