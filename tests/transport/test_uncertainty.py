@@ -166,7 +166,7 @@ def test_a_heavy_batch_is_named(tmp_path):
     run = dataclasses.replace(run, tallies=tallies, batch_moments=heavy)
     for one in (run, spadwarp.load_result(run.save(tmp_path / "heavy.h5"))):
         (text,) = one.warnings
-        assert text.startswith("backscatter: one of 32 batches has 9") and "more photons" in text
+        assert text.startswith("backscatter: one of 32 batches has 100 %") and "more photons" in text
         assert one.summary()["warnings"] == [text]
     # Results of older versions have no moments, and warn of nothing.
     older = dataclasses.replace(run, batch_moments={})
