@@ -28,7 +28,7 @@ class ComponentError:
     Attributes:
         relative_error: Relative standard error of the component's light, all pixels and bins together.
         largest_share: Squared deviation of the batch furthest from the mean, over the largest that it could have at the
-            same variance, in [0, 1]: about 5/batches where many photons matter equally, near 1 where a heavy one decides.
+            same variance, in [0, 1]: about 5/batches where many photons matter equally, near 1 where one decides.
         batches: Number of batches.
     """
 
