@@ -155,8 +155,13 @@ def write_mat(frames: FrameSequence, path: Path, number: int) -> Path:
 
 
 def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
-    """Counts as a T3 image of PicoQuant, one record a detection, the frames one after the other."""
+    """Counts as a T3 image of PicoQuant, one record a detection, the frames one after the other.
+
+    With the tags that `phconvert` asks for, and the records of a MultiHarp, whose markers `tttrlib` knows, too.
+    """
     import ptufile
+
+    from spadwarp import __version__
 
     first, counts = frames.with_counts(chosen[0], ".ptu")
     height, width, bins = counts.shape
@@ -166,6 +171,8 @@ def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     if most is None:
         most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
     sync = max(first.period or 0.0, bins * first.bin_width)
+    # A pixel lasts long enough for its detections, one a sync.
+    pixel_time = sync * max(most, 1)
     comment = (
         f"Counts of a simulated SPAD array, {first.pulses} pulses a frame. "
         f"Bin 0 begins at {first.gate_start * 1e9:.6f} ns of flight."
@@ -177,10 +184,17 @@ def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
             (1, height, width, 1, bins),
             global_resolution=sync,
             tcspc_resolution=first.bin_width,
-            # A pixel lasts long enough for its detections, one a sync.
-            pixel_time=sync * max(most, 1),
+            pixel_time=pixel_time,
+            record_type=ptufile.PtuRecordType.GenericT3,
             comment=comment,
-            tags={"CreatorSW_Name": "spadwarp"},
+            tags={
+                "CreatorSW_Name": "spadwarp",
+                "CreatorSW_Version": __version__,
+                "HW_Type": "simulated SPAD array",
+                "HW_Version": "1",
+                "HW_SerialNo": "0",
+                "MeasDesc_AcquisitionTime": max(1, round(1e3 * pixel_time * width * height * len(chosen))),  # [ms]
+            },
         ) as file,
     ):
         for number in chosen:

@@ -118,6 +118,32 @@ def test_ptu_is_read_back_by_ptufile(frames, detection, tmp_path):
     assert again.values.sum() == detection.counts[0].sum()
 
 
+def test_ptu_is_read_by_phconvert(frames, detection, tmp_path):
+    reader = pytest.importorskip("phconvert.pqreader")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    stamps, detectors, dtime, facts, markers = reader.load_ptu(str(path))
+    photon = ~np.isin(detectors, markers)
+    assert np.array_equal(np.bincount(dtime[photon], minlength=BINS), detection.counts.sum(axis=(0, 1, 2)))
+    assert facts["nanotimes_unit"] == pytest.approx(detection.bin_width)
+    assert facts["timestamps_unit"] == pytest.approx(1 / LASER["repetition_rate"])
+    assert facts["hardware_name"] == "simulated SPAD array" and facts["software"] == "spadwarp"
+    # The scan takes as long as its last record says, to a pixel and to a millisecond.
+    pixel = facts["tags"]["ImgHdr_TimePerPixel"]["value"] * 1e-3
+    assert abs(facts["acquisition_duration"] - stamps[-1] * facts["timestamps_unit"]) < pixel + 1e-3
+
+
+def test_ptu_is_read_by_tttrlib(frames, detection, tmp_path):
+    tttrlib = pytest.importorskip("tttrlib")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    events = tttrlib.TTTR(str(path), "PTU")
+    photon = np.asarray(events.event_types) == 0
+    found = np.bincount(np.asarray(events.micro_times)[photon], minlength=BINS)
+    assert np.array_equal(found, detection.counts.sum(axis=(0, 1, 2)))
+    assert events.header.micro_time_resolution == pytest.approx(detection.bin_width)
+    image = tttrlib.CLSMImage(tttr_data=events, channels=[0], fill=True)
+    assert np.array_equal(image.intensity, detection.counts.sum(axis=-1))
+
+
 def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
     ptufile = pytest.importorskip("ptufile")
     [path] = spadwarp.export(frames, tmp_path / "a.ptu", frames=0)
