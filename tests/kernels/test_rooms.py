@@ -18,6 +18,7 @@ ROOMS = (
     "medium",
     "phase",
     "intersect",
+    "port",
     "sensor",
     "surface",
     "source",
