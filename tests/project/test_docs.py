@@ -30,9 +30,10 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def anchors(text):
-    """Anchors that the headings of a Markdown page get, code blocks left out."""
+    """Anchors that the headings of a Markdown page get, code blocks left out, and those of its equations."""
     headings = re.findall(r"^#+ (.*)$", _FENCE.sub("", text), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    named = re.findall(r'<a id="([\w-]+)"></a>', text)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}.union(named)
 
 
 def load(path):
@@ -67,6 +68,30 @@ def test_relative_links_and_images_exist(page):
         assert target.exists(), f"{page.name}: {link}"
         if anchor:
             assert anchor in anchors(target.read_text(encoding="utf-8")), f"{page.name}: {link}"
+
+
+def test_equations_have_one_number_and_an_anchor_each():
+    """(P3) is the third equation of its page, and `physics.md#eq-p3` leads to it."""
+    letters = {}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        numbers = re.findall(r"\\tag\{([A-Z])(\d+)\}", text)
+        assert text.count("```math") == len(numbers), page.name
+        for place, (letter, number) in enumerate(numbers, 1):
+            assert letters.setdefault(letter, page) == page and int(number) == place, f"{page.name}: ({letter}{number})"
+        anchored = re.findall(r'^ *<a id="eq-(\w+)"></a>\n\n *```math\n(?:.*\n)*?.*\\tag\{(\w+)\}', text, re.MULTILINE)
+        assert [(first.upper(), second) for first, second in anchored] == [
+            (letter + number,) * 2 for letter, number in numbers
+        ]
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=by_name)
+def test_links_have_titles_and_commands_fit_the_page(page):
+    """A link shows a title, not a file of the documentation; a command of a page is read without scrolling."""
+    text = page.read_text(encoding="utf-8")
+    assert not re.findall(r"\[`?[\w/]+\.md`?\]\(", text)
+    shell = "".join(code for language, code in _FENCE.findall(text) if language in ("sh", "bash"))
+    assert not [line for line in shell.splitlines() if len(line) > 88]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
