@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.scene import phase_function
+from spadwarp.scene import WaterLine, phase_function, water_lines
 from spadwarp.scene.geometry import depth_per_time
 
 if TYPE_CHECKING:
@@ -86,12 +86,14 @@ def pixel_maps(
         return wp.array(np.nan_to_num(np.ascontiguousarray(values, kind)), dtype=dtype, device=device)
 
     view_d, distance_d, phase_d = on_device(views, wp.vec3d), on_device(distances), on_device(_phase_table(scene))
-    signal_d, arrival_d = kernels.signal_map(
-        lidar, view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)
-    )
+    lines = water_lines(scene)
+    signal, arrival = _signal(lidar, lines, [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)])
+    signal_d: Any = on_device(signal)
+    arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
+    lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
     profile = np.zeros((1, 1), np.float32)
     if chosen.backscatter == "single_scatter":
-        paths_d, cumulative_d, total_d = kernels.single_scatter_table(lidar, phase_d, view_d, distance_d)
+        paths_d, cumulative_d, total_d = kernels.single_scatter_table(lidar, phase_d, view_d, distance_d, lines=lines_d)
         table = BackscatterTable(paths_d.numpy(), cumulative_d.numpy())
     elif chosen.backscatter == "monte_carlo":
         if backscatter_profile is None:
@@ -115,9 +117,10 @@ def pixel_maps(
         acquisitions=scene.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
         outliers=outliers,
+        lines=lines_d,
     )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
-    maps = {"signal": signal_d.numpy(), "arrival": arrival_d.numpy(), "backscatter": total_d.numpy()}
+    maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy()}
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}
     _check_alpha(scene, maps["alpha"])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,6 +151,25 @@ def source_name(scene: Scene) -> str | None:
 
 
 # Parts
+
+
+def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any]) -> tuple[Map, Map]:
+    """S, summed over the lines, and the mean arrival time of their photons, `[P]`; `lidar` is as it was afterwards."""
+    from spadwarp_kernels import analytic as kernels
+
+    own = (lidar.photons, lidar.extinction, lidar.speed)
+    parts: list[tuple[Map, Map]] = []
+    for line in lines:
+        lidar.photons, lidar.extinction, lidar.speed = own[0] * line.share, line.extinction, line.speed
+        signal, arrival = kernels.signal_map(lidar, *arrays)
+        parts.append((signal.numpy(), arrival.numpy()))
+    lidar.photons, lidar.extinction, lidar.speed = own
+    if len(parts) == 1:
+        return parts[0]
+    total = np.sum([signal for signal, _ in parts], axis=0)
+    even = np.full_like(total, 1.0 / len(parts))
+    shares = [np.divide(signal, total, out=even.copy(), where=total > 0) for signal, _ in parts]
+    return total, np.sum([share * time for share, (_, time) in zip(shares, parts, strict=True)], axis=0)
 
 
 def _check_alpha(scene: Scene, alpha: Map) -> None:

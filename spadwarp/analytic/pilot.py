@@ -163,7 +163,7 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
             method: _finite_median((_depth_error(both, frames, recorded, method, device) - errors[method])[seen])
             for method in METHODS
         }
-    signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detector.pde
+    signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
     bound, shot = _bounds(both, device)
     noise = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
@@ -232,7 +232,7 @@ def _return(signal: Floats, background: Floats, result: Result) -> tuple[Floats,
 def _bounds(result: Result, device: str | None) -> tuple[Floats, Floats]:
     """Bounds of depth for one pulse [m], `[H, W]`: as the detector records it, and without background and pile-up."""
     scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detector.pde
+    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
     background = result.component("backscatter") * scale + scene.detector.noise_rate * scene.gate.bin_width
     options: dict[str, Any] = {

@@ -100,7 +100,7 @@ def _profile(scene: Scene, given: Any) -> NDArray[np.float32] | None:
     camera, bins = scene.camera, scene.gate.bins
     if isinstance(given, str | os.PathLike | Result):
         given = as_result(given, "backscatter_profile")
-        values = given.component("backscatter") * (scene.laser.photons_per_pulse * scene.detector.pde)
+        values = given.component("backscatter") * (scene.laser.photons_per_pulse * scene.detections_per_photon)
     else:
         values = np.asarray(given, np.float64)
     shape = (camera.height, camera.width, bins)

@@ -9,6 +9,7 @@ from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
 from spadwarp.checks.optics import check_focus, check_scan
 from spadwarp.checks.plausible import check_plausible
+from spadwarp.checks.spectrum import check_spectrum
 from spadwarp.checks.statistics import check_statistics
 from spadwarp.checks.survey import Survey
 from spadwarp.checks.targets import check_targets
@@ -20,7 +21,16 @@ from spadwarp.scene import Scene, SceneLike, as_scene
 
 __all__ = ["check", "summary"]
 
-_CHECKS = (check_plausible, check_targets, check_focus, check_scan, check_timing, check_medium, check_statistics)
+_CHECKS = (
+    check_plausible,
+    check_targets,
+    check_focus,
+    check_scan,
+    check_timing,
+    check_spectrum,
+    check_medium,
+    check_statistics,
+)
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
@@ -83,7 +93,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "average_power": laser.average_power,
         "peak_power": laser.peak_power,
         "irradiance": survey.irradiance,
-        "pde": scene.detector.pde,
+        "pde": scene.detections_per_photon,
         "photons_per_pixel": survey.photons_per_pixel,
         "signal_per_pulse": survey.signal_per_pulse,
         "samples_per_pixel": survey.samples_per_pixel,

@@ -30,9 +30,8 @@ def check_statistics(survey: Survey) -> Iterator[CheckMessage]:
         yield note("laser.pulse_energy", text, signal_per_pulse=signal)
     traced = scene.transport.photons
     if scene.transport.estimator == "analog":
-        photons = (
-            signal * traced / scene.scan_positions / (scene.laser.photons_per_pulse * scene.detector.pde or math.inf)
-        )
+        emitted = scene.laser.photons_per_pulse * scene.detections_per_photon or math.inf
+        photons = signal * traced / scene.scan_positions / emitted
         if photons < 10.0:
             text = f"analog: only about {photons:.2g} of {traced:.3g} photons reach a pixel unscattered"
             yield warning("transport.estimator", text, photons_per_pixel=photons)

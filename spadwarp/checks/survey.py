@@ -145,4 +145,4 @@ class Survey:
     @property
     def signal_per_pulse(self) -> float | None:
         """Unscattered photons from the target that a pixel on the beam's axis detects from a pulse."""
-        return None if self.photons_per_pixel is None else self.photons_per_pixel * self.scene.detector.pde
+        return None if self.photons_per_pixel is None else self.photons_per_pixel * self.scene.detections_per_photon

@@ -31,7 +31,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
     if result.partial:
         raise KeyboardInterrupt
-    scale = scene.laser.photons_per_pulse * scene.detector.pde
+    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.component("backscatter")
     returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
     seen = (returned > 0) & np.isfinite(result.truth.depth)

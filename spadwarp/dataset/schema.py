@@ -137,7 +137,7 @@ def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
         "pulse_energy": scene.laser.pulse_energy,
         "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
         "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
-        "pde": scene.detector.pde,
+        "pde": scene.detections_per_photon,
         "dark_count_rate": scene.detector.dark_count_rate,
         "config": config.encode(),
     }

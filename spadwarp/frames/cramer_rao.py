@@ -99,7 +99,7 @@ def crlb(
     """
     result = as_result(result)
     scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detector.pde
+    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
     background = result.component("backscatter") * scale + scene.detector.noise_rate * scene.gate.bin_width
     return crlb_from_histogram(

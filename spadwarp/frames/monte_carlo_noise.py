@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spadwarp.result.result import Result
+from spadwarp.scene import detection_efficiency
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -72,7 +73,7 @@ def monte_carlo_noise(
         return None
     scene = result.scene
     detector, laser = detector or scene.detector, laser or scene.laser
-    scale = laser.photons_per_pulse * detector.pde
+    scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
     # Bins are nearly independent: a history adds to few of those of one pixel.
     error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
     expected = result.intensity * scale + detector.noise_rate * (scene.gate.stop - scene.gate.start)

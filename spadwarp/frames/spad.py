@@ -22,7 +22,7 @@ from spadwarp.frames.response import InstrumentResponse, detector_response, resp
 from spadwarp.frames.window import Window, detector_window, missing_light
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
 from spadwarp.result.file import as_result
-from spadwarp.scene import Detector, Laser
+from spadwarp.scene import Detector, Laser, detection_efficiency
 
 __all__ = ["detect"]
 
@@ -91,7 +91,7 @@ def detect(
     if scene is not None:
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
-        detections_per_photon = laser.photons_per_pulse * detector.pde
+        detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
         if background is None:
             background = source.component("backscatter") * detections_per_photon
         source = source.histogram * detections_per_photon

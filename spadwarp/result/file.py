@@ -48,7 +48,7 @@ _TRUTH = ("depth", "range", "normal", "reflectance")
 _OLDER_NAMES = {"second_moment": "squares", "importance_sampling_residual": "directed"}  # in files of format version 1
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
-    "times laser_photons_per_pulse * detector_pde it is the expected detections per pulse. "
+    "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
     "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
@@ -273,7 +273,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         **camera_attributes(camera, result.focus_distance),
         "scan": scene.scan.mode,
         "camera_aperture_area": camera.aperture_area,
-        "detector_pde": detector.pde,
+        "detector_pde": scene.detections_per_photon,
         "detector_jitter_fwhm": detector.jitter_fwhm_ps * 1e-12,
         "detector_irf": detector.irf,
     }

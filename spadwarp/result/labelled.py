@@ -31,7 +31,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     truth = result.truth
     variables: dict[str, Variable] = {
         "histogram": (cube, values, "1", "expected fraction of the emitted photons per pixel and bin"),
-        "detections_per_photon": ((), result.scene.detector.pde, "1", "photon detection efficiency"),
+        "detections_per_photon": ((), result.scene.detections_per_photon, "1", "detection efficiency with the filter"),
         "depth": (image, truth.depth, "m", "true planar depth"),
         "range": (image, truth.range, "m", "true distance along the line of sight"),
         "normal": ((*image, "axis"), truth.normal, "1", "unit normals towards the camera"),

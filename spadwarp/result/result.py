@@ -160,7 +160,7 @@ class Result:
     @property
     def detections(self) -> NDArray[np.float64]:
         """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
-        return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detector.pde)
+        return self.histogram * np.float64(self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
 
     @cached_property
     def tally_value(self) -> NDArray[np.float64]:
@@ -311,7 +311,9 @@ class Result:
                 **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
             },
             "collected_fraction": dict(zip(COMPONENTS, map(float, fractions), strict=True)),
-            "detections_per_pulse": float(fractions.sum() * scene.laser.photons_per_pulse * scene.detector.pde),
+            "detections_per_pulse": float(
+                fractions.sum() * scene.laser.photons_per_pulse * scene.detections_per_photon
+            ),
             "pixels_with_return": int(np.count_nonzero(self.tallies.any(axis=(0, 3)))),
             "truth": {
                 "pixels": int(seen.sum()),

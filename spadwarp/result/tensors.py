@@ -61,7 +61,7 @@ class TorchResult:
     @property
     def detections(self) -> torch.Tensor:
         """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
-        return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detector.pde)
+        return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
 
     @property
     def intensity(self) -> torch.Tensor:

@@ -19,6 +19,14 @@ from spadwarp.scene.pose import look_at, opencv_pose
 from spadwarp.scene.preset import Preset, presets
 from spadwarp.scene.scan import Scan
 from spadwarp.scene.scene import Scene, SceneLike, as_scene, load_scene, template
+from spadwarp.scene.spectrum import (
+    SpectralLine,
+    WaterLine,
+    detection_efficiency,
+    filter_transmission,
+    spectral_lines,
+    water_lines,
+)
 from spadwarp.scene.targets import Target
 from spadwarp.scene.transport import Transport
 
@@ -37,14 +45,20 @@ __all__ = [
     "Scan",
     "Scene",
     "SceneLike",
+    "SpectralLine",
     "Target",
     "Transport",
+    "WaterLine",
     "as_scene",
+    "detection_efficiency",
+    "filter_transmission",
     "load_scene",
     "look_at",
     "opencv_pose",
     "parse_override",
     "phase_function",
     "presets",
+    "spectral_lines",
     "template",
+    "water_lines",
 ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from spadwarp.scene.sections import Section, Whole
 
@@ -35,6 +35,14 @@ class Detector(Section):
     """dark count rate of a hot pixel [1/s]"""
     ambient_rate: float = Field(0.0, ge=0, le=1e15)
     """detected background counts per second and pixel [1/s]"""
+    filter_centre_nm: float | None = Field(None, ge=1e-9, le=1e6)
+    """wavelength of largest transmission of the filter before the detector [nm]; default: the laser's"""
+    filter_fwhm_nm: float | None = Field(None, ge=1e-6, le=1e6)
+    """full width at half maximum of its Gaussian transmission [nm]; without it there is no filter"""
+    filter_peak: float = Field(1.0, gt=0, le=1)
+    """its largest transmission"""
+    filter_table: str | None = None
+    """a measured filter in place of these: .csv file of wavelength [nm] and transmission"""
     mode: Literal["first_photon", "free_running"] = "first_photon"
     """one count a pulse, or as many as come"""
     dead_time_ns: float = Field(0.0, ge=0, le=1e12)
@@ -61,9 +69,32 @@ class Detector(Section):
             raise ValueError("choice", names, "the path of a .csv file")
         return value
 
+    @field_validator("filter_table")
+    @classmethod
+    def _table_of_a_filter(cls, value: str | None) -> str | None:
+        if value is not None and not value.lower().endswith(".csv"):
+            raise ValueError("is not the path of a .csv file")
+        return value
+
+    @model_validator(mode="after")
+    def _one_filter(self) -> Self:
+        others = {"filter_centre_nm": self.filter_centre_nm, "filter_fwhm_nm": self.filter_fwhm_nm}
+        others |= {"filter_peak": None if self.filter_peak == 1.0 else self.filter_peak}
+        given = [f"{name} = {value}" for name, value in others.items() if value is not None]
+        if self.filter_table is not None and given:
+            raise ValueError(f"{given[0]} goes without filter_table")
+        if self.filter_table is None and self.filter_fwhm_nm is None and given:
+            raise ValueError(f"{given[0]} needs filter_fwhm_nm")
+        return self
+
+    @property
+    def has_filter(self) -> bool:
+        """Whether there is a filter before the detector."""
+        return self.filter_fwhm_nm is not None or self.filter_table is not None
+
     @property
     def pde(self) -> float:
-        """Photon detection efficiency: PDP × fill factor."""
+        """Photon detection efficiency: PDP × fill factor; the filter's transmission is left out."""
         return self.pdp * self.fill_factor
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from spadwarp.scene.load import ENERGIES
 from spadwarp.scene.sections import Section, Vector
@@ -35,7 +35,11 @@ class Laser(Section):
     beam_radius: float = Field(0.0, ge=0, le=1e6)
     """radius of the collimated beam [m]; 0 is a pencil beam"""
     wavelength_nm: float = Field(532.0, ge=1e-9, le=1e6)
-    """vacuum wavelength [nm]"""
+    """vacuum wavelength [nm]; with a spectrum that at which photons and water are counted"""
+    linewidth_nm: float = Field(0.0, ge=0, le=1e5)
+    """full width at half maximum of a Gaussian spectrum about wavelength_nm [nm]; 0: one line"""
+    spectrum: str | None = None
+    """a measured spectrum in place of linewidth_nm: .csv file of wavelength [nm] and power per nm of any scale"""
     pulse_energy: float = Field(37.5e-9, ge=1e-30, le=1e6)
     """energy of one pulse [J]"""
     average_power: float = Field(0.0, ge=1e-30, le=1e15)
@@ -57,6 +61,13 @@ class Laser(Section):
             )
         if (self.profile == "measured") != (self.profile_image is not None):
             raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
+        if self.linewidth_nm > 0.2 * self.wavelength_nm:
+            raise ValueError(
+                f"linewidth_nm = {self.linewidth_nm} is outside [0, {0.2 * self.wavelength_nm:g}], a fifth of "
+                "wavelength_nm; a broader source needs spectrum"
+            )
+        if self.spectrum is not None and self.linewidth_nm > 0.0:
+            raise ValueError(f"linewidth_nm = {self.linewidth_nm} goes without spectrum")
         return self
 
     @model_validator(mode="after")
@@ -90,6 +101,13 @@ class Laser(Section):
         """The fields that make an equal section again: of energy and powers the given one."""
         hidden = set(ENERGIES) - set(self.given or ("pulse_energy",))
         return {name: value for name, value in super().to_dict().items() if name not in hidden}
+
+    @field_validator("spectrum")
+    @classmethod
+    def _table_of_a_spectrum(cls, value: str | None) -> str | None:
+        if value is not None and not value.lower().endswith(".csv"):
+            raise ValueError("is not the path of a .csv file")
+        return value
 
     @property
     def half_angle(self) -> float:

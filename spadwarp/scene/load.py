@@ -46,7 +46,15 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     },
-    "laser": {name: tuple(other for other in ENERGIES if other != name) for name in ENERGIES},
+    "laser": {
+        **{name: tuple(other for other in ENERGIES if other != name) for name in ENERGIES},
+        "linewidth_nm": ("spectrum",),
+        "spectrum": ("linewidth_nm",),
+    },
+    "detector": {
+        "filter_fwhm_nm": ("filter_table",),
+        "filter_table": ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"),
+    },
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
 }
 

@@ -28,6 +28,7 @@ from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
 from spadwarp.scene.quantities import with_units
 from spadwarp.scene.scan import Scan
 from spadwarp.scene.sections import listed
+from spadwarp.scene.spectrum import detection_efficiency
 from spadwarp.scene.targets import Target
 from spadwarp.scene.transport import Transport
 from spadwarp.units import path_from_time
@@ -110,6 +111,14 @@ class Scene(BaseModel):
         position, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
         moved = {"position": tuple(map(float, position)), "direction": tuple(map(float, axis)), "frame": "camera"}
         return laser.model_copy(update=moved)
+
+    @property
+    def detections_per_photon(self) -> float:
+        """Detections for each photon of a pulse that reaches a pixel: PDE, times what the filter passes.
+
+        Raises `FileError` or `ConfigError` if the table of a spectrum or a filter cannot be read.
+        """
+        return detection_efficiency(self.laser, self.detector)
 
     @property
     def pulses_per_depth_frame(self) -> int:
@@ -258,6 +267,8 @@ _FILE_FIELDS = (
     ("detector", "irf", ".csv"),
     ("camera", "calibration", ""),
     ("laser", "profile_image", ""),
+    ("laser", "spectrum", ".csv"),
+    ("detector", "filter_table", ".csv"),
 )
 
 
@@ -277,6 +288,6 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     elif isinstance(targets, (list, tuple)):
         changed["targets"] = [absolute(target, "mesh") for target in targets]
     for section, name, ending in _FILE_FIELDS:
-        if section in tables:
-            changed[section] = absolute(tables[section], name, ending)
+        if section in changed:
+            changed[section] = absolute(changed[section], name, ending)
     return changed

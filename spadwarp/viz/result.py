@@ -82,7 +82,7 @@ def _depth_figure(result: Result, frame: NDArray[np.float64], method: str) -> Fi
 
 
 def _intensity_figure(result: Result) -> Figure:
-    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     ballistic = result.component("ballistic").sum(axis=-1)
     panels = _panels(result, 2)
     panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
@@ -134,7 +134,7 @@ def _histogram_figure(result: Result) -> Figure:
 
 def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     """Components of one pixel over time of flight, and over the range along its line of sight."""
-    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+    per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
     time = 1e9 * result.bin_edges
     top = parts.max()

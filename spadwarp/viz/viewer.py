@@ -111,7 +111,7 @@ def view(
 
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scene = result.scene
-    per_pulse = scene.laser.photons_per_pulse * scene.detector.pde
+    per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
     # In a scan the positions' numbers of photons differ by one at most.
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"

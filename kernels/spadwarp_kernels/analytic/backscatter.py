@@ -35,29 +35,47 @@ def phase_at(phase: wp.array(dtype=wp.float64), cos_theta: wp.float64) -> wp.flo
 
 @wp.func
 def single_scatter_per_metre(
-    lidar: Lidar, phase: wp.array(dtype=wp.float64), view: wp.vec3d, r: wp.float64
+    lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
+    phase: wp.array(dtype=wp.float64),
+    view: wp.vec3d,
+    r: wp.float64,
 ) -> wp.float64:
-    """Single-scatter detections per pulse and metre of range at distance r along `view` [1/m].
+    """Single-scatter detections per pulse and metre of range at distance r along `view` [1/m], over all lines.
 
     For a laser in the lens, a narrow cone and the axis it is C_back(t) of the geometry of Lu et al. 2024 times dt/dr.
     """
+    total = wp.float64(0.0)
     if lidar.lu2024 == 1:
-        scale = lidar.photons * lidar.pde * lidar.scattering * phase[phase.shape[0] - 1]
         # pitch^2/N^2 = 4 A (pitch/f)^2/pi
         etendue = wp.float64(4.0) / PI * lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent
-        return scale * etendue * wp.exp(-TWO * lidar.extinction * r) / (wp.float64(4.0) * lidar.tan2 * r * r)
+        for k in range(lines.shape[0]):
+            line = lines[k]
+            scale = line[0] * lidar.pde * line[2] * phase[phase.shape[0] - 1]
+            total += scale * etendue * wp.exp(-TWO * line[1] * r) / (wp.float64(4.0) * lidar.tan2 * r * r)
+        return total
     x = r * view
     cos_theta = -wp.dot(beam_direction(lidar, x), view)
     cos_psi2 = view[2] * view[2]
     # A cos(psi)/r^2 to the lens times the r^2 (pitch/f)^2 cos^3(psi) that the pixel sees.
     collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
-    scale = lidar.photons * lidar.pde * lidar.scattering * phase_at(phase, cos_theta) * collected
-    return scale * beam_fluence(lidar, x) * wp.exp(-lidar.extinction * (beam_path(lidar, x) + r))
+    density = phase_at(phase, cos_theta)
+    fluence = beam_fluence(lidar, x)
+    path = beam_path(lidar, x) + r
+    for k in range(lines.shape[0]):
+        line = lines[k]
+        scale = line[0] * lidar.pde * line[2] * density * collected
+        total += scale * fluence * wp.exp(-line[1] * path)
+    return total
 
 
 @wp.func
 def single_scatter_rate(
-    lidar: Lidar, phase: wp.array(dtype=wp.float64), view: wp.vec3d, time: wp.float64
+    lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
+    phase: wp.array(dtype=wp.float64),
+    view: wp.vec3d,
+    time: wp.float64,
 ) -> wp.float64:
     """Single-scatter rate C_back(t) [1/s] on a line of sight without a target."""
     r = range_of_path(lidar, view, time * lidar.speed)
@@ -65,7 +83,7 @@ def single_scatter_rate(
         return ZERO
     # path = |r u - p| + r, so that d path/dr = 1 - cos(scattering angle).
     stretch = ONE + wp.dot(beam_direction(lidar, r * view), view)
-    return single_scatter_per_metre(lidar, phase, view, r) * lidar.speed / stretch
+    return single_scatter_per_metre(lidar, lines, phase, view, r) * lidar.speed / stretch
 
 
 @wp.func
@@ -101,6 +119,7 @@ def illuminated_interval(lidar: Lidar, view: wp.vec3d) -> wp.vec2d:
 def _single_scatter_table(
     first: int,
     lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
     phase: wp.array(dtype=wp.float64),
     view: wp.array(dtype=wp.vec3d),
     distance: wp.array(dtype=wp.float64),
@@ -131,9 +150,9 @@ def _single_scatter_table(
             mid = r * wp.exp(half)
             low = mid * wp.exp(-offset * half)
             high = mid * wp.exp(offset * half)
-            f = wp.float64(8.0) * mid * single_scatter_per_metre(lidar, phase, view[i], mid)
-            f += wp.float64(5.0) * low * single_scatter_per_metre(lidar, phase, view[i], low)
-            f += wp.float64(5.0) * high * single_scatter_per_metre(lidar, phase, view[i], high)
+            f = wp.float64(8.0) * mid * single_scatter_per_metre(lidar, lines, phase, view[i], mid)
+            f += wp.float64(5.0) * low * single_scatter_per_metre(lidar, lines, phase, view[i], low)
+            f += wp.float64(5.0) * high * single_scatter_per_metre(lidar, lines, phase, view[i], high)
             sum += f * step / wp.float64(18.0)
             cumulative[i, k + 1] = float(sum)
             r = r * wp.exp(step)
@@ -146,6 +165,7 @@ def _single_scatter_table(
 @wp.func
 def background_rate(
     lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
     phase: wp.array(dtype=wp.float64),
     profile: wp.array2d(dtype=float),
     i: int,
@@ -162,7 +182,7 @@ def background_rate(
     if lidar.source == 1:
         if beyond == 1:
             return lidar.dark
-        return lidar.dark + single_scatter_rate(lidar, phase, view, time)
+        return lidar.dark + single_scatter_rate(lidar, lines, phase, view, time)
     row = i % profile.shape[0]
     last = profile.shape[1] - 1
     position = wp.clamp((time - lidar.start) / lidar.bin_width - HALF, ZERO, wp.float64(last))
@@ -172,6 +192,16 @@ def background_rate(
     return lidar.dark + value / lidar.bin_width
 
 
+def spectral_lines(lidar: Any, lines: wp.array | None, device: wp.Device) -> wp.array:
+    """The lines given, or the lidar's own photons, extinction and scattering as one line."""
+    if lines is None:
+        own = wp.vec3d(float(lidar.photons), float(lidar.extinction), float(lidar.scattering))
+        return wp.array([own], dtype=wp.vec3d, device=device)
+    check_array("lines", lines, wp.vec3d, (None,), device)
+    check_integer("number of lines", lines.size, 1)
+    return lines
+
+
 def check_phase(phase: Any, device: wp.Device) -> None:
     """A table of a phase function over the scattering angle."""
     check_array("phase", phase, wp.float64, (None,), device)
@@ -179,7 +209,7 @@ def check_phase(phase: Any, device: wp.Device) -> None:
 
 
 def single_scatter_table(
-    lidar: Any, phase: wp.array, view: wp.array, distance: wp.array
+    lidar: Any, phase: wp.array, view: wp.array, distance: wp.array, *, lines: wp.array | None = None
 ) -> tuple[wp.array, wp.array, wp.array]:
     """Where and when each pixel's single-scatter backscatter comes from.
 
@@ -187,6 +217,8 @@ def single_scatter_table(
         lidar: A `Lidar`; the table runs over its gate, from `nearest` on and up to the target.
         phase: float64 `[n]`, phase function [1/sr] at angles uniform on [0, π].
         view, distance: As for `signal_map`.
+        lines: vec3d `[line]`, a spectrum as photons per pulse, extinction and scattering [1/m] of each line, in place
+            of the lidar's own; one speed holds for all.
 
     Returns:
         Edges in path float32 `[pixel, TABLE_EDGES]` [m], cumulative distribution of the same shape, and the total
@@ -204,5 +236,6 @@ def single_scatter_table(
     paths = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     cumulative = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     total = wp.empty(count, dtype=wp.float64, device=device)
-    launch_pixels(_single_scatter_table, count, [lidar, phase, view, distance, paths, cumulative, total], device=device)
+    inputs = [lidar, spectral_lines(lidar, lines, device), phase, view, distance]
+    launch_pixels(_single_scatter_table, count, [*inputs, paths, cumulative, total], device=device)
     return paths, cumulative, total

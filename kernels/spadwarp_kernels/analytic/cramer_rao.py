@@ -12,7 +12,7 @@ from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice,
 from spadwarp_kernels.math.float64 import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 from spadwarp_kernels.pixels import launch_pixels
 
-from .backscatter import background_rate, check_phase
+from .backscatter import background_rate, check_phase, spectral_lines
 from .lidar import Lidar, check_lidar
 from .outliers import outlier_probability
 
@@ -69,6 +69,7 @@ def _gauss_legendre(node: int) -> wp.vec2d:
 @wp.func
 def _integrate_pulse(
     lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
     phase: wp.array(dtype=wp.float64),
     profile: wp.array2d(dtype=float),
     i: int,
@@ -88,11 +89,11 @@ def _integrate_pulse(
             high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
         half = (high - low) / wp.float64(48.0)
         if half > ZERO:
-            right = background_rate(lidar, phase, profile, i, view, side, low)
+            right = background_rate(lidar, lines, phase, profile, i, view, side, low)
             for panel in range(24):
                 middle = low + (TWO * wp.float64(panel) + ONE) * half
                 left = wp.float64(right)
-                right = background_rate(lidar, phase, profile, i, view, side, middle + half)
+                right = background_rate(lidar, lines, phase, profile, i, view, side, middle + half)
                 for node in range(5):
                     rule = _gauss_legendre(node)
                     x = rule[0]
@@ -103,7 +104,7 @@ def _integrate_pulse(
                     # Straight across a panel; only a profile can have more detail than that.
                     noise_rate = HALF * (left + right) + HALF * (right - left) * x
                     if lidar.source == 2:
-                        noise_rate = background_rate(lidar, phase, profile, i, view, side, t)
+                        noise_rate = background_rate(lidar, lines, phase, profile, i, view, side, t)
                     rate = noise_rate + pulse
                     if rate > ZERO:
                         total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
@@ -116,6 +117,7 @@ def _integrate_pulse(
 def _statistics(
     first: int,
     lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
     phase: wp.array(dtype=wp.float64),
     profile: wp.array2d(dtype=float),
     view: wp.array(dtype=wp.vec3d),
@@ -147,7 +149,7 @@ def _statistics(
     alpha[i] = a
     pulse = PulseIntegrals()
     if s * fraction > ZERO:
-        pulse = _integrate_pulse(lidar, phase, profile, i, view[i], s, mu)
+        pulse = _integrate_pulse(lidar, lines, phase, profile, i, view[i], s, mu)
     counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
     f = wp.float64(0.0)
     sigma_star = wp.float64(wp.nan)
@@ -227,6 +229,7 @@ def statistics_maps(
     acquisitions: float,
     pulses_per_frame: float = 1.0,
     outliers: bool = True,
+    lines: wp.array | None = None,
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
@@ -243,6 +246,7 @@ def statistics_maps(
         acquisitions: Pulses (`"per_pulse"`), or frames.
         pulses_per_frame: ην, for the laws per frame.
         outliers: Whether their probability is wanted, which takes most of the time; else it is NaN.
+        lines: As for `single_scatter_table`, used where `lidar.source` is 1.
 
     Where no signal falls into the gate, F is 0, and σ* and the outlier probability are NaN.
 
@@ -267,8 +271,8 @@ def statistics_maps(
         wp.float64(pulses_per_frame),
         int(bool(outliers)),
     ]
-    inputs = [lidar, phase, profile, view, signal, arrival, backscatter, *counting, *out]
-    launch_pixels(_statistics, count, inputs, device=device)
+    inputs = [lidar, spectral_lines(lidar, lines, device), phase, profile, view, signal, arrival, backscatter]
+    launch_pixels(_statistics, count, [*inputs, *counting, *out], device=device)
     return out
 
 
