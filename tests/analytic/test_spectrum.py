@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from helpers.lidar import lidar
 from scipy.integrate import quad
 
 import spadwarp
+from helpers.lidar import lidar
 from spadwarp.analytic import pixel_maps
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 from spadwarp_kernels import analytic as kernels
