@@ -74,6 +74,8 @@ def read_coloured_mesh(
     channel, ending = colour_channel(wavelength_nm), path.suffix.lower()[1:]
 
     def decode(values: Any, encoded: bool) -> Array:
+        if np.ndim(values) < 1 or np.shape(values)[-1] < 3 or np.asarray(values).dtype.kind not in "iuf":
+            raise MeshError(f"{name}: a colour of the file, {values!r}, is not red, green and blue")
         colours = _as_fraction(np.asarray(values)[..., :3], name)[..., channel]
         return srgb_to_linear(colours) if encoded and encoding == "srgb" else colours
 
@@ -168,11 +170,30 @@ def _check_materials(path: Path, name: str) -> None:
             if not materials.is_file():
                 raise MeshError(f"{name}: its material file {os.fspath(materials)!r} is missing")
             for entry in materials.read_text(errors="replace").splitlines():
-                words = entry.split(maxsplit=1)
-                if words and words[0].lower() == "map_kd":
-                    image = materials.parent / words[-1].strip()
-                    if not image.is_file():
-                        raise MeshError(f"{name}: {materials.name} names an image that is missing: {entry.strip()!r}")
+                _check_material_line(entry.strip(), materials, name)
+
+
+def _check_material_line(entry: str, materials: Path, name: str) -> None:
+    """Refuses what makes trimesh pass over a material, or over its image."""
+    import PIL.Image
+
+    words = entry.split()
+    match words[0].lower() if words else None:
+        case "kd":
+            try:
+                colour = [float(word) for word in words[1:]]
+            except ValueError:
+                colour = []
+            if len(colour) != 3:
+                raise MeshError(f"{name}: {materials.name} has {entry[:80]!r}, which is not red, green and blue")
+        case "map_kd":
+            image = materials.parent / entry[len("map_kd") :].strip()
+            if not image.is_file():
+                raise MeshError(f"{name}: {materials.name} names an image that is missing: {entry!r}")
+            try:
+                PIL.Image.open(image).close()
+            except Exception as error:  # what Pillow raises depends on the format
+                raise MeshError(f"{name}: {materials.name} names {entry!r}, which is no image: {error}") from error
 
 
 def _read_off(text: str) -> dict[str, Any]:

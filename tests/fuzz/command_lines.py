@@ -49,10 +49,16 @@ OUTPUTS = ("out", "out.json", "out.html", "out.gif", "mine.toml", "view.html", "
 
 
 @functools.cache
-def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
-    """Of each command its options, and whether they take a value."""
+def program():
+    """`spadwarp`, built once: typer reads the annotations of all commands for it."""
     from spadwarp.cli import app
 
+    return typer.main.get_command(app)
+
+
+@functools.cache
+def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
+    """Of each command its options, and whether they take a value."""
     found: dict[tuple[str, ...], list[tuple[str, bool]]] = {}
 
     def walk(command, path):
@@ -65,7 +71,7 @@ def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
                 if parameter.param_type_name == "option" and parameter.opts[-1] not in _SETTINGS
             ]
 
-    walk(typer.main.get_command(app), ())
+    walk(program(), ())
     return found
 
 

@@ -12,6 +12,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from fuzz import command_lines
 from fuzz.cases import Case, write
 from fuzz.isolation import Outcome, run_isolated
 
@@ -76,13 +77,11 @@ def _child(case: Case, folder: Path) -> tuple[int, str, list[str]]:
     command, *rest = case.arguments
     if command.startswith("load"):
         return _load(command, rest[0])
-    from spadwarp.cli import app
-
     out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO(), errors="replace")
     code = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            app(list(case.arguments), prog_name="spadwarp")
+            command_lines.program()(list(case.arguments), prog_name="spadwarp")
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
         err.flush()

@@ -6,6 +6,7 @@ Each case runs in a child process of its own, forked from this one in which ever
 
 import argparse
 import collections
+import gc
 import json
 import os
 import sys
@@ -19,10 +20,20 @@ sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from fuzz import kernel_calls
 from fuzz.cases import CATEGORIES, Case, draw
+from fuzz.command_lines import program
 from fuzz.corpus import Corpus, make_corpus
 from fuzz.executed import run_case
 
 FINE = ("done", "refused")
+
+
+def coarse_pictures() -> None:
+    """Pictures are drawn whole, with few pixels and in fixed places: most of a case's time else."""
+    from spadwarp.viz.style import NotebookFigure as Picture
+
+    begin, save = Picture.__init__, Picture.savefig
+    Picture.__init__ = lambda self, *sizes, **options: begin(self, *sizes, **{**options, "layout": None})
+    Picture.savefig = lambda self, *where, **options: save(self, *where, **{**options, "dpi": 20})
 
 
 def warm_up(corpus: Path) -> None:
@@ -72,9 +83,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="corpus-") as folder:
         corpus = Corpus(Path(folder))
         make_corpus(corpus.folder)
+        coarse_pictures()
         warm_up(corpus.folder)
         if "kernels" in names:
             kernel_calls.warm_up()
+        program()
+        gc.collect()
+        gc.freeze()  # else the first collection of every child copies this process's memory
         for number in range(options.first, options.first + options.cases):
             category = names[number % len(names)]
             if category == "kernels":

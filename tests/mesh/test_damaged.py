@@ -46,6 +46,25 @@ def test_mtllib_without_a_name(tmp_path):
             load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
 
 
+@pytest.mark.parametrize(
+    "colour", ["0.4 0.3", "0.4 0.3 0.2 0.1 0", "spectral file.rfl", "0.4 x 0.3", "1e999 0 0", "", "0", "0.5"]
+)
+def test_material_colours_that_are_none(colour, tmp_path):
+    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt 0 0\nusemtl one\nf 1/1 2/1 3/1\n")
+    (tmp_path / "box.mtl").write_text(f"newmtl one\nKd {colour}\n")
+    with pytest.raises(MeshError, match=r"box\.obj.*(red, green and blue|colour component)"):
+        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+
+
+def test_an_image_of_a_material_that_is_none(tmp_path):
+    """trimesh passes over it, and would leave the material's plain colour."""
+    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt 0 0\nusemtl one\nf 1/1 2/1 3/1\n")
+    (tmp_path / "box.mtl").write_text("newmtl one\nKd 0.4 0.4 0.4\nmap_Kd box.png\n")
+    (tmp_path / "box.png").write_bytes(b"\x89PNG and no more")
+    with pytest.raises(MeshError, match=r"box\.png.*no image"):
+        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+
+
 @pytest.fixture
 def glb():
     """Bytes of a textured box, and its header as a table with where the numbers begin."""
