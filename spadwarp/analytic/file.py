@@ -13,6 +13,7 @@ from spadwarp.analytic.labelled import MAP_UNITS
 from spadwarp.analytic.model import response_sigma
 from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
 
@@ -48,30 +49,42 @@ def save_analytic(result: AnalyticResult, path: str | Path, *, frames: int | Non
         FileError: The file cannot be written.
     """
 
-    def write(name: str, values: NDArray[Any], unit: str) -> None:
-        file.create_dataset(name, data=values, **(_PACKED if values.size else {})).attrs["unit"] = unit
+    def write(name: str, values: NDArray[Any]) -> None:
+        file.create_dataset(name, data=values, **(_PACKED if values.size else {}))
 
+    count, shape = len(result.depth) if frames is None else frames, result.truth.depth.shape
     with write_hdf5(path) as file:
         file.attrs.update(_metadata(result))
         file.create_dataset("config", data=result.scene.to_toml())
-        for name, unit in MAP_UNITS.items():
-            write(f"maps/{name}", getattr(result, name), unit)
-        for name, unit in _TRUTH_UNITS.items():
-            write(f"truth/{name}", getattr(result.truth, name), unit)
+        for name in MAP_UNITS:
+            write(f"maps/{name}", getattr(result, name))
+        for name in _TRUTH_UNITS:
+            write(f"truth/{name}", getattr(result.truth, name))
         if frames is None:
-            write("depth", result.depth, "m")
-            write("labels", result.labels, "1")
-            return Path(path)
-        shape = result.truth.depth.shape
-        packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
-        depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
-        labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
-        depth.attrs["unit"], labels.attrs["unit"] = "m", "1"
-        part = max(1, _PART_BYTES // (5 * result.truth.depth.size))
-        for first in range(0, frames, part):
-            stop = min(first + part, frames)
-            depth[first:stop], labels[first:stop] = result.sample(stop - first, first=first, device=device)
+            write("depth", result.depth)
+            write("labels", result.labels)
+        else:
+            packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
+            depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
+            labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
+            part = max(1, _PART_BYTES // (5 * result.truth.depth.size))
+            for first in range(0, frames, part):
+                stop = min(first + part, frames)
+                depth[first:stop], labels[first:stop] = result.sample(stop - first, first=first, device=device)
+        number: Coordinate = (np.arange(count), "1", "number of the frame")
+        name_dimensions(file, {"frame": number, **image_coordinates(*shape)}, _DIMENSIONS)
     return Path(path)
+
+
+_DIMENSIONS = {
+    "depth": (("frame", *PIXELS), "m", "planar depth of the frame"),
+    "labels": (("frame", *PIXELS), "1", "whether the pixel reports background"),
+    **{f"maps/{name}": (PIXELS, unit, name.replace("_", " ")) for name, unit in MAP_UNITS.items()},
+    **{
+        f"truth/{name}": ((*PIXELS, "axis") if name == "normal" else PIXELS, unit, f"true {name}")
+        for name, unit in _TRUTH_UNITS.items()
+    },
+}
 
 
 def _metadata(result: AnalyticResult) -> dict[str, Any]:

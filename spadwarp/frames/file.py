@@ -16,6 +16,7 @@ from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
+from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
@@ -29,6 +30,7 @@ FORMAT_VERSION = 1
 _CHUNK_BYTES = 1 << 20
 _TAG_CHUNK = 1 << 16
 _TAGS = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
+_TAG_DIMENSION = "tags/detection"
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _READ_ME = (
     "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
@@ -210,10 +212,11 @@ class FramesWriter:
         image: dict[str, Any] = {"shape": (frames, height, width), "chunks": (1, height, width), **_PACKED}
         file.create_dataset("intensity", dtype=np.int64, **image)
         for method in methods:
-            file.create_dataset(f"depth/{method}", dtype=np.float32, **image).attrs["unit"] = "m"
+            file.create_dataset(f"depth/{method}", dtype=np.float32, **image)
         if part.tags is not None:
             for name, kind in _TAGS.items():
                 file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(_TAG_CHUNK,), **_PACKED)
+        name_dimensions(file, _coordinates(part, frames, (height, width)), _dimensions(part, methods))
 
     def add(self, part: Frames, depth: dict[Method, NDArray[np.float64]]) -> None:
         """Writes the next frames, and their depth by each estimator `[frames, H, W]` [m]."""
@@ -228,7 +231,39 @@ class FramesWriter:
                 before = column.shape[0]
                 column.resize((before + len(values),))
                 column[before:] = values
+            file[_TAG_DIMENSION].resize(column.shape)
         self._written = rows.stop
+
+
+def _coordinates(part: Frames, frames: int, shape: tuple[int, int]) -> dict[str, Coordinate | int | None]:
+    edges = part.gate_start + part.edges
+    return {
+        "frame": (np.arange(frames), "1", "number of the frame"),
+        **image_coordinates(*shape),
+        "time": (0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
+        "whole_gate": 1,
+        "edges": ("edges", "s", "edges of the bins after the start of the gate"),
+        "sample": 0 if part.irf.times is None else len(part.irf.times),
+        "quantity": (["time [s]", "value"], "1", "of the measured instrument response"),
+        _TAG_DIMENSION: None,
+    }
+
+
+def _dimensions(part: Frames, methods: Sequence[Method]) -> dict[str, tuple[tuple[str, ...], str, str]]:
+    image, images = PIXELS, ("frame", *PIXELS)
+    bins = "whole_gate" if part.background.shape[-1] == 1 < part.expected.shape[-1] else "time"
+    return {
+        "counts": ((*images, "time"), "1", "detections in the bin"),
+        "intensity": (images, "1", "counts over all bins"),
+        **{f"depth/{method}": (images, "m", f"planar depth by {method}") for method in methods},
+        "expected": ((*image, "time"), "1", "expected detections per pulse before pile-up"),
+        "background": ((*image, bins), "1", "the part of `expected` that is not target"),
+        "bound/time": (image, "s", "Cramér–Rao bound of one frame"),
+        "bound/depth": (image, "m", "Cramér–Rao bound of one frame"),
+        "truth/depth": (image, "m", "true planar depth"),
+        "irf": (("quantity", "sample"), "1", "measured instrument response"),
+        **{f"tags/{name}": ((_TAG_DIMENSION,), "1", f"{name} of the detection") for name in _TAGS},
+    }
 
 
 def _metadata(result: Result, part: Frames, frames: int) -> dict[str, Any]:

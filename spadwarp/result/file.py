@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
@@ -96,7 +97,33 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
         for name in _TRUTH:
             file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **packed)
+        name_dimensions(file, _coordinates(result), _DIMENSIONS)
     return Path(path)
+
+
+def _coordinates(result: Result) -> dict[str, Coordinate | int | None]:
+    return {
+        "component": (COMPONENTS, "1", "history of the light"),
+        **image_coordinates(*result.truth.depth.shape),
+        "time": (result.bin_centres, "s", "time of flight at the centre of the bin"),
+        "bin_edges": ("bin_edges", "s", "time of flight at the edges of the bins"),
+        "word": (["low", "high"], "1", "64 bits of a number of 128"),
+        "run": len(result.photon_ranges),
+        "limit": (["start", "stop"], "1", "of photon ids"),
+    }
+
+
+_DIMENSIONS = {
+    "tallies": (("component", *PIXELS, "time"), "1", "times unit over photons: fraction of the emitted photons"),
+    "second_moment": (("word", *PIXELS, "time"), "1", "sum over batches of the squared tally"),
+    "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
+    "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
+    "requested": (("limit",), "1", "ids of the requested photons"),
+    "truth/depth": (PIXELS, "m", "true planar depth"),
+    "truth/range": (PIXELS, "m", "true distance along the line of sight"),
+    "truth/normal": ((*PIXELS, "axis"), "1", "unit normals towards the camera"),
+    "truth/reflectance": (PIXELS, "1", "Lambertian reflectance"),
+}
 
 
 def load_result(path: str | Path) -> Result:

@@ -88,15 +88,17 @@ def pixel_views(camera: Camera) -> Points:
 
 
 def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str, NDArray[np.float64] | float]:
-    """What a file says of a camera, for readers without spadwarp: OpenCV's `camera_matrix` `[3, 3]` [pixels], 0 being
-    the first pixel's centre, and `camera_distortion` (k1, k2, p1, p2, k3); `camera_position` [m] and `camera_rotation`
-    `[3, 3]`, the camera's axes in the world as columns; `camera_focus_distance` [m], NaN if all depths are sharp."""
+    """What a file says of a camera, for readers without spadwarp: OpenCV's `camera_matrix` [pixels], 0 being the
+    first pixel's centre, and `camera_distortion` (k1, k2, p1, p2, k3); `camera_position` [m] and `camera_rotation`, the
+    camera's axes in the world as columns; `camera_focus_distance` [m], NaN if all depths are sharp.
+
+    The matrices `[3, 3]` are 9 numbers, row after row: netCDF knows no attributes of two dimensions."""
     (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
     return {
-        "camera_matrix": np.array([[fx, 0.0, column - 0.5], [0.0, fy, row - 0.5], [0.0, 0.0, 1.0]]),
+        "camera_matrix": np.array([fx, 0.0, column - 0.5, 0.0, fy, row - 0.5, 0.0, 0.0, 1.0]),
         "camera_distortion": np.array(camera.distortion),
         "camera_position": np.array(camera.position),
-        "camera_rotation": rotation_matrix(camera.rotation_deg),
+        "camera_rotation": rotation_matrix(camera.rotation_deg).ravel(),
         "camera_focus_distance": np.nan if focus_distance is None else focus_distance,
     }
 

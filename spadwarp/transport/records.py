@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
+from spadwarp.io.hdf5_dimensions import Coordinate, name_dimensions
 from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.result.file import read_ledger
@@ -35,6 +36,16 @@ _ARRAYS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "path": (np.float32, ()),
     "collisions": (np.int32, ()),
     "reason": (np.int32, ()),
+}
+_AXES: Coordinate = (["x", "y", "z"], "1", "of the world")
+_DIMENSIONS = {
+    "id": (("photon",), "1", "of the photon"),
+    "position": (("photon", "axis"), "m", "where the history ended"),
+    "direction": (("photon", "axis"), "1", "of the last flight"),
+    "weight": (("photon",), "1", "remaining weight"),
+    "path": (("photon",), "m", "geometric path"),
+    "collisions": (("photon",), "1", "events, surfaces included"),
+    "reason": (("photon",), "1", "index into reasons"),
 }
 _READ_ME = (
     "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
@@ -153,6 +164,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
         file.create_dataset("ledger", data=json.dumps(records.ledger))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())
+        name_dimensions(file, {"photon": len(records.id), "axis": _AXES}, _DIMENSIONS)
     return Path(path)
 
 

@@ -251,7 +251,7 @@ def test_a_file_holds_maps_frames_and_scene(tmp_path):
         np.testing.assert_array_equal(file["labels"][...], result.labels)
         np.testing.assert_array_equal(file["truth/normal"][...], result.truth.normal)
         assert file.attrs["seed"] == str(2**64 - 1) and file.attrs["group_index"] == one.medium.group_index
-        assert file["maps/sigma_time"].attrs["unit"] == "s"
+        assert file["maps/sigma_time"].attrs["units"] == "s"
         import tomllib
 
         assert spadwarp.Scene.from_dict(tomllib.loads(file["config"].asstr()[()])) == one
