@@ -1,4 +1,4 @@
-"""Names and coordinates of the dimensions of HDF5 arrays, as netCDF-4 has them: xarray and netCDF programs show them."""
+"""Names and coordinates of the dimensions of HDF5 arrays, as netCDF-4 has them."""
 
 from __future__ import annotations
 
