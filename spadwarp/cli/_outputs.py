@@ -56,6 +56,7 @@ def check_outputs(
     inputs: Iterable[str | Path | None] = (),
     overwrite: bool,
     resume: bool = False,
+    beside: bool = False,
     needed: int = 0,
     option: str = "--out",
 ) -> Outputs:
@@ -65,12 +66,13 @@ def check_outputs(
 
     Args:
         out: Directory of `option`.
-        names: Files that the command may write in it.
+        names: Files that the command may write in it; patterns such as `frames-*.mat` where `beside` is given.
         files: Option → file that the command writes.
         json: File of --json.
         inputs: Files that the command reads, or directories of a result or frames.
         overwrite: Whether existing files are replaced.
         resume: Whether the command continues what is in the directory.
+        beside: Whether the directory may hold other files than `names`.
         needed: Bytes that may be written to `out`.
         option: That names the directory.
 
@@ -78,6 +80,7 @@ def check_outputs(
         typer.BadParameter: An output exists, is an input, or is given twice.
         FileError: A directory cannot be written, is in use by another process, or has too little space.
     """
+    names = list(names)
     named = {option: path for option, path in {**(files or {}), "--json": json}.items() if path is not None}
     named = {option: path for option, path in named.items() if not spadwarp.io.is_stream(path)}
     written = [*named.items(), *((option, out / name) for name in names if out is not None)]
@@ -88,7 +91,10 @@ def check_outputs(
         if os.path.lexists(path) and not overwrite:
             raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=name)
     if out is not None:
-        _prepare_directory(out, option, may_hold_files=overwrite or resume, needed=needed)
+        if beside and not overwrite and out.is_dir():
+            for path in sorted(path for name in names for path in out.glob(name)):
+                raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=option)
+        _prepare_directory(out, option, may_hold_files=overwrite or resume or beside, needed=needed)
     for path in named.values():
         check_writable(path.parent)
     return Outputs(json, overwrite)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,13 @@ from spadwarp.limits import parse_number
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+
+class PlyFrame(enum.StrEnum):
+    """What `spadwarp.run.write_depth` takes as `ply_frame`."""
+
+    camera = "camera"
+    world = "world"
 
 
 @app.command()
@@ -57,7 +65,12 @@ def depth(
             "measured histograms none, with likelihood the median.",
         ),
     ] = None,
-    ply: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the points of the first frame.")] = None,
+    ply: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write the points of the first frame, with normals.")
+    ] = None,
+    ply_frame: Annotated[
+        PlyFrame, typer.Option(help="Frame of the points: the camera's, or the world for a simulation.")
+    ] = PlyFrame.camera,
     device: opt.Device = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -109,7 +122,7 @@ def depth(
             background=_background(background),
             device=device,
         )
-    written = write_depth(reduced, out, ply=ply, comment=f"{path.name}, {reduced.method}")
+    written = write_depth(reduced, out, ply=ply, ply_frame=ply_frame.value, comment=f"{path.name}, {reduced.method}")
     first = reduced.first
     summary = {**_statistics(first), "quantity": reduced.quantity, "frames": reduced.frames, "files": written}
     if not quiet:

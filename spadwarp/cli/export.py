@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import glob
 from pathlib import Path
 from typing import Annotated
 
@@ -14,12 +15,14 @@ from spadwarp.cli._app import app, say
 
 
 class Format(enum.StrEnum):
-    """`spadwarp.run.FORMATS`, known without loading it."""
+    """Endings of `spadwarp.run.FORMATS`, and a layout; known without loading it."""
 
     npy = "npy"
     mat = "mat"
     ptu = "ptu"
     exr = "exr"
+    xml = "xml"
+    fusion = "fusion"
 
 
 @app.command()
@@ -43,6 +46,10 @@ def export(
     split: Annotated[
         str, typer.Option(metavar="NAME", help="Split of a dataset: train, validation, test or all.")
     ] = "all",
+    factor: Annotated[
+        int,
+        typer.Option(parser=opt.whole_number, metavar="N", help="fusion: finer pixels of the camera image, each way."),
+    ] = 8,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
@@ -55,8 +62,12 @@ def export(
          denoisers read: sparse spad, rates, 1-based bin, bin_size in seconds
     ptu  PicoQuant T3 image, one record a detection
     exr  images: depth, intensity, truth; one file a frame
+    xml  the camera's calibration, as OpenCV's cv::FileStorage reads it
+    fusion  mat files and a camera image of finer pixels, as networks for
+         sensor fusion read them: intensity/, spad/ with bin_hr, a list
 
-    mat and ptu are for counts (`spadwarp detect`); ptu needs spadwarp[formats].
+    The folder may hold other files. fusion, mat and ptu are for counts (`spadwarp detect`); ptu needs
+    spadwarp[formats].
 
     \b
     Examples:
@@ -69,15 +80,21 @@ def export(
     stem = source.resolve().stem
     outputs = opt.check_outputs(
         out,
-        [f"{stem}.{one.value}" for one in set(formats)],
+        [name for one in dict.fromkeys(formats) for name in _names(stem, one)],
         json=json_path,
         inputs=(source,),
         overwrite=overwrite,
+        beside=True,
         needed=source.stat().st_size if source.is_file() else 0,
     )
     written: dict[str, list[Path]] = {}
     # Those that not every source has go first, so that nothing is written where one is refused.
-    for one in sorted(set(formats), key=["ptu", "mat", "npy", "exr"].index):
+    for one in sorted(set(formats), key=["fusion", "ptu", "mat", "npy", "exr", "xml"].index):
+        if one is Format.fusion:
+            written[one.value] = spadwarp.run.export_sensor_fusion(
+                source, out, stem=stem, factor=factor, frames=chosen, split=split
+            )
+            continue
         written[one.value] = spadwarp.export(source, out / f"{stem}.{one.value}", frames=chosen, split=split)
     if not quiet:
         lines = {}
@@ -86,6 +103,14 @@ def export(
             lines[name] = f"{paths[0]}{more}"
         say(opt.rows(lines))
     outputs.write_json({"files": [path for paths in written.values() for path in paths]})
+
+
+def _names(stem: str, one: Format) -> list[str]:
+    """What a format is written to, as patterns."""
+    stem = glob.escape(stem)
+    if one is Format.fusion:
+        return [f"{stem}.txt", f"intensity/{stem}-[0-9]*.mat", f"spad/{stem}-[0-9]*_p1.mat"]
+    return [f"{stem}.{one.value}", f"{stem}-[0-9]*.{one.value}"]
 
 
 def _frames(text: str | None) -> int | slice | None:

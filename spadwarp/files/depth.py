@@ -38,6 +38,7 @@ def stored_depth(held: Held) -> Reduction | None:
         intensity=intensity,
         directions=view,
         method="stored",
+        camera=camera,
     )
 
 

@@ -52,6 +52,7 @@ class Reduction:
         intensity: Sum over the bins, `[frames, H, W]`.
         directions: Lines of sight, unit vectors `[H, W, 3]`, or None.
         method: Estimator of the arrival time, or "stored" for depth that was read.
+        camera: That of a simulation, with its pose in the world; else None.
     """
 
     quantity: Literal["depth", "range"]
@@ -60,6 +61,7 @@ class Reduction:
     intensity: NDArray[Any]
     directions: NDArray[np.float64] | None
     method: str
+    camera: Camera | None = None
 
     @property
     def frames(self) -> int:
@@ -127,6 +129,7 @@ def depth_of(
         intensity=values.sum(axis=-1).reshape(-1, height, width),
         directions=directions,
         method=method,
+        camera=None if histograms.scene is None else histograms.scene.camera,
     )
 
 

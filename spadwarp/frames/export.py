@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,14 +55,19 @@ class SequenceFrame:
     def true_bins(self) -> NDArray[np.float64]:
         """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
         assert self.scene is not None and self.depth is not None and self.counts is not None
-        view = pixel_directions(self.scene.camera)
-        distance = range_from_depth(self.depth.astype(np.float64), view)
-        path = path_from_range(distance, view, self.scene.beam.position)
-        time = time_from_path(path, self.scene.medium.group_index) - self.gate_start
+        found = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
+        return np.where((found >= 1) & (found <= self.counts.shape[-1]), found, 0.0)
+
+    def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
+        `[H, W]`; NaN where there is none."""
+        view = pixel_directions(scene.camera)
+        distance = range_from_depth(depth.astype(np.float64), view)
+        path = path_from_range(distance, view, scene.beam.position)
+        time = time_from_path(path, scene.medium.group_index) - self.gate_start
         if self.period is not None:
             time = np.mod(time, self.period)
-        found = np.floor(time / self.bin_width) + 1.0
-        return np.where((found >= 1) & (found <= self.counts.shape[-1]), found, 0.0)
+        return time / self.bin_width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,8 +121,10 @@ def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
     return path
 
 
-def write_mat(frames: FrameSequence, path: Path, number: int) -> Path:
-    """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables."""
+def write_mat(
+    frames: FrameSequence, path: Path, number: int, *, more: Mapping[str, NDArray[Any]] | None = None
+) -> Path:
+    """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `more`: further ones."""
     from scipy.io import savemat
     from scipy.sparse import csc_matrix
 
@@ -148,6 +155,7 @@ def write_mat(frames: FrameSequence, path: Path, number: int) -> Path:
         "mean_signal_photons": photons,
         "mean_background_photons": frame.background,
         "pulses": float(frame.pulses),
+        **(more or {}),
     }
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         savemat(file, variables, do_compression=True)

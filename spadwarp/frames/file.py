@@ -243,7 +243,7 @@ def _coordinates(part: Frames, frames: int, shape: tuple[int, int]) -> dict[str,
         "time": (0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
         "whole_gate": 1,
         "edges": ("edges", "s", "edges of the bins after the start of the gate"),
-        "sample": 0 if part.irf.times is None else len(part.irf.times),
+        "sample": 0 if part.irf.times is None else np.size(part.irf.times),
         "quantity": (["time [s]", "value"], "1", "of the measured instrument response"),
         _TAG_DIMENSION: None,
     }

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError
 from spadwarp.io.atomic import atomic_path
 
-__all__ = ["point_cloud", "write_ply"]
+__all__ = ["point_cloud", "point_normals", "write_ply"]
 
 _KINDS = {"f4": "float", "f8": "double", "i4": "int", "u4": "uint", "u1": "uchar"}
 
@@ -32,6 +32,35 @@ def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.
         raise ArgumentError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
     returned = np.isfinite(along)
     return (along[returned][:, None] * view[returned]).astype(np.float32), returned
+
+
+def point_normals(distance: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
+    """Unit normals of the points of `point_cloud`, towards the camera: float32 `[P, 3]`.
+
+    By the cross product of the steps to a neighbour in the row and to one in the column, of both the one whose range is
+    nearer; where a pixel has no neighbour in one of them, the direction to the camera.
+    """
+    along = np.asarray(distance, np.float64)
+    view = np.asarray(directions, np.float64)
+    image = along[..., None] * view
+
+    def step(axis: int) -> NDArray[np.float64]:
+        ahead = np.full_like(image, np.nan)
+        there = [slice(None)] * 3
+        there[axis] = slice(None, -1)
+        ahead[tuple(there)] = np.diff(image, axis=axis)
+        behind = np.roll(ahead, 1, axis=axis)  # the last row and column are NaN, and so is what comes round
+        one, other = (np.abs((part * view).sum(axis=-1)) for part in (ahead, behind))
+        use_behind = ~(one <= other) & ~np.isnan(other)
+        return np.where(use_behind[..., None], behind, ahead)
+
+    normal = np.cross(step(1), step(0))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= length
+    normal *= np.where((normal * view).sum(axis=-1) > 0, -1.0, 1.0)[..., None]
+    normal = np.where(np.isfinite(normal), normal, -view)
+    return normal[np.isfinite(along)].astype(np.float32)
 
 
 def write_ply(

@@ -10,7 +10,7 @@ from spadwarp.run.directory import (
     remove_checkpoint,
     write_run,
 )
-from spadwarp.run.formats import FORMATS, export
+from spadwarp.run.formats import FORMATS, export, export_sensor_fusion
 from spadwarp.run.schema import SCHEMAS, json_schema
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "RunFiles",
     "bytes_needed",
     "export",
+    "export_sensor_fusion",
     "json_schema",
     "load_resumable",
     "remove_checkpoint",

@@ -1,4 +1,4 @@
-"""Results, frames and datasets in the formats of other programs: NumPy, MATLAB, PicoQuant, EXR."""
+"""Results, frames and datasets in the formats of other programs: NumPy, MATLAB, PicoQuant, EXR, OpenCV."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.limits import check_choice
 from spadwarp.result.result import COMPONENTS, Result
+from spadwarp.run.sensor_fusion import write_sensor_fusion
+from spadwarp.scene.calibration import CALIBRATION_ENDINGS, save_calibration
 
-__all__ = ["FORMATS", "export"]
+__all__ = ["FORMATS", "export", "export_sensor_fusion"]
 
-FORMATS = (".npy", ".mat", ".ptu", ".exr")
+FORMATS = (".npy", ".mat", ".ptu", ".exr", *CALIBRATION_ENDINGS)
 
 
 def export(
@@ -45,6 +47,7 @@ def export(
       the window's start, which the comment of the file states, as behind a delayed sync.
     - `.exr`: images of one frame: depth `Z` [m], `intensity`, `truth.Z` and what else the source has: components of a
       result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
+    - `.xml`, `.yml`, `.yaml`, `.json`: the camera's calibration, as OpenCV's `cv::FileStorage` reads it.
 
     Args:
         source: A `Result`, `Frames`, the file of one (`result.h5`, `frames.h5`, `analytic.h5`), or the folder of a
@@ -69,6 +72,8 @@ def export(
     source = Path(source) if isinstance(source, os.PathLike) else source
     try:
         with open_source(source, result=result, split=split) as opened:
+            if ending in CALIBRATION_ENDINGS:
+                return [_write_calibration(opened, path)]
             if isinstance(opened, Result):
                 return [_write_result(opened, path, ending, frames)]
             chosen = _chosen(opened, frames)
@@ -78,6 +83,45 @@ def export(
             return [write(opened, name, number) for number, name in zip(chosen, _numbered(path, chosen), strict=True)]
     except ModuleNotFoundError as error:
         raise FileError(f"{path}: writing it needs {error.name}: pip install 'spadwarp[formats]'") from error
+
+
+def export_sensor_fusion(
+    source: Frames | str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    stem: str = "frames",
+    factor: int = 8,
+    frames: int | slice | None = None,
+    split: str = "all",
+    result: Result | None = None,
+) -> list[Path]:
+    """Writes frames beside a camera image of finer pixels, in the layout that networks for sensor fusion read.
+
+    The layout is that of Lindell, O'Toole and Wetzstein (2018): see `write_sensor_fusion` for files and variables.
+
+    Args:
+        source: Frames with counts, as for `export`.
+        folder: For the folders `intensity`, `spad` and the list of the files.
+        stem: Of the files' names.
+        factor: Pixels of the camera image in a pixel, each way, in [1, 64].
+        frames, split, result: As for `export`.
+
+    Raises:
+        ArgumentError: No such frame, or no counts, or no scene of meshes.
+        FileError: A file cannot be read or written.
+    """
+    check_choice("split", split, (*SPLITS, "all"))
+    with open_source(source, result=result, split=split) as opened:
+        if isinstance(opened, Result):
+            raise ArgumentError("a result holds expected histograms: draw frames first (`spadwarp detect`)")
+        return write_sensor_fusion(opened, Path(folder), stem, _chosen(opened, frames), factor)
+
+
+def _write_calibration(opened: Result | FrameSequence, path: Path) -> Path:
+    scene = opened.scene if isinstance(opened, Result) else opened.at(0).scene
+    if scene is None:
+        raise ArgumentError("result is missing: its scene has the camera")
+    return save_calibration(scene.camera, path)
 
 
 def _chosen(source: FrameSequence, frames: int | slice | None) -> range:

@@ -5,6 +5,7 @@
 """
 
 from spadwarp.scene.analytic import Analytic
+from spadwarp.scene.calibration import load_calibration, save_calibration
 from spadwarp.scene.camera import Camera
 from spadwarp.scene.detector import Detector
 from spadwarp.scene.domain import Domain
@@ -52,12 +53,14 @@ __all__ = [
     "as_scene",
     "detection_efficiency",
     "filter_transmission",
+    "load_calibration",
     "load_scene",
     "look_at",
     "opencv_pose",
     "parse_override",
     "phase_function",
     "presets",
+    "save_calibration",
     "spectral_lines",
     "template",
     "water_lines",

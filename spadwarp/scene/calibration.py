@@ -1,18 +1,27 @@
-"""Camera calibrations as OpenCV writes them: YAML or JSON of `cv::FileStorage`, and ROS's `camera_info` YAML."""
+"""Camera calibrations as OpenCV writes them: XML, YAML or JSON of `cv::FileStorage`, and ROS's `camera_info` YAML."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import yaml
 
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.io.parsing import parse_json, read_text
+from spadwarp.io.text import write_text
 from spadwarp.limits import check_integer, check_real, parse_number, shown
 
-__all__ = ["load_calibration"]
+if TYPE_CHECKING:
+    from spadwarp.scene.camera import Camera
+
+__all__ = ["CALIBRATION_ENDINGS", "load_calibration", "save_calibration"]
+
+CALIBRATION_ENDINGS = (".xml", ".yml", ".yaml", ".json")
+"""Of files that `save_calibration` writes."""
 
 _LARGEST = 1 << 19  # bytes; one with all corners of 100 views has 300 kB
 
@@ -53,7 +62,52 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
         raise ConfigError(f"camera.calibration = {str(path)!r}: {error}") from None
 
 
+def save_calibration(camera: Camera, path: str | Path) -> Path:
+    """Writes a camera's calibration as OpenCV's `cv::FileStorage` reads it: XML, YAML or JSON by the ending.
+
+    Holds `image_width`, `image_height`, `camera_matrix` and `distortion_coefficients` (k1, k2, p1, p2, k3), as
+    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel.
+
+    Raises:
+        ArgumentError: Another ending.
+        FileError: The file cannot be written.
+    """
+    from spadwarp.scene.intrinsics import camera_attributes
+
+    path = Path(path)
+    if (ending := path.suffix.lower()) not in CALIBRATION_ENDINGS:
+        raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
+    numbers: Any = camera_attributes(camera, None)
+    size = {"image_width": camera.width, "image_height": camera.height}
+    matrices = {
+        "camera_matrix": (3, 3, [float(number) for number in numbers["camera_matrix"]]),
+        "distortion_coefficients": (1, 5, [float(number) for number in numbers["camera_distortion"]]),
+    }
+    if ending == ".xml":
+        lines = [f"<{name}>{value}</{name}>" for name, value in size.items()]
+        for name, (rows, columns, values) in matrices.items():
+            lines += [f'<{name} type_id="opencv-matrix">', f"  <rows>{rows}</rows>", f"  <cols>{columns}</cols>"]
+            lines += ["  <dt>d</dt>", f"  <data>{' '.join(map(repr, values))}</data></{name}>"]
+        text = "\n".join(['<?xml version="1.0"?>', "<opencv_storage>", *lines, "</opencv_storage>", ""])
+    elif ending == ".json":
+        tables = {
+            name: {"type_id": "opencv-matrix", "rows": rows, "cols": columns, "dt": "d", "data": values}
+            for name, (rows, columns, values) in matrices.items()
+        }
+        text = json.dumps({**size, **tables}, indent=1) + "\n"
+    else:
+        lines = [f"{name}: {value}" for name, value in size.items()]
+        for name, (rows, columns, values) in matrices.items():
+            lines += [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
+            lines += [f"   data: [ {', '.join(map(repr, values))} ]"]
+        text = "\n".join(["%YAML:1.0", "---", *lines, ""])
+    write_text(text, path)
+    return path
+
+
 def _entries(text: str) -> dict[str, Any]:
+    if text.lstrip().startswith("<"):
+        return _xml_entries(text)
     is_json = text.lstrip().startswith("{")
     try:  # OpenCV's first line is no YAML
         entries = parse_json(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
@@ -62,6 +116,22 @@ def _entries(text: str) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("not valid YAML: lists or tables are nested too deeply") from None
     return entries if isinstance(entries, dict) else {}
+
+
+def _xml_entries(text: str) -> dict[str, Any]:
+    """The entries of OpenCV's XML, its matrices as `_numbers` takes them."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # with entities a small file can be huge
+        raise ValueError("not OpenCV's XML: it declares a document type")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not valid XML: {error}") from None
+    entries: dict[str, Any] = {}
+    for element in root:
+        data = element.find("data")
+        words: Sequence[str] = ((element if data is None else data).text or "").split()
+        entries[element.tag] = {"data": list(words)} if data is not None else words[0] if len(words) == 1 else [*words]
+    return entries
 
 
 class _Loader(yaml.BaseLoader):

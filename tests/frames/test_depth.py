@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.frames.depth import depth_of
+from spadwarp.frames.depth import Reduction, depth_of
 from spadwarp.frames.measured import read_histograms
-from spadwarp.io.ply import point_cloud, write_ply
+from spadwarp.io.ply import point_cloud, point_normals, write_ply
+from spadwarp.run import write_depth
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.pose import rotation_matrix, to_camera
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
 
@@ -57,6 +59,57 @@ def test_background_is_that_of_all_frames_together(tmp_path):
     # 121.5 bins of 100 ps are 1.8212 m; the bound of eight photons is 80 ps / √8.
     assert np.median(reduced.values) == pytest.approx(1.8212, abs=4 * 80e-12 / np.sqrt(8 * 240) * 0.15e9)
     assert np.array_equal(reduced.intensity, counts.sum(-1))
+
+
+@pytest.mark.parametrize("frame", ["camera", "world"])
+def test_open3d_reads_points_and_normals(frame, tmp_path):
+    """A tilted wall, of which some pixels see nothing, by a camera that is tilted, too."""
+    open3d = pytest.importorskip("open3d")
+    pose = {"position": (1.0, -2.0, 0.5), "rotation_deg": (10.0, -30.0, 5.0)}
+    camera = Camera(width=12, height=9, horizontal_fov_deg=50.0, aperture_diameter=0.01, **pose)
+    view = pixel_directions(camera)
+    normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    distance = (np.array([0.0, 0.0, 3.0]) @ normal) / (view @ normal)
+    distance[3, 4:7] = np.nan
+    reduction = Reduction(
+        quantity="depth",
+        values=(distance * view[..., 2])[None],
+        range=distance[None],
+        intensity=np.ones((1, 9, 12)),
+        directions=view,
+        method="stored",
+        camera=camera,
+    )
+    path = tmp_path / "wall.ply"
+    write_depth(reduction, tmp_path / "out", ply=path, ply_frame=frame, comment="a wall")
+    cloud = open3d.io.read_point_cloud(str(path))
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    assert points.shape == normals.shape == (12 * 9 - 3, 3)
+    assert f"frame {frame}: ".encode() in path.read_bytes()
+    if frame == "world":
+        points, normals = to_camera(camera, points), normals @ rotation_matrix(pose["rotation_deg"])
+    assert np.allclose((points - [0, 0, 3]) @ normal, 0, atol=1e-5)
+    assert np.allclose(normals, normal, atol=1e-4)
+
+
+def test_normals_at_steps_and_of_lone_pixels():
+    camera = Camera(width=6, height=4, horizontal_fov_deg=50.0, aperture_diameter=0.01)
+    view = pixel_directions(camera)
+    distance = np.where(np.arange(6) < 3, 2.0, 5.0) / view[..., 2]  # two walls, one behind the other
+    assert np.allclose(point_normals(distance, view), [0, 0, -1], atol=1e-6)
+    alone = np.full((4, 6), np.nan)
+    alone[2, 3] = 4.0
+    assert np.allclose(point_normals(alone, view), -view[2, 3])
+    measured = Reduction(
+        quantity="depth",
+        values=distance[None],
+        range=distance[None],
+        intensity=distance[None],
+        directions=view,
+        method="a",
+    )
+    with pytest.raises(ValueError, match="need the pose of the camera"):
+        write_depth(measured, "out", ply="a.ply", ply_frame="world")
 
 
 def test_points_lie_where_they_were_seen(tmp_path):

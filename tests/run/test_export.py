@@ -185,6 +185,69 @@ def test_exr_is_read_back_by_openexr(frames, detection, result, tmp_path):
     assert np.array_equal(channels["truth.N.Z"], result.truth.normal[..., 2], equal_nan=True)
 
 
+def read_as_lindell(listed, noise, size, fine):
+    """Names, index arithmetic and normalisation of the loader of Lindell, O'Toole and Wetzstein's sensor fusion."""
+    with open(listed) as file:
+        intensity_files = file.read().split()
+    for intensity_file in intensity_files:
+        spad_file = intensity_file.replace("intensity", "spad").replace(".mat", f"_p{noise}.mat")
+        held = io.loadmat(spad_file, spmatrix=False)
+        spad = np.asarray(held["spad"].todense()).reshape(1, size[1], size[0], -1).transpose(0, 3, 2, 1)
+        rates = np.asarray(held["rates"]).reshape(1, *size, -1).transpose(0, 3, 1, 2)
+        yield {
+            "spad": spad,
+            "rates": rates / np.sum(rates, axis=1)[None],
+            "intensity": io.loadmat(intensity_file)["intensity"].astype(np.float32).reshape(1, *fine) / 255,
+            "bins": (np.asarray(held["bin"]).astype(np.float32).reshape(size) - 1)[None] / (spad.shape[1] - 1),
+            "bins_hr": (np.asarray(held["bin_hr"]).astype(np.float32).reshape(fine) - 1)[None] / (spad.shape[1] - 1),
+            "sbr": held["SBR"].item(),
+            "photons": held["photons"].item(),
+        }
+
+
+def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_path):
+    printed = run("export", frames, "--format", "fusion", "--factor", 5, "--out", tmp_path / "run").output
+    assert "frames.txt" in printed
+    fine = (5 * HEIGHT, 5 * WIDTH)
+    items = list(read_as_lindell(tmp_path / "run" / "frames.txt", 1, (HEIGHT, WIDTH), fine))
+    assert len(items) == FRAMES
+    for number, item in enumerate(items):
+        assert np.array_equal(item["spad"][0], detection.counts[number].transpose(2, 0, 1))
+        assert item["photons"] > 0 and item["sbr"] > 0
+        assert item["intensity"].max() == 1 and item["intensity"].min() >= 0
+        # The middle one of the finer pixels looks where the pixel does.
+        middle = {name: item[name][0, 2::5, 2::5] for name in ("bins_hr", "intensity")}
+        seen = item["bins"][0] >= 0
+        assert seen.sum() > WIDTH * HEIGHT // 2
+        assert np.abs(middle["bins_hr"] - item["bins"][0])[seen].max() * (BINS - 1) < 0.5 + 1e-3
+        view = spadwarp.scene.geometry.pixel_directions(result.scene.camera)
+        light = -result.truth.reflectance * (result.truth.normal * view).sum(axis=-1)
+        there = np.isfinite(light)
+        ratio = (middle["intensity"] / light)[there]
+        assert ratio.max() / ratio.min() < 1.001 and (middle["intensity"][~there] == 0).all()
+    with pytest.raises(ValueError, match="draw frames first"):
+        spadwarp.run.export_sensor_fusion(result, tmp_path / "none")
+    with pytest.raises(ValueError, match="no scene of meshes"):
+        spadwarp.run.export_sensor_fusion(detection, tmp_path / "none")
+
+
+def test_calibration_of_a_run(frames, result, tmp_path):
+    [path] = spadwarp.export(frames, tmp_path / "camera.xml")
+    camera = spadwarp.scene.Camera(calibration=str(path), aperture_diameter=0.02)
+    assert camera.focal_pixels == pytest.approx(result.scene.camera.focal_pixels)
+    assert camera.principal_point == pytest.approx(result.scene.camera.principal_point)
+
+
+def test_a_second_format_goes_into_the_same_folder(frames, tmp_path):
+    run("export", frames, "--format", "npy", "--out", tmp_path / "a")
+    run("export", frames, "--format", "mat", "--format", "xml", "--out", tmp_path / "a")
+    names = sorted(path.name for path in (tmp_path / "a").iterdir() if not path.name.startswith("."))
+    assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy", "frames.xml"]
+    again = run("export", frames, "--format", "mat", "--out", tmp_path / "a", code=2).output
+    assert "frames-00000.mat exists; --overwrite replaces it" in " ".join(again.split())
+    run("export", frames, "--format", "mat", "--out", tmp_path / "a", "--overwrite")
+
+
 def test_analytic_frames(tmp_path):
     analytic = spadwarp.simulate_analytic(
         make_scene(width=WIDTH, height=HEIGHT, bins=BINS), frames=3, seed=5, device="cpu"

@@ -7,8 +7,8 @@ import pytest
 
 from helpers.opencv import project_points
 from spadwarp import load_scene
-from spadwarp.errors import ConfigError, FileError
-from spadwarp.scene import Camera, look_at, opencv_pose
+from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.scene import Camera, look_at, opencv_pose, save_calibration
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.intrinsics import image_points, image_tangents, pixel_views, view_box
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_camera, to_world
@@ -164,7 +164,28 @@ _OPENCV_JSON = """{"image_width": 64, "image_height": 48,
 _PLAIN_JSON = '{"K": [[61.0, 0, 29.2], [0, 63.5, 25.1], [0, 0, 1]], "dist": [[-0.28, 0.07, 0, 0, -0.01, 0, 0, 0]]}'
 
 
-@pytest.mark.parametrize("text", [_OPENCV_YAML, _ROS_YAML, _OPENCV_JSON, _PLAIN_JSON])
+_OPENCV_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<calibration_time>"Mon 01 Jan 2024"</calibration_time>
+<image_width>64</image_width>
+<image_height>48</image_height>
+<camera_matrix type_id="opencv-matrix">
+  <rows>3</rows>
+  <cols>3</cols>
+  <dt>d</dt>
+  <data>
+    61. 0. 29.2 0. 6.3500e+01 25.1 0.
+    0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix">
+  <rows>1</rows>
+  <cols>5</cols>
+  <dt>d</dt>
+  <data>-0.28 0.07 0. 0. -0.01</data></distortion_coefficients>
+</opencv_storage>
+"""
+
+
+@pytest.mark.parametrize("text", [_OPENCV_YAML, _OPENCV_XML, _ROS_YAML, _OPENCV_JSON, _PLAIN_JSON])
 def test_a_calibration_file_becomes_fields(tmp_path, text):
     path = tmp_path / "camera.yml"
     path.write_text(text)
@@ -183,6 +204,9 @@ def test_a_calibration_file_becomes_fields(tmp_path, text):
         (_PLAIN_JSON.replace("-0.01, 0, 0, 0", "-0.01, 0, 0.1, 0"), "no rational, prism or tilt terms"),
         ('{"K": ', "not valid JSON"),
         ('{"K": ' + "[" * 100_000, "not valid JSON"),
+        ("<opencv_storage><K>", "not valid XML: "),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage/>", "declares a document type"),
+        ("<opencv_storage><K>abc</K></opencv_storage>", "K = 'abc' is not a number"),
         ("K: [61.0, 0,\n", "not valid YAML: while parsing a flow"),
         ("K: &a [61.0]\nD: *a\n", "not valid YAML: an alias stands in line 2"),
         (_ROS_YAML.replace("61.0", "abc"), "camera_matrix = 'abc' is not a number"),
@@ -204,6 +228,39 @@ def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
     assert problem in str(caught.value) and str(path) in str(caught.value)
     with pytest.raises(FileError, match="No such file"):
         Camera(calibration=str(tmp_path / "none.yml"), aperture_diameter=0.01, width=64, height=48)
+
+
+@pytest.mark.parametrize("ending", [".xml", ".yml", ".json"])
+def test_opencv_reads_our_calibration_and_we_read_opencvs(tmp_path, ending):
+    cv2 = pytest.importorskip("cv2")
+    camera = Camera(**INTRINSICS, distortion=LENSES["barrel"])
+    path = save_calibration(camera, tmp_path / f"camera{ending}")
+    again = Camera(calibration=str(path), aperture_diameter=camera.aperture_diameter)
+    assert again == camera
+
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    size = tuple(int(storage.getNode(f"image_{name}").real()) for name in ("width", "height"))
+    matrix, lens = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
+    storage.release()
+    assert size == (camera.width, camera.height)
+    points = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.5]])
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)
+    np.testing.assert_allclose(pixels[:, 0], image_points(camera, points[:, :2] / points[:, 2:]) - 0.5, atol=1e-9)
+
+    storage = cv2.FileStorage(str(tmp_path / f"theirs{ending}"), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Mon 01 Jan 2024")
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", lens)
+    storage.release()
+    theirs = Camera(calibration=str(tmp_path / f"theirs{ending}"), aperture_diameter=camera.aperture_diameter)
+    assert theirs == camera
+
+
+def test_calibrations_are_written_under_known_endings(tmp_path):
+    with pytest.raises(ArgumentError, match=r"'\.txt' is not one of \.xml"):
+        save_calibration(Camera(**INTRINSICS), tmp_path / "camera.txt")
 
 
 def test_a_calibration_of_many_lines_is_refused_before_it_is_parsed(tmp_path):
