@@ -35,7 +35,7 @@ class Request:
         weight: Of the photon; in water times the albedo, but for flights through layers, whose albedo is that of the
             sampled point.
         path: Geometric path up to x [m].
-        lens: The point of the lens, if it has been drawn.
+        lens: The point of the lens by which a flight is scored; others draw one from `first`.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
         first, second: Random words: of the lens's point or, of a flight, of the choice and the distance.
         rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
@@ -120,10 +120,6 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.u = s.u
                 q.weight = s.weight.value
                 q.path = s.path
-                if wp.static(flights):
-                    # An even draw, from the words that the flight's point comes from: a surface has nothing to gain
-                    # from a point close to the flight's line. Others draw one from `first`.
-                    q.lens = lens_point(camera, u01(s.flight.sample_block[2]), u01(s.flight.sample_block[3]))
                 q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
                 q.rounding_sample = s.flight.block[2]  # of the azimuth to come
@@ -239,15 +235,14 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         found.origin = request.x
         weight = float(request.weight)
         path = float(request.path)
+        found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
         if wp.static(flights):
-            found.lens = request.lens
             if request.interval[0] < request.interval[1]:
+                found.lens = request.lens
                 point = flight_point(request, medium, layers)
                 found.origin = point.x
                 weight = point.weight
                 path = point.path
-        else:
-            found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
         view = camera.view
         if wp.static(confocal):
             view = scan.view[request.target]

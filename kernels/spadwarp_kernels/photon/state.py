@@ -66,7 +66,7 @@ class Flight:
         distance: To the event [m].
         reach: How far to look for surfaces [m].
         interval: The part that an estimator wants to score [m]; empty for none.
-        lens: The point of the lens by which the flight, or its end, is scored [m].
+        lens: The point of the lens by which the flight is scored, and where a shadow ray leads [m].
         lens_weight: Its density if it were uniform, over that of the draw.
     """
 
