@@ -1,8 +1,9 @@
 """A single-photon depth camera for a robot simulator: depth and normals in, noisy depth out, all on the device.
 
 Underwater depth cameras of robot simulators cut off at a range and add Gaussian noise (`ThresholdCamera`). This one
-(`SpadCamera`) has the same interface. Its noise is the Cramér–Rao bound of single-photon timing behind the light that
-the water and the surface leave over, and some of its pixels report light that the water scattered back.
+(`CramerRaoCamera`) has the same interface. Its noise is the Cramér–Rao bound of single-photon timing behind the light
+that the water and the surface leave over, and some of its pixels report light that the water scattered back. It makes
+no histograms: `spadwarp_kernels.SpadCamera` does, for many worlds at once.
 
     python kernels/examples/depth_camera.py --frames 100 --picture frame.png
 
@@ -55,7 +56,7 @@ def _threshold(
     out[i, j] = wp.where(depth[i, j] < farthest, value, wp.NAN)
 
 
-class SpadCamera:
+class CramerRaoCamera:
     """A pulsed laser beside a SPAD array in water, with the interface of `ThresholdCamera`.
 
     Args:
@@ -252,7 +253,7 @@ def main():
     parser.add_argument("--device", help='"cpu" or "cuda:0"; by default the GPU, if there is one')
     parser.add_argument("--picture", help="PNG of a frame of both cameras (needs matplotlib)")
     options = parser.parse_args()
-    camera = SpadCamera(*options.size, device=options.device)
+    camera = CramerRaoCamera(*options.size, device=options.device)
     depth, normal = sea_floor(camera)
     noisy = camera.frame(depth, normal)  # compiles the kernels
     wp.synchronize_device(camera.device)

@@ -92,6 +92,18 @@ from .transport import (
     make_transport_kernel,
     read_ledger,
 )
+from .worlds import (
+    CAMERA_FRAMES,
+    SHAPE_KINDS,
+    Shapes,
+    SpadCamera,
+    SpadConfig,
+    make_shapes,
+    move_shapes,
+    mujoco_shapes,
+    newton_shapes,
+    write_poses,
+)
 
 __version__ = "0.1.0"
 
@@ -100,6 +112,7 @@ __all__ = [
     "BRUTE_FORCE_FACES",
     "C0",
     "CALIBRATED",
+    "CAMERA_FRAMES",
     "COMPONENTS",
     "COUNTERS",
     "COUNT_LAWS",
@@ -109,6 +122,7 @@ __all__ = [
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
     "PLAIN",
+    "SHAPE_KINDS",
     "TABULATED",
     "ArgumentError",
     "Batches",
@@ -128,6 +142,9 @@ __all__ = [
     "PhaseGuide",
     "Records",
     "Scan",
+    "Shapes",
+    "SpadCamera",
+    "SpadConfig",
     "SurfaceHit",
     "Surfaces",
     "Textures",
@@ -163,10 +180,14 @@ __all__ = [
     "make_layers",
     "make_phase_tables",
     "make_records",
+    "make_shapes",
     "make_surfaces",
     "make_textures",
     "make_transport_kernel",
+    "move_shapes",
+    "mujoco_shapes",
     "near_depth_map",
+    "newton_shapes",
     "next_event_value",
     "offset_from_surface",
     "one_minus_cosine",
@@ -198,4 +219,5 @@ __all__ = [
     "u01_fine",
     "u01_tail",
     "unshadowed",
+    "write_poses",
 ]

@@ -12,12 +12,13 @@ import warp as wp
 def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any) -> None:
     """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
 
-    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads.
+    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads; but not
+    while a graph is captured, which records the launches of one thread.
     """
     device = wp.get_device(device)
     if count == 0:
         return
-    if device.is_cuda:
+    if device.is_cuda or device.is_capturing:
         wp.launch(kernel, count, [0, *inputs], device=device)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads

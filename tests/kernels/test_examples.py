@@ -57,7 +57,7 @@ def test_moving_target(monkeypatch):
 @pytest.fixture(scope="module")
 def depth_camera():
     module = example("depth_camera")
-    camera = module.SpadCamera(24, 18, pulses=100, device="cpu")
+    camera = module.CramerRaoCamera(24, 18, pulses=100, device="cpu")
     return module, camera, *module.sea_floor(camera)
 
 
@@ -87,7 +87,7 @@ def test_depth_camera_refuses_images_of_another_size(depth_camera):
 def test_depth_camera_takes_torch(depth_camera):
     torch = pytest.importorskip("torch")
     module, _, depth, normal = depth_camera
-    one, other = (module.SpadCamera(24, 18, device="cpu") for _ in range(2))
+    one, other = (module.CramerRaoCamera(24, 18, device="cpu") for _ in range(2))
     tensors = wp.to_torch(depth), wp.to_torch(normal)
     noisy = wp.to_torch(one.frame(wp.from_torch(tensors[0]), wp.from_torch(tensors[1], dtype=wp.vec3)))
     assert noisy.shape == (18, 24) and noisy.dtype == torch.float32

@@ -30,6 +30,7 @@ ROOMS = (
     "detection",
     "analytic",
     "ray_cast",
+    "worlds",
 )
 
 

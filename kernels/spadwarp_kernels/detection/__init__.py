@@ -1,6 +1,6 @@
 """SPAD and TCSPC: counts from expected detections, and arrival times from histograms."""
 
-from .arrival_time import PHASES, arrival_bins
+from .arrival_time import PHASES, ArrivalEstimator, arrival_bins
 from .events import EVENT_LIMIT, event_counts
 from .expected import (
     add_crosstalk,
@@ -10,12 +10,13 @@ from .expected import (
     first_photon_probabilities,
     free_running_probabilities,
 )
-from .first_photon import first_photon_counts
+from .first_photon import first_photon_counts, first_photon_step
 from .rates import first_invalid_row
 
 __all__ = [
     "EVENT_LIMIT",
     "PHASES",
+    "ArrivalEstimator",
     "add_crosstalk",
     "arrival_bins",
     "coates",
@@ -25,5 +26,6 @@ __all__ = [
     "first_invalid_row",
     "first_photon_counts",
     "first_photon_probabilities",
+    "first_photon_step",
     "free_running_probabilities",
 ]

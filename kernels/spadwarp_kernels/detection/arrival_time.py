@@ -266,6 +266,88 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
     return likelihood
 
 
+class ArrivalEstimator:
+    """`arrival_bins` with everything prepared: a call allocates nothing and reads no value on the host.
+
+    Args:
+        bins: Of the histograms.
+        device: Where they are.
+        method, background, response, lowest_tap, first, stop, half_width: As for `arrival_bins`.
+
+    Raises:
+        ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
+    """
+
+    def __init__(
+        self,
+        bins: int,
+        *,
+        device: wp.DeviceLike,
+        method: str = "centroid",
+        background: wp.array | None = None,
+        response: np.ndarray | None = None,
+        lowest_tap: int = 0,
+        first: int = 0,
+        stop: int | None = None,
+        half_width: int = 3,
+    ) -> None:
+        check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
+        self.device, self.method = wp.get_device(device), method
+        self.bins = check_integer("bins", bins, 0)
+        first = check_integer("first", first, 0, bins)
+        stop = bins if stop is None else check_integer("stop", stop, first, bins)
+        half_width = check_integer("half_width", half_width, 0, 2**24)
+        lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
+        if background is None:
+            background = wp.zeros((1, 1), dtype=float, device=self.device)
+        check_array("background", background, wp.float32, (None, None), self.device)
+        if background.shape[0] < 1 or background.shape[1] not in (1, bins):
+            raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
+        if method in ("peak", "centroid"):
+            self._inputs = [background, first, stop, half_width]
+            return
+        response = _check_response(method, response)
+        floor = RESPONSE_FLOOR * float(response.max())
+        # A narrow response loses signal between the delays of the coarse search, a wide one does not.
+        coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4
+        if method == "matched":
+            # ln(h / floor): counts outside the response add the same to every delay.
+            gain = np.log(np.maximum(response, floor) / floor)
+            self._inputs = [self._on_device(gain), first, stop, lowest_tap, coarse_step]
+        else:
+            taps = self._on_device(response)
+            self._inputs = [background, taps, floor, first, stop, lowest_tap, coarse_step]
+
+    def _on_device(self, table: np.ndarray) -> wp.array:
+        return wp.array(table.astype(np.float32), device=self.device)
+
+    def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
+        """Writes the arrival times of a histogram `[pixel, bin]` into `arrival`, float32 `[pixel]`."""
+        check_array("histogram", histogram, RATES, (None, self.bins), self.device)
+        pixels = histogram.shape[0]
+        check_array("arrival", arrival, wp.float32, (pixels,), self.device)
+        if self.method == "matched":
+            kernel = _matched_kernel(histogram.dtype)
+        elif self.method == "likelihood":
+            kernel = _likelihood_kernel(histogram.dtype)
+        else:
+            kernel = _peak_kernel(histogram.dtype, self.method == "centroid")
+        launch_pixels(kernel, pixels, [histogram, *self._inputs, arrival], device=self.device)
+
+
+def _check_response(method: str, response: np.ndarray | None) -> np.ndarray:
+    if response is None:
+        raise ArgumentError(f"method = {method!r} needs a response")
+    response = check_numbers("response", response)
+    if response.ndim != 2 or response.shape[0] != PHASES or response.size == 0:
+        raise ArgumentError(f"response has shape {response.shape}; ({PHASES}, taps) is needed")
+    if not (np.isfinite(response).all() and response.min() >= 0.0 and response.max() > 0.0):
+        raise ArgumentError(
+            f"response holds {response.min()} to {response.max()}; finite values >= 0 are needed, and one above"
+        )
+    return response
+
+
 def arrival_bins(
     histogram: wp.array,
     *,
@@ -300,42 +382,17 @@ def arrival_bins(
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check_array("histogram", histogram, RATES, (None, None))
-    check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
-    device = histogram.device
-    pixels, bins = histogram.shape
-    first = check_integer("first", first, 0, bins)
-    stop = bins if stop is None else check_integer("stop", stop, first, bins)
-    half_width = check_integer("half_width", half_width, 0, 2**24)
-    lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
-    arrival = wp.empty(pixels, dtype=float, device=device)
-    if background is None:
-        background = wp.zeros((1, 1), dtype=float, device=device)
-    check_array("background", background, wp.float32, (None, None), device)
-    if background.shape[0] < 1 or background.shape[1] not in (1, bins):
-        raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
-    if method in ("peak", "centroid"):
-        kernel = _peak_kernel(histogram.dtype, method == "centroid")
-        launch_pixels(kernel, pixels, [histogram, background, first, stop, half_width, arrival], device=device)
-        return arrival
-    if response is None:
-        raise ArgumentError(f"method = {method!r} needs a response")
-    response = check_numbers("response", response)
-    if response.ndim != 2 or response.shape[0] != PHASES or response.size == 0:
-        raise ArgumentError(f"response has shape {response.shape}; ({PHASES}, taps) is needed")
-    if not (np.isfinite(response).all() and response.min() >= 0.0 and response.max() > 0.0):
-        raise ArgumentError(
-            f"response holds {response.min()} to {response.max()}; finite values >= 0 are needed, and one above"
-        )
-    floor = RESPONSE_FLOOR * float(response.max())
-    # A narrow response loses signal between the delays of the coarse search, a wide one does not.
-    coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4
-    if method == "matched":
-        # ln(h / floor): counts outside the response add the same to every delay.
-        gain = wp.array(np.log(np.maximum(response, floor) / floor).astype(np.float32), device=device)
-        inputs = [histogram, gain, first, stop, lowest_tap, coarse_step, arrival]
-        launch_pixels(_matched_kernel(histogram.dtype), pixels, inputs, device=device)
-    else:
-        taps = wp.array(response.astype(np.float32), device=device)
-        inputs = [histogram, background, taps, floor, first, stop, lowest_tap, coarse_step, arrival]
-        launch_pixels(_likelihood_kernel(histogram.dtype), pixels, inputs, device=device)
+    estimator = ArrivalEstimator(
+        histogram.shape[1],
+        device=histogram.device,
+        method=method,
+        background=background,
+        response=response,
+        lowest_tap=lowest_tap,
+        first=first,
+        stop=stop,
+        half_width=half_width,
+    )
+    arrival = wp.empty(histogram.shape[0], dtype=float, device=histogram.device)
+    estimator(histogram, arrival)
     return arrival

@@ -29,6 +29,49 @@ def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.u
     return -wp.log(wp.float64(1.0) - u[0])
 
 
+@wp.func
+def _draw_row(
+    hazard: wp.array2d(dtype=float),
+    pixel: int,
+    row: int,
+    pulses: int,
+    depth: int,
+    seed: wp.uint64,
+    id: wp.uint64,
+    # Out, zero before or counts to add to:
+    counts: wp.array2d(dtype=int),
+):
+    """Adds the counts of `pulses` pulses of a pixel to a row; `id` names the draw."""
+    block = wp.uint32(0)
+    left = int(pulses)  # pulses without a count so far
+    waiting = int(0)
+    wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+    for k in range(hazard.shape[1]):
+        h = wp.float64(hazard[pixel, k])
+        if h > wp.float64(0.0) and left > 0:
+            count = int(0)
+            if wp.float64(left) * h < _SPARSE:
+                # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+                if waiting == 0:
+                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                    block = block + _ONE
+                    waiting = 1
+                while left > 0 and wait < wp.float64(left) * h:
+                    h = h - wait / wp.float64(left)
+                    left = left - 1
+                    count = count + 1
+                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                    block = block + _ONE
+                wait = wait - wp.float64(left) * h
+            else:
+                # Exponential waits have no memory: the one begun may be dropped.
+                waiting = 0
+                count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
+                left = left - count
+            if count > 0:
+                counts[row, k] = counts[row, k] + wp.min(count, depth)
+
+
 @wp.kernel(enable_backward=False)
 def _first_photon_kernel(
     first_row: int,
@@ -47,34 +90,23 @@ def _first_photon_kernel(
     for part in range(summed):
         frame = wp.uint64(first_frame) + wp.uint64(row / pixels * summed + part)
         id = frame * wp.uint64(pixels) + wp.uint64(pixel)
-        block = wp.uint32(0)
-        left = int(pulses)  # pulses without a count so far
-        waiting = int(0)
-        wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
-        for k in range(hazard.shape[1]):
-            h = wp.float64(hazard[pixel, k])
-            if h > wp.float64(0.0) and left > 0:
-                count = int(0)
-                if wp.float64(left) * h < _SPARSE:
-                    # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
-                    if waiting == 0:
-                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                        block = block + _ONE
-                        waiting = 1
-                    while left > 0 and wait < wp.float64(left) * h:
-                        h = h - wait / wp.float64(left)
-                        left = left - 1
-                        count = count + 1
-                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                        block = block + _ONE
-                    wait = wait - wp.float64(left) * h
-                else:
-                    # Exponential waits have no memory: the one begun may be dropped.
-                    waiting = 0
-                    count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
-                    left = left - count
-                if count > 0:
-                    counts[row, k] = counts[row, k] + wp.min(count, depth)
+        _draw_row(hazard, pixel, row, pulses, depth, seed, id, counts)
+
+
+@wp.kernel(enable_backward=False)
+def _first_photon_step_kernel(
+    first_row: int,
+    hazard: wp.array2d(dtype=float),
+    pulses: int,
+    frame: wp.array(dtype=wp.int64),
+    depth: int,
+    seed: wp.uint64,
+    # Out, zero before:
+    counts: wp.array2d(dtype=int),
+):
+    pixel = first_row + wp.tid()
+    id = wp.uint64(frame[0]) * wp.uint64(hazard.shape[0]) + wp.uint64(pixel)
+    _draw_row(hazard, pixel, pixel, pulses, depth, seed, id, counts)
 
 
 def first_photon_counts(
@@ -116,6 +148,32 @@ def first_photon_counts(
     inputs = [hazard, pulses, first_frame, frames if summed else 1, counter_depth or 2**31 - 1, seed, counts]
     launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
     return counts
+
+
+def first_photon_step(
+    hazard: wp.array, *, pulses: int, frame: wp.array, counter_depth: int = 0, seed: int, counts: wp.array
+) -> None:
+    """One frame of `first_photon_counts` whose number is on the device, for a step that is captured in a graph.
+
+    Nothing is allocated and no value is read on the host: the counts are those of `first_photon_counts` with
+    `first_frame` = frame[0].
+
+    Args:
+        hazard: As there; its values are not checked.
+        frame: int64 `[1]`, the number of the frame, which the caller moves on.
+        counts: int32 `[pixel, bin]`, overwritten.
+        pulses, counter_depth, seed: As there.
+
+    Raises:
+        ArgumentError: A number out of range, or an array of another kind.
+    """
+    check_array("hazard", hazard, wp.float32, (None, None))
+    check_array("frame", frame, wp.int64, (1,), hazard.device)
+    check_array("counts", counts, wp.int32, hazard.shape, hazard.device, contiguous=True)
+    pulses, _, _, counter_depth, seed = check_exposure(hazard, pulses, 1, 0, counter_depth, seed)
+    counts.zero_()
+    inputs = [hazard, pulses, frame, counter_depth or 2**31 - 1, seed, counts]
+    launch_pixels(_first_photon_step_kernel, hazard.shape[0], inputs, device=hazard.device)
 
 
 def check_rates(name: str, rates: wp.array) -> None:

@@ -1,0 +1,250 @@
+"""What stands in the worlds: shapes on bodies, as the arrays that a simulator has on the device."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_struct
+from spadwarp_kernels.surface.mesh import Textures, no_textures
+from spadwarp_kernels.surface.reflectance import texture_at
+
+from .closed_forms import MESH, SHAPE_KINDS, ShapeHit, intersect_shape
+
+wp.set_module_options({"enable_backward": False})
+
+_FAR = wp.constant(1.0e10)
+
+
+@wp.struct
+class ShapeTable:
+    """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place.
+
+    Attributes:
+        kind: Index into SHAPE_KINDS, [shapes].
+        size: [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone:
+            radius and half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points.
+        body: Index of the pose that carries the shape, -1 for none, [shapes].
+        local: Pose of the shape on its body, [shapes].
+        mesh: Id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes].
+        albedo: Lambertian reflectance in [0, 1], [shapes].
+        first: Where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last.
+        member: Shapes in the order of their worlds.
+        first_face: Of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none.
+        textures: Images on the faces of meshes, which multiply the albedo; see `make_textures`.
+        pose: Of each shape in its world, written by `move_shapes`, [shapes].
+    """
+
+    kind: wp.array(dtype=int)
+    size: wp.array(dtype=wp.vec3)
+    body: wp.array(dtype=int)
+    local: wp.array(dtype=wp.transform)
+    mesh: wp.array(dtype=wp.uint64)
+    albedo: wp.array(dtype=float)
+    first: wp.array(dtype=int)
+    member: wp.array(dtype=int)
+    first_face: wp.array(dtype=int)
+    textures: Textures
+    pose: wp.array(dtype=wp.transform)
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Shapes of all worlds, from `make_shapes`, `newton_shapes` or `mujoco_shapes`.
+
+    Attributes:
+        table: The struct that kernels take.
+        worlds: Number of worlds.
+        device: Warp device of the arrays.
+        meshes: Meshes that are kept alive with the shapes.
+    """
+
+    table: ShapeTable
+    worlds: int
+    device: wp.Device
+    meshes: tuple[wp.Mesh, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.table.kind.size)
+
+
+def make_shapes(
+    kind: Any,
+    size: Any,
+    *,
+    body: Any = None,
+    local: Any = None,
+    mesh: Any = None,
+    albedo: Any = 0.2,
+    world: Any = None,
+    worlds: int = 1,
+    visible: Any = None,
+    first_face: Any = None,
+    textures: "Textures | None" = None,
+    device: wp.DeviceLike = None,
+) -> Shapes:
+    """Shapes from arrays `[shapes]` of NumPy, lists, or Warp arrays, which are kept and not copied.
+
+    Args:
+        kind: Names or indices of SHAPE_KINDS.
+        size: [m], see `ShapeTable`.
+        body: -1, the default, stands still in its world.
+        local: Poses on the bodies (x, y, z, qx, qy, qz, qw).
+        mesh: `wp.Mesh` objects, or ids of such, which the caller keeps alive; None or 0 for the other kinds.
+        albedo: A number, or one for each shape.
+        world: Index of the world of each shape, -1 for a shape that stands in all; read once, on the host. By default
+            all stand in world 0, or in all worlds if there are several.
+        worlds: Number of worlds.
+        visible: Whether cameras see a shape; all by default. Read once, as `world`.
+        first_face, textures: See `ShapeTable`.
+        device: Where the arrays are.
+
+    Raises:
+        ArgumentError: Arrays of another length or on another device, an unknown kind, or a world that there is not.
+    """
+    device = check_device("device", device)
+    worlds = check_integer("worlds", worlds, 1)
+    table = ShapeTable()
+    if not isinstance(kind, wp.array):
+        kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in kind])
+        if kind.dtype.kind not in "iu" or kind.size == 0:
+            raise ArgumentError(
+                f"kind = {kind.tolist()} is not a list of {', '.join(SHAPE_KINDS)}, or of their indices"
+            )
+    count = kind.shape[0]
+
+    def on_device(name: str, value: Any, dtype: Any, default: Any) -> wp.array:
+        if value is None:
+            value = default
+        if isinstance(value, wp.array):
+            return check_array(name, value, dtype, (count,), device)
+        try:
+            width = wp.types.type_size(dtype)
+            shape = (count, width) if width > 1 else (count,)
+            rows = np.broadcast_to(np.asarray(value, np.uint64 if dtype == wp.uint64 else np.float64), shape)
+        except (TypeError, ValueError):
+            raise ArgumentError(f"{name} does not fit {count} shapes, [shapes] of {dtype.__name__}") from None
+        scalar = {wp.int32: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
+        return wp.array(rows.astype(scalar), dtype=dtype, device=device)
+
+    meshes = () if mesh is None or isinstance(mesh, wp.array) else tuple(m for m in mesh if isinstance(m, wp.Mesh))
+    if mesh is not None and not isinstance(mesh, wp.array):
+        mesh = [one.id if isinstance(one, wp.Mesh) else int(one or 0) for one in mesh]
+    table.kind = on_device("kind", kind, wp.int32, None)
+    table.size = on_device("size", size, wp.vec3, None)
+    table.body = on_device("body", body, wp.int32, -1)
+    table.local = on_device("local", local, wp.transform, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    table.mesh = on_device("mesh", mesh, wp.uint64, 0)
+    table.albedo = on_device("albedo", albedo, wp.float32, None)
+    table.first_face = on_device("first_face", first_face, wp.int32, -1)
+    if textures is not None:
+        check_struct("textures", textures, Textures)
+    table.textures = no_textures(device) if textures is None else textures
+    _check_shapes(table)
+    if world is None:
+        world = np.full(count, 0 if worlds == 1 else -1)
+    world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
+    if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
+        raise ArgumentError(f"world is not one of -1 to {worlds - 1} for each of {count} shapes")
+    seen = np.arange(count) if visible is None else np.flatnonzero(np.broadcast_to(visible, (count,)))
+    slot = np.where(world < 0, worlds, world)[seen]
+    table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
+    table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
+    table.pose = wp.clone(table.local)
+    return Shapes(table, worlds, device, meshes)
+
+
+def _check_shapes(table: ShapeTable) -> None:
+    kind, mesh = table.kind.numpy(), table.mesh.numpy()
+    if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
+        raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
+    without = np.flatnonzero((kind == MESH) & (mesh == 0))
+    if without.size:
+        raise ArgumentError(f"kind[{without[0]}] is a mesh and mesh[{without[0]}] = 0 is none")
+
+
+@wp.kernel(enable_backward=False)
+def _move_kernel(table: ShapeTable, body_q: wp.array(dtype=wp.transform)):
+    """Launch: table."""
+    k = wp.tid()
+    pose = table.local[k]
+    body = table.body[k]
+    if body >= 0:
+        pose = wp.transform_multiply(body_q[body], pose)
+    table.pose[k] = pose
+
+
+def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
+    """Carries the shapes to the poses of their bodies, on the device.
+
+    Args:
+        shapes: From `make_shapes`.
+        body_q: `wp.transform` `[bodies]`, in the worlds' frames; None where no shape is on a body.
+    """
+    if body_q is None:
+        body_q = wp.empty(0, dtype=wp.transform, device=shapes.device)
+    check_array("body_q", body_q, wp.transform, (None,), shapes.device)
+    wp.launch(_move_kernel, len(shapes), [shapes.table, body_q], device=shapes.device)
+
+
+@wp.struct
+class SceneHit:
+    """The nearest shape along a ray.
+
+    Attributes:
+        distance: [m]; -1 for none.
+        normal: Unit vector against the ray.
+        albedo: At this point.
+        shape: Its index; -1 for none.
+    """
+
+    distance: float
+    normal: wp.vec3
+    albedo: float
+    shape: int
+
+
+@wp.func
+def _albedo_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
+    albedo = table.albedo[k]
+    first = table.first_face[k]
+    if hit.face >= 0 and first >= 0:
+        row = first + hit.face
+        index = table.textures.face[row]
+        if index >= 0:
+            uv = hit.corner[0] * table.textures.coordinates[row, 0]
+            uv += hit.corner[1] * table.textures.coordinates[row, 1]
+            uv += (1.0 - hit.corner[0] - hit.corner[1]) * table.textures.coordinates[row, 2]
+            albedo *= texture_at(table.textures, index, uv)
+    return albedo
+
+
+@wp.func
+def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> SceneHit:
+    """The nearest shape of a world along the ray x + s u; every shape of the world is tried."""
+    nearest = ShapeHit()
+    nearest.distance = _FAR
+    nearest.face = -1
+    found = int(-1)
+    worlds = table.first.shape[0] - 2
+    for part in range(2):
+        slot = wp.where(part == 0, world, worlds)
+        for m in range(table.first[slot], table.first[slot + 1]):
+            k = table.member[m]
+            inverse = wp.transform_inverse(table.pose[k])
+            local_x = wp.transform_point(inverse, x)
+            local_u = wp.transform_vector(inverse, u)
+            hit = intersect_shape(table.kind[k], table.size[k], table.mesh[k], local_x, local_u, nearest.distance)
+            if hit.distance > 0.0 and hit.distance < nearest.distance:
+                nearest = hit
+                found = k
+    result = SceneHit()
+    result.distance = -1.0
+    result.shape = found
+    if found >= 0:
+        normal = wp.transform_vector(table.pose[found], nearest.normal)
+        result.distance = nearest.distance
+        result.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+        result.albedo = _albedo_at(table, found, nearest)
+    return result

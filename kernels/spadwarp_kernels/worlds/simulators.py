@@ -1,0 +1,189 @@
+"""Shapes and poses from Newton and from MuJoCo, on the simulator's own arrays.
+
+Nothing of either is imported before it is there: a model is read by its attributes.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
+
+from .closed_forms import SHAPE_KINDS
+from .shapes import Shapes, make_shapes
+
+wp.set_module_options({"enable_backward": False})
+
+GREEN = 1  # the colour that stands for the reflectance at 532 nm
+
+# mjtGeom, in MuJoCo's order.
+_MUJOCO_KINDS = ("plane", "mesh", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+_HEIGHT_FIELD, _MESH = 1, 7
+
+
+def srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Linear reflectance of a colour channel in [0, 1] (IEC 61966-2-1)."""
+    value = np.clip(value, 0.0, 1.0)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
+    """The visible shapes of a finalised `newton.Model`, in all its worlds.
+
+    Sizes, poses on bodies and meshes are the model's own arrays: what changes there is seen. Cameras are then updated
+    with `state.body_q`, and their poses are in the frame "opengl".
+
+    Args:
+        model: `newton.Model`.
+        albedo: A number, or one for each shape of the model; by default the green of `model.shape_color`.
+
+    Raises:
+        ArgumentError: A model without shapes.
+    """
+    from newton import GeoType, ShapeFlags
+
+    if not model.shape_count:
+        raise ArgumentError("model.shape_count = 0; a camera needs something to look at")
+    kinds = {getattr(GeoType, name.upper()): index for index, name in enumerate(SHAPE_KINDS)}
+    kinds |= {GeoType.CONVEX_MESH: kinds[GeoType.MESH], GeoType.HFIELD: kinds[GeoType.MESH]}
+    types = model.shape_type.numpy().tolist()
+    visible = (model.shape_flags.numpy() & int(ShapeFlags.VISIBLE)) != 0
+    visible &= np.array([kind in kinds for kind in types])  # neither empty nor made of Gaussians
+    if albedo is None:
+        albedo = srgb_to_linear(model.shape_color.numpy()[:, GREEN])
+    return make_shapes(
+        np.array([kinds.get(kind, 0) for kind in types]),
+        model.shape_scale,
+        body=model.shape_body,
+        local=model.shape_transform,
+        mesh=model.shape_source_ptr,
+        albedo=albedo,
+        world=model.shape_world.numpy(),
+        worlds=max(int(model.world_count), 1),
+        visible=visible,
+        device=model.device,
+    )
+
+
+def mujoco_shapes(
+    model: Any, worlds: int = 1, *, albedo: Any = None, groups: Any = (0, 1, 2), device: wp.DeviceLike = None
+) -> Shapes:
+    """The geoms of a `mujoco.MjModel`, in as many worlds as MuJoCo Warp simulates.
+
+    Cameras are updated with body poses that `write_poses` fills from `data.xpos` and `data.xquat` `[worlds, bodies]`,
+    and their poses, from `data.cam_xpos` and `data.cam_xmat`, are in the frame "opengl".
+
+    Args:
+        model: `mujoco.MjModel`, on the host.
+        worlds: `nworld` of the data.
+        albedo: A number, or one for each geom; by default the green of its material or of `geom_rgba`.
+        groups: Geom groups that are seen.
+        device: Where the arrays go.
+
+    Raises:
+        ArgumentError: A model without geoms.
+    """
+    worlds = check_integer("worlds", worlds, 1)
+    count = int(model.ngeom)
+    if not count:
+        raise ArgumentError("model.ngeom = 0; a camera needs something to look at")
+    kind = np.asarray(model.geom_type)
+    if kind.max() >= len(_MUJOCO_KINDS):
+        raise ArgumentError(f"model.geom_type holds {kind.max()}, which is not the type of a geom that can be seen")
+    size = np.array(model.geom_size, np.float32)
+    size[kind == 0] *= 2.0  # of a plane MuJoCo has half the width
+    size[(kind == _MESH) | (kind == _HEIGHT_FIELD)] = 1.0
+    meshes = {key: _mujoco_mesh(model, *key, device) for key in _mujoco_mesh_keys(model)}
+    mesh = [meshes.get((int(k), int(one))) for k, one in zip(kind, model.geom_dataid, strict=True)]
+    rgba = np.where(model.geom_matid[:, None] >= 0, model.mat_rgba[model.geom_matid], model.geom_rgba)
+    if model.nmat == 0:
+        rgba = np.asarray(model.geom_rgba)
+    albedo = np.broadcast_to(srgb_to_linear(rgba[:, GREEN]) if albedo is None else albedo, (count,))
+    quat = np.roll(np.asarray(model.geom_quat), -1, axis=1)
+    body = np.arange(worlds)[:, None] * int(model.nbody) + np.asarray(model.geom_bodyid)
+    return make_shapes(
+        np.tile([SHAPE_KINDS.index(_MUJOCO_KINDS[k]) for k in kind], worlds),
+        np.tile(size, (worlds, 1)),
+        body=body.ravel(),
+        local=np.tile(np.concatenate([model.geom_pos, quat], axis=1), (worlds, 1)),
+        mesh=mesh * worlds,
+        albedo=np.tile(albedo, worlds),
+        world=np.repeat(np.arange(worlds), count),
+        worlds=worlds,
+        visible=np.tile(np.isin(model.geom_group, list(groups)) & (rgba[:, 3] > 0.0), worlds),
+        device=device,
+    )
+
+
+def _mujoco_mesh_keys(model: Any) -> set[tuple[int, int]]:
+    """(type, index) of the meshes and height fields that geoms use."""
+    pairs = zip(model.geom_type, model.geom_dataid, strict=True)
+    return {(int(kind), int(one)) for kind, one in pairs if kind in (_MESH, _HEIGHT_FIELD)}
+
+
+def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp.Mesh:
+    if kind == _MESH:
+        first, count = model.mesh_vertadr[index], model.mesh_vertnum[index]
+        points = model.mesh_vert[first : first + count]
+        first, count = model.mesh_faceadr[index], model.mesh_facenum[index]
+        faces = model.mesh_face[first : first + count]
+    else:
+        rows, columns, first = model.hfield_nrow[index], model.hfield_ncol[index], model.hfield_adr[index]
+        half_x, half_y, top, _ = model.hfield_size[index]
+        x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+        z = top * model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+        points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        faces = np.stack(
+            [corner, corner + 1, corner + columns, corner + columns, corner + 1, corner + columns + 1], axis=1
+        )
+    points = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
+    return wp.Mesh(points, wp.array(np.asarray(faces, np.int32).ravel(), dtype=int, device=device))
+
+
+@wp.kernel(enable_backward=False)
+def _from_matrix_kernel(
+    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.mat33), out: wp.array2d(dtype=wp.transform)
+):
+    """Launch: (worlds, things)."""
+    w, k = wp.tid()
+    out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat_from_matrix(rotation[w, k])))
+
+
+@wp.kernel(enable_backward=False)
+def _from_quaternion_kernel(
+    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.quat), out: wp.array2d(dtype=wp.transform)
+):
+    """Launch: (worlds, things)."""
+    w, k = wp.tid()
+    q = rotation[w, k]
+    out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+
+
+def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
+    """Poses as `wp.transform` from MuJoCo's positions and rotations, on the device.
+
+    Args:
+        position: vec3 `[worlds]` or `[worlds, things]`: `data.xpos`, `data.cam_xpos`, or a column of it.
+        rotation: mat33 (`data.cam_xmat`), or quat in MuJoCo's order w, x, y, z (`data.xquat`), of the same shape.
+        out: `wp.transform`, as many in a row, the things of a world after each other.
+
+    Raises:
+        ArgumentError: Arrays that do not fit.
+    """
+    shape = (position.shape[0], 1) if position.ndim == 1 else position.shape
+    matrix = isinstance(rotation, wp.array) and wp.types.types_equal(rotation.dtype, wp.mat33)
+    check_array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)
+    check_array("out", out, wp.transform, (shape[0] * shape[1],), position.device, contiguous=True)
+    if position.ndim == 1:
+        position, rotation = _column(position), _column(rotation)
+    kernel = _from_matrix_kernel if matrix else _from_quaternion_kernel
+    wp.launch(kernel, shape, [position, rotation], [out.reshape(shape)], device=out.device)
+
+
+def _column(array: wp.array) -> wp.array:
+    """A view `[n, 1]` of an array `[n]`, which need not be contiguous."""
+    return wp.array(
+        ptr=array.ptr, dtype=array.dtype, shape=(array.shape[0], 1), strides=(array.strides[0], 0), device=array.device
+    )

@@ -1,0 +1,91 @@
+"""Rays against shapes in closed form: points lie on the surface, and nothing stands before them."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from spadwarp_kernels.worlds import SHAPE_KINDS, intersect_shape
+
+SIZE = (0.4, 0.7, 0.3)
+
+
+@wp.kernel(enable_backward=False)
+def trace(
+    kind: int,
+    size: wp.vec3,
+    x: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=float),
+    normal: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    hit = intersect_shape(kind, size, wp.uint64(0), x[i], u[i], 1.0e10)
+    distance[i] = hit.distance
+    normal[i] = hit.normal
+
+
+def inside(kind, p):
+    """How deep a point lies in a shape: positive inside, 0 on the surface (not a distance)."""
+    a, b, c = SIZE
+    x, y, z = np.moveaxis(p, -1, 0)
+    r = np.hypot(x, y)
+    if kind == "plane":
+        return np.where((abs(x) <= a / 2) & (abs(y) <= b / 2), -z, -1.0)
+    if kind == "sphere":
+        return a - np.sqrt(r**2 + z**2)
+    if kind == "capsule":
+        return a - np.hypot(r, np.maximum(abs(z) - b, 0.0))
+    if kind == "ellipsoid":
+        return 1.0 - np.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
+    if kind == "cylinder":
+        return np.minimum(a - r, b - abs(z))
+    if kind == "box":
+        return np.minimum(np.minimum(a - abs(x), b - abs(y)), c - abs(z))
+    return np.minimum(a * (b - z) / (2 * b) - r, z + b)  # cone
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHAPE_KINDS if kind not in ("mesh", "plane")])
+@pytest.mark.parametrize("start", ["outside", "inside"])
+def test_nearest_point_is_on_the_surface(kind, start, device):
+    rng = np.random.default_rng(5)
+    count = 4000
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    if start == "outside":
+        x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
+    else:
+        x = rng.uniform(-1, 1, (8 * count, 3)) * SIZE
+        x = x[inside(kind, x) > 1e-3][:count]
+    count = len(x)
+    x, u = x.astype(np.float32), u[:count].astype(np.float32)
+    distance = wp.empty(count, dtype=float, device=device)
+    normal = wp.empty(count, dtype=wp.vec3, device=device)
+    rays = [wp.array(one, dtype=wp.vec3, device=device) for one in (x, u)]
+    wp.launch(trace, count, [SHAPE_KINDS.index(kind), wp.vec3(*SIZE), *rays], [distance, normal], device=device)
+    s, n = distance.numpy(), normal.numpy()
+    hit = s > 0.0
+    assert hit.mean() > 0.2 if start == "outside" else hit.all()
+    assert np.abs(inside(kind, x[hit] + s[hit, None] * u[hit])).max() < 2e-5
+    # Nothing before it: 400 points of each ray up to the hit, or up to its end.
+    end = np.where(hit, s - 1e-3, 6.0)
+    steps = np.linspace(0.0, 1.0, 400)[1:-1, None, None] * end[:, None]
+    depth = inside(kind, x + steps * u)
+    assert ((depth < 2e-4) if start == "outside" else (depth > -2e-4)).all()
+    # The normal is the direction in which the depth changes most.
+    p, h = (x + s[:, None] * u)[hit].astype(np.float64), 1e-6
+    slope = np.stack([inside(kind, p + h * e) - inside(kind, p - h * e) for e in np.eye(3)], axis=-1)
+    slope /= np.linalg.norm(slope, axis=-1, keepdims=True)
+    assert np.quantile(1.0 - np.abs(np.sum(slope * n[hit], axis=-1)), 0.98) < 1e-3  # edges aside
+
+
+def test_plane_ends_at_its_width(device):
+    x = wp.array(
+        [(0.19, 0.34, 1.0), (0.21, 0.0, 1.0), (0.0, 0.36, 1.0), (0.0, 0.0, -1.0)], dtype=wp.vec3, device=device
+    )
+    u = wp.array([(0.0, 0.0, -1.0)] * 4, dtype=wp.vec3, device=device)
+    distance = wp.empty(4, dtype=float, device=device)
+    normal = wp.empty(4, dtype=wp.vec3, device=device)
+    wp.launch(trace, 4, [0, wp.vec3(*SIZE), x, u], [distance, normal], device=device)
+    assert distance.numpy().tolist() == [1.0, -1.0, -1.0, -1.0]
+    wp.launch(trace, 4, [0, wp.vec3(0.0), x, u], [distance, normal], device=device)
+    assert distance.numpy().tolist() == [1.0, 1.0, 1.0, -1.0]
