@@ -143,7 +143,7 @@ def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:
         raise ArgumentError(
             f"vary = {shown(text)} is not of the form section.field=from:to:count, with :log only for positive ends"
         ) from None
-    count = check_integer("number of values to vary", count, f"[1, {LONGEST}]")
+    count = check_integer("number of values to vary", count, f"[{1 if low == high else 2}, {LONGEST}]")
     steps = [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
     if info is not None and takes_integers(info):
         return field, list(dict.fromkeys(round(value) for value in steps))

@@ -143,6 +143,13 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
 class _Command(TyperCommand):
     """Refuses options that are not finite numbers, which `float` takes without a word."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ").removesuffix(".")  # of the parser's own making
+            raise
+
     def invoke(self, ctx: Any) -> Any:
         for param in self.params:
             value = ctx.params.get(param.name)

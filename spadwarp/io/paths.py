@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spadwarp.errors import FileError
+from spadwarp.io.examples import examples
 
 __all__ = ["check_apart", "existing_file", "file_problem", "file_within", "is_stream"]
 
@@ -27,7 +28,9 @@ def file_problem(path: str | os.PathLike[str]) -> str | None:
 def existing_file(path: str | Path) -> Path:
     """The path of a file that exists. Raises `FileError`, also for folders, pipes and names that no file can have."""
     if (problem := file_problem(path)) is not None:
-        raise FileError(f"{path}: {problem}")
+        scene = str(path) in examples("scenes")
+        hint = f"; `spadwarp simulate {path} --out DIR` makes a result of this scene" if scene else ""
+        raise FileError(f"{path}: {problem}{hint}")
     return Path(path)
 
 

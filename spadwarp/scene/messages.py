@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 
 from spadwarp.limits import Interval, shown, suggestion
 from spadwarp.scene.load import Key, key_text
+from spadwarp.scene.quantities import field_unit
 
 # What people write for a field's name, beyond misspellings.
 _SYNONYMS = {
@@ -140,7 +141,7 @@ def _literals(annotation: Any) -> Iterator[str]:
 
 
 def _interval(info: FieldInfo) -> str:
-    """The range of a numeric field, such as `(0, 1]`."""
+    """The range of a numeric field with its unit, such as `(0, 1e6] 1/m`."""
     interval = Interval(-math.inf, math.inf, False, False)
     for bound in _bounds(info):
         for name, includes in (("gt", False), ("ge", True)):
@@ -149,7 +150,8 @@ def _interval(info: FieldInfo) -> str:
         for name, includes in (("lt", False), ("le", True)):
             if getattr(bound, name, None) is not None:
                 interval = interval._replace(high=getattr(bound, name), includes_high=includes)
-    return str(interval)
+    unit = field_unit(info)
+    return str(interval) if unit in (None, "1") else f"{interval} {unit}"
 
 
 def _bounds(holder: Any) -> Iterator[Any]:

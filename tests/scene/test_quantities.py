@@ -158,7 +158,7 @@ def test_average_power_stays_where_the_rate_changes():
     [
         ({"pulse_energy": 1.0, "average_power": 2.0}, "laser needs one of pulse_energy, average_power, peak_power"),
         ({"peak_power": 1.0, "pulse_fwhm_ps": 0.0}, "laser.peak_power = 1.0 needs pulse_fwhm_ps > 0"),
-        ({"average_power": 0.0}, "laser.average_power = 0.0 is outside [1e-30, 1e15]"),
+        ({"average_power": 0.0}, "laser.average_power = 0.0 is outside [1e-30, 1e15] W"),
     ],
 )
 def test_one_energy_is_given(fields, words):

@@ -178,6 +178,7 @@ def test_overrides_that_name_no_field_are_refused(overrides):
         ("medium.albedo=1.5", "medium.albedo = 1.5 (an override) is outside [0, 1] and not 'lu2024'"),
         ("medium.albedo=none", "medium.albedo = 'none' (an override) is neither a number nor 'lu2024'"),
         ("transport.max_collisions=0", "transport.max_collisions = 0 (an override) is outside [1, 2147483647]"),
+        ("medium.extinction=-1", "medium.extinction = -1 (an override) is outside [1e-12, 1e6] 1/m"),
         ("transport.axis_threshold=0", "transport.axis_threshold = 0 (an override) is outside (0, 1]"),
         ("transport.max_path=inf", "transport.max_path = inf (an override) is outside (0, 1e12]"),
         ("transport.lateral_limit=nan", "transport.lateral_limit = nan (an override) is outside (0, inf]"),
