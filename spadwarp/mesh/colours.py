@@ -95,6 +95,8 @@ def read_coloured_mesh(
             if factor is not None:
                 shade, found = shade * decode(factor, False), True
             if image is not None and visual.uv is not None and len(visual.uv) == len(mesh.vertices):
+                if np.shape(visual.uv)[1:] != (2,) or not np.isfinite(visual.uv).all():
+                    raise MeshError(f"{name}: texture coordinates that are not two finite numbers for each vertex")
                 uv, found = visual.uv[mesh.faces], True
                 texture = places.setdefault(id(image), len(places))
                 if texture not in images:

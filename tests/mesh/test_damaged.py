@@ -65,6 +65,19 @@ def test_an_image_of_a_material_that_is_none(tmp_path):
         load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
 
 
+@pytest.mark.parametrize("coordinates", ["0", "nan 0", "0 inf", "0 0 0"])
+def test_texture_coordinates_are_two_finite_numbers(coordinates, tmp_path):
+    Image.new("RGB", (2, 2)).save(tmp_path / "box.png")
+    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt {coordinates}\nusemtl one\nf 1/1 2/1 3/1\n")
+    (tmp_path / "box.mtl").write_text("newmtl one\nmap_Kd box.png\n")
+    target = Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file")
+    if coordinates == "0 0 0":  # a third one is allowed by the format
+        assert load_target(target)
+        return
+    with pytest.raises(MeshError, match="texture coordinates"):
+        load_target(target)
+
+
 @pytest.fixture
 def glb():
     """Bytes of a textured box, and its header as a table with where the numbers begin."""
