@@ -6,6 +6,7 @@ years and "50 PS" as petasiemens, and makes 3.7500000000000005e-08 J of "37.5 nJ
 
 from __future__ import annotations
 
+import math
 import re
 from fractions import Fraction
 from math import pi
@@ -116,6 +117,8 @@ def quantity(text: str, unit: str) -> float:
     if found is None:
         raise ValueError(f"is not {kind}, such as {example!r}")
     number, given = found.groups()
+    if math.isinf(float(number)):
+        raise ValueError("is beyond the largest number, 1.8e308")
     if not given:
         raise ValueError(f"has no unit; write {number} without quotes for {unit}, or {example!r}")
     if given not in UNITS:

@@ -10,7 +10,7 @@ from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budg
 from spadwarp.analytic.pilot import Pilot
 from spadwarp.analytic.result import AnalyticResult, background_photons
 from spadwarp.analytic.simulate import simulate_analytic
-from spadwarp.analytic.sweeps import DepthErrorRow, Sweep, parse_vary, sweep
+from spadwarp.analytic.sweeps import DepthErrorRow, Sweep, parse_values, parse_vary, sweep
 
 __all__ = [
     "OUTLIERS",
@@ -29,6 +29,7 @@ __all__ = [
     "background_photons",
     "budget",
     "eye_limit",
+    "parse_values",
     "parse_vary",
     "permissible_exposure",
     "pixel_maps",

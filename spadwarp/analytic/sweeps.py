@@ -25,7 +25,7 @@ from spadwarp.scene.quantities import field_unit, takes_integers
 from spadwarp.transport import truth_maps
 from spadwarp.units import quantity
 
-__all__ = ["DepthErrorRow", "Sweep", "parse_vary", "sweep"]
+__all__ = ["DepthErrorRow", "Sweep", "parse_values", "parse_vary", "sweep"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,41 +113,53 @@ def sweep(
     return found
 
 
-def parse_vary(text: str, *, unit: str | None = None) -> tuple[str, list[Any]]:
+def parse_vary(text: str) -> tuple[str, list[Any]]:
     """Field and values of `field=from:to:count`, `field=from:to:count:log` or `field=a,b,c`; raises `ArgumentError`.
 
-    Values may have units, such as `laser.pulse_energy=1 nJ:1 µJ:7:log`, and become numbers of the field's own unit, or
-    of `unit`. Of a field of integers they are whole, each once.
+    Values may have units, such as `laser.pulse_energy=1 nJ:1 µJ:7:log`, and become numbers of the field's own unit. Of
+    a field of integers they are whole, each once.
     """
     field, equals, spec = (part.strip() for part in text.partition("="))
     if not field or not equals or not spec:
         raise ArgumentError(f"vary = {shown(text)} is not of the form section.field=from:to:count")
-    info = locate(Scene, parse_key(field))[1] if unit is None else None
-    unit = (field_unit(info) if info is not None else None) or unit
-    if ":" not in spec:
+    info = locate(Scene, parse_key(field))[1]
+    unit = field_unit(info) if info is not None else None
+    values = parse_values(spec, unit, name=f"vary: {field}")
+    if ":" in spec and info is not None and takes_integers(info):
+        values = list(dict.fromkeys(round(value) for value in values))
+    return field, values
+
+
+def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
+    """Values of `from:to:count`, `from:to:count:log` or `a,b,c`, of which those with units become numbers of `unit`.
+
+    Raises `ArgumentError`, which begins with `name`.
+    """
+    if ":" not in text:
         try:
-            values = parse_toml(f"values = [{spec}]")["values"]
+            values = parse_toml(f"values = [{text}]")["values"]
         except ConfigError:  # bare words
-            values = [parse_override(f"{field}={value}")[1] for value in spec.split(",")]
-        return field, [_number(value, unit, text) for value in values]
-    parts = spec.split(":")
+            values = [parse_override(f"a.b={value}")[1] if value.strip() else "" for value in text.split(",")]
+        if not values or "" in values:
+            raise ArgumentError(f"{name} = {shown(text)} lacks a value")
+        return [_number(value, unit, name) for value in values]
+    parts = text.split(":")
+    geometric = len(parts) == 4 and parts[3] == "log"
     try:
-        low, high = (float(_number(_bare(part), unit, text)) for part in parts[:2])
+        low, high = (float(_number(_bare(part), unit, name)) for part in parts[:2])
         count = parse_number(parts[2])
-        geometric = len(parts) == 4 and parts[3] == "log"
         if len(parts) > 3 + geometric or not math.isfinite(high - low) or (geometric and not min(low, high) > 0):
             raise ValueError
     except ArgumentError:
         raise
     except (ValueError, IndexError):
         raise ArgumentError(
-            f"vary = {shown(text)} is not of the form section.field=from:to:count, with :log only for positive ends"
+            f"{name} = {shown(text)} is not of the form from:to:count, with :log only for positive ends"
         ) from None
-    count = check_integer("number of values to vary", count, f"[{1 if low == high else 2}, {LONGEST}]")
-    steps = [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
-    if info is not None and takes_integers(info):
-        return field, list(dict.fromkeys(round(value) for value in steps))
-    return field, steps
+    whole = int(count) if float(count).is_integer() and abs(count) < 1e15 else count
+    fewest = 1 if low == high else 2
+    count = check_integer(f"{name} = {shown(text)}: the number of values", whole, f"[{fewest}, {LONGEST}]")
+    return [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
 
 
 def _bare(text: str) -> Any:
@@ -158,14 +170,14 @@ def _bare(text: str) -> Any:
         return text.strip()
 
 
-def _number(value: Any, unit: str | None, text: str) -> Any:
+def _number(value: Any, unit: str | None, name: str) -> Any:
     """A text that begins like a number as a number of the unit; all else as it is."""
     if unit is None or not isinstance(value, str) or not value.lstrip("+-.")[:1].isdigit():
         return value
     try:
         return quantity(value, unit)
     except ValueError as error:
-        raise ArgumentError(f"vary = {shown(text)}: {shown(value)} {error}") from None
+        raise ArgumentError(f"{name}: {shown(value)} {error}") from None
 
 
 def _central_row(scene: Scene, device: str | None) -> BudgetRow:

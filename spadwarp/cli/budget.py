@@ -13,6 +13,7 @@ from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
 from spadwarp.cli._tables import budget_table, table_notes
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import shown
 
 
 @app.command()
@@ -78,11 +79,11 @@ def budget(
 
 
 def _numbers(text: str | None) -> list[float] | None:
-    from spadwarp.analytic import parse_vary
+    from spadwarp.analytic import parse_values
 
     if text is None:
         return None
-    _, values = parse_vary(f"range={text}", unit="m")
+    values = parse_values(text, "m", name="--range")
     if not all(isinstance(value, (int, float)) for value in values):
-        raise ArgumentError(f"range = {text!r} is not of the form from:to:count or a,b,c")
+        raise ArgumentError(f"--range = {shown(text)} is not of the form from:to:count or a,b,c")
     return [float(value) for value in values]

@@ -148,5 +148,7 @@ def _lines(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
         lines[name] = (
             f"{100 * error.estimate_fraction:.3g} % of the target's pixels; error {1000 * error.median:.3g} mm in the "
             f"median, below {1000 * error.p90:.3g} mm in 90 %"
+            if error.estimate_fraction > 0.0
+            else "no pixel of the target has a depth"
         )
     return lines

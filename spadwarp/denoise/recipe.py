@@ -28,7 +28,7 @@ class _Table(BaseModel):
 
 def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
     if not limits[0] <= limits[1]:
-        raise ValueError(f"{list(limits)} is not (lowest, highest)")
+        raise ValueError("is not (lowest, highest)")
     return limits
 
 

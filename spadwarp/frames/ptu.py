@@ -52,6 +52,8 @@ def read_ptu(
             counts, text = _image(file, sum_frames), "pixels by the image in its header"
         else:
             counts, text = _scan(file, image_size)
+        if (channels := file.number_channels) > 1:
+            text += f"; {channels} channels, added up"
         return counts, width, _own_gate(file), text
 
 

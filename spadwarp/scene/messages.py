@@ -45,9 +45,11 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     """One line for each field that `error` complains about; `overrides` is the layer set from outside the file."""
     lines: dict[Key, str] = {}
     problems = error.errors(include_url=False)
-    for problem in problems[:_MOST]:
-        key, info = locate(model, problem["loc"])
-        lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
+    located = [(*locate(model, problem["loc"]), problem) for problem in problems[:_MOST]]
+    values = {key for key, _, problem in located if problem["type"] != "literal_error"}
+    for key, info, problem in located:
+        if problem["type"] != "literal_error" or key not in values:  # of a word or a value the value counts
+            lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
     return [*dict.fromkeys(lines.values()), *more]  # a list that is too short misses each item
 
@@ -60,7 +62,7 @@ def locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, Field
     for part in loc:
         if isinstance(part, int):
             key.append(part)
-        elif inner is not None:
+        elif inner is not None and not part.startswith(("literal[", "function-")):
             key.append(part)
             info = inner.model_fields.get(part)
             inner = next(_models(info.annotation), None) if info is not None else None

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_vary, simulate_analytic, sweep
+from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_values, parse_vary, simulate_analytic, sweep
 from spadwarp.analytic.photon_budget import budget
-from spadwarp.errors import ConfigError, SpadwarpWarning
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},
@@ -116,7 +116,7 @@ def test_what_to_vary(text, field, values):
     ["medium.extinction", "=1:2:3", "a.b=", "a.b=1:2", "a.b=1:2:3:4", "a.b=-1:2:3:log", "a.b=1:x:3"],
 )
 def test_what_cannot_be_varied(text):
-    with pytest.raises(ValueError, match=r"vary = .* is not of the form section.field"):
+    with pytest.raises(ValueError, match=r"vary.* is not of the form (section\.field=)?from:to:count"):
         parse_vary(text)
 
 
@@ -163,8 +163,14 @@ def test_a_sweep_follows_the_lidar_equation():
 
 @pytest.mark.parametrize("count", ["0", "1", "999999999", "1e30", "-1", "2.5"])
 def test_so_many_values_cannot_be_varied(count):
-    with pytest.raises(ValueError, match=r"number of values to vary = -?[\d.e+]+ is .*\[2, 10000\]"):
+    with pytest.raises(ValueError, match=r"a\.b = '1:2:.*': the number of values = -?[\d.e+]+ is .*\[2, 10000\]"):
         parse_vary(f"a.b=1:2:{count}")
+
+
+@pytest.mark.parametrize("text", ["1:5", "a,", "", ":", "1 s,2 s", "1:2:0", "1:inf:3", "1,,2"])
+def test_values_that_are_wrong_are_named_by_their_option(text):
+    with pytest.raises(ArgumentError, match=r"^--range"):
+        parse_values(text, "m", name="--range")
 
 
 def test_bad_requests_are_named():

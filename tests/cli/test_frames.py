@@ -37,6 +37,13 @@ def test_frames_are_those_of_detect(done, tmp_path):
     assert "Cramér–Rao" in printed.stdout and printed.stdout.count("% of the target's pixels") == 4
 
 
+def test_frames_without_a_detection(done, tmp_path):
+    options = ("--pulses", 1, "--method", "peak", *DEVICE, "--set", "detector.pdp=1e-9")
+    printed = run("detect", done, "--out", tmp_path / "out", *options, "--json", tmp_path / "printed.json")
+    assert "no pixel of the target has a depth" in printed.stdout and "nan" not in printed.stdout
+    assert tables(tmp_path / "printed.json")["depth"]["peak"]["median"] is None
+
+
 def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, monkeypatch):
     monkeypatch.setattr("spadwarp.frames.record._PART_BYTES", 1)
     run("detect", done, "--out", tmp_path, "--frames", 3, "--method", "peak", "--quiet", *DEVICE)

@@ -271,6 +271,7 @@ def test_a_folder_holds_one_recipe(tmp_path):
     [
         ({"model": "unet"}, "model"),
         ({"noise": {"backscatter": [0.5, 1.2]}}, r"noise.backscatter"),
+        ({"noise": {"backscatter": [0.5, 0.2]}}, r"noise.backscatter = \[0.5, 0.2\] is not \(lowest"),
         ({"noise": {"photons": [0.0, 3.0]}}, r"noise.photons"),
         ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
         ({"model": "histograms"}, r"noise.counting"),

@@ -2,6 +2,7 @@
 
 import struct
 
+import numpy as np
 import pytest
 
 pytest.importorskip("ptufile")
@@ -55,3 +56,13 @@ def test_images_that_are_too_large_are_refused(content, tag, tmp_path):
     (tmp_path / "frames.ptu").write_bytes(changed(content, tag, 10**9))
     with pytest.raises(spadwarp.SpadwarpError):
         read_histograms(tmp_path / "frames.ptu")
+
+
+def test_channels_are_added_up_and_named(tmp_path):
+    import ptufile
+
+    counts = np.random.default_rng(1).poisson(1.0, (4, 5, 3, 16)).astype(np.uint8)
+    ptufile.imwrite(tmp_path / "three.ptu", counts, global_resolution=50e-9, tcspc_resolution=1e-10)
+    read = read_histograms(tmp_path / "three.ptu", gate_start=0.0)
+    np.testing.assert_array_equal(read.values, counts.sum(2))
+    assert "3 channels, added up" in "; ".join(read.notes)

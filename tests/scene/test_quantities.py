@@ -46,6 +46,7 @@ def test_texts_become_numbers_correctly_rounded(text, unit, value):
         ("5 mj", "J", "did you mean '5 mJ' or '5 MJ'?"),
         ("20 mHz", "Hz", "did you mean '20 MHz'?"),
         ("5", "ns", "has no unit; write 5 without quotes for ns"),
+        ("1e400", "ns", "is beyond the largest number"),
         ("1,5 nJ", "J", "',5 nJ', which is not known"),
         ("nJ", "J", "is not an energy"),
         ("5 furlongs", "m", "'furlongs', which is not known"),
