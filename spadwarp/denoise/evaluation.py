@@ -30,7 +30,10 @@ _STAIRCASE = "staircase"
 
 
 class Sample(NamedTuple):
-    """One frame: true depth `[H, W]` [m], gate [m], depth by method `[H, W]` [m], and a caption."""
+    """One frame: true depth `[H, W]` [m], gate [m], depth by method `[H, W]` [m], and a caption.
+
+    NaN where no target is, or where the method says that none is: it gives it a probability below one half.
+    """
 
     clean: NDArray[np.float32]
     gate: tuple[float, float]
@@ -224,8 +227,8 @@ class _Comparison:
             if method == "bm3d" and count > self.bm3d_frames:
                 continue
             window, weights = self.windows.get(level, 5), self.weights.get(method)
-            found, _ = denoise_frames(noisy, model=method, window=window, weights=weights, device=self.device)
-            images[method] = found[0]
+            found, seen_by = denoise_frames(noisy, model=method, window=window, weights=weights, device=self.device)
+            images[method] = np.where(seen_by[0], found[0], np.float32(np.nan))
             self.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
             if target == _STAIRCASE:
                 steps = self.steps.get((method, level), Steps())

@@ -19,14 +19,16 @@ from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import weights_metadata
 from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.files import gate_of, holds_own_file, is_own_file, load, locate, stored_depth
+from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.estimators import Method
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.paths import existing_file
+from spadwarp.result import Result
 from spadwarp.scene.geometry import depth_from_time
+from spadwarp.transport import PhotonRecords
 from spadwarp.units import range_from_time
 from spadwarp.viz import draw_denoised
 
@@ -48,6 +50,7 @@ class DepthReading:
         profile: Backscatter over the gate, `[bins]`; None where the file does not give it.
         source: How the depth was obtained, as text.
         histograms: What the depth was estimated from, if these are counts whose instrument response is known.
+        truth: True depth of the first frame, `[H, W]` [m]; None where the file does not give it.
     """
 
     depth: NDArray[np.float32]
@@ -56,6 +59,7 @@ class DepthReading:
     profile: NDArray[np.float64] | None
     source: str
     histograms: Histograms | None = None
+    truth: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -154,7 +158,7 @@ def denoise_file(
     shown = found.masked(0.5 if mask is None else mask)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
     title = f"{Path(path).name}: {model}"
-    files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, title=title))
+    files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, title=title, truth=read.truth))
     return Denoised(
         depth=depth, target_probability=found.target_probability, confidence=found.confidence, gate=gate,
         files=tuple(files), notes=tuple(notes),
@@ -214,12 +218,15 @@ def read_depth(
         raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ArgumentError(f"scale = {scale} is outside (0, inf)")
+    truth = None
     if is_own_file(place):
         held = load(place)
-        own = stored_depth(held)
+        own, truth = stored_depth(held), _truth(held)
         if own is not None:
             frames = own.values.astype(np.float32)
-            return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is")
+            return DepthReading(
+                depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is", truth=truth
+            )
     stored = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if stored is not None:
         if stored.dtype.kind not in "iuf":
@@ -233,7 +240,17 @@ def read_depth(
         source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = read_histograms(place, **measured)
-    return _estimate_depth(histograms, method, group_index, device)
+    return dataclasses.replace(_estimate_depth(histograms, method, group_index, device), truth=truth)
+
+
+def _truth(held: Held) -> NDArray[np.float32] | None:
+    """True depth of the first frame, where one of our files has it."""
+    if isinstance(held, Result):
+        return held.truth.depth
+    if isinstance(held, PhotonRecords):
+        return None
+    depth = sequence(held).at(0).depth
+    return None if depth is None else depth.astype(np.float32)
 
 
 def _stored_depth(path: Path, channel: str | None, dataset: str | None, as_depth: bool) -> NDArray[Any] | None:

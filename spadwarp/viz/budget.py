@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator
+from numpy.typing import NDArray
 
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow
 from spadwarp.analytic.sweeps import Sweep
 from spadwarp.scene import Scene
-from spadwarp.viz.style import SERIES, new_figure, plain_axis, save
+from spadwarp.viz.style import PAGE, SERIES, columns_that_fit, log_axis, new_figure, paper, plain_axis, save, wrapped
 
 __all__ = ["draw_budget", "draw_sweep"]
 
@@ -39,14 +41,15 @@ _LABELS: dict[str, tuple[str, float]] = {
 }
 
 
-def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> Figure:
+@paper()
+def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, width: float = PAGE) -> Figure:
     """Four panels over range, a line for each water: signal, depth error, signal to backscatter, pulses for 1 cm.
 
     Where more than 1 % of the fits would be outliers, the bound is dashed: it is not reached. Returns the matplotlib
-    figure, and writes it where `path` is given.
+    figure of this width [inch], and writes it where `path` is given.
     """
     waters = list(dict.fromkeys(row.medium for row in rows))
-    figure, axes = _grid(len(_PANELS))
+    figure, axes = _grid(len(_PANELS), width)
     for number, name in enumerate(waters):
         own = [row for row in rows if row.medium == name]
         x = np.array([row.range for row in own])
@@ -54,57 +57,95 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None) -> Fi
             y = np.array([getattr(row, field) for row in own]) * scale
             y[~(np.isfinite(y) & (y > 0.01 * shown[0]) & (y < 100 * shown[1]))] = np.nan
             colour = SERIES[number % len(SERIES)]
-            label = f"{name} ({own[0].extinction:.3g}/m)"
             if field == "sigma_depth":
                 sure = np.array([row.outlier_probability <= OUTLIERS for row in own])
-                axis.plot(x, y, "--", color=colour, linewidth=1.0)
+                axis.plot(x, y, "--", color=colour, linewidth=0.8)
                 y = np.where(sure, y, np.nan)
-            axis.plot(x, y, "o-", color=colour, markersize=3.5, linewidth=1.6, label=label)
+            label = f"{name}, c = {own[0].extinction:.3g} 1/m"
+            axis.plot(x, y, "o-", color=colour, markevery=-(-len(x) // 12), label=label)
     for axis, (label, _, shown) in zip(axes, _PANELS.values(), strict=True):
-        axis.set(xlabel="range [m]", ylabel=label, xscale="log", yscale="log")
+        axis.set(xlabel="range [m]", ylabel=wrapped(label, 1.5), yscale="log")
         low, high = axis.get_ylim()
         low, high = max(low, shown[0]), min(high, shown[1])
-        axis.set(yscale="log" if high > 20 * low else "linear", ylim=(low, high))
-        _plain_range_ticks(axis, [row.range for row in rows])
-    axes[1].axhline(TOLERANCE * 1e3, color="0.5", linewidth=0.8, linestyle=":")
+        axis.set(
+            yscale="log" if high > 20 * low else "linear", ylim=(low, high) if high > 20 * low else (0, 1.05 * high)
+        )
+        if high > 20 * low:
+            log_axis(axis, "y")
+        else:
+            axis.yaxis.minorticks_on()
+        _range_ticks(axis, [row.range for row in rows])
+    axes[1].axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)), frameon=False, fontsize=9)
+    if any(row.outlier_probability > OUTLIERS for row in rows):
+        handles.append(Line2D([], [], color="0.4", linestyle="--", linewidth=0.8))
+        labels.append(f"not reached: over {100 * OUTLIERS:g} % false peaks")
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns_that_fit(len(labels), width, 2.3))
     if path is not None:
         save(figure, path)
     return figure
 
 
-def draw_sweep(curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None) -> Figure:
+@paper()
+def draw_sweep(
+    curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None, width: float = PAGE
+) -> Figure:
     """One panel for each column over the values of the swept field; returns the matplotlib figure, writes it to `path`.
 
-    `columns`: attributes of the rows; default: what matters most.
+    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel.
+
+    Args:
+        curves: From `spadwarp.sweep`.
+        path: The picture.
+        columns: Attributes of the rows; default: what matters most.
+        width: Of the figure [inch].
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
     names = list(columns or (_PANELS if budgets else _ERROR_PANELS))
-    figure, axes = _grid(len(names))
+    figure, axes = _grid(len(names), width)
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
-    x: Any = np.array(curves.values, np.float64) if numeric else [str(value) for value in curves.values]
+    x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
     for number, (axis, name) in enumerate(zip(axes, names, strict=False)):
         label, scale = _LABELS.get(name, (name, 1.0))
-        y = curves.column(name) * scale
-        positive = y[np.isfinite(y) & (y > 0)]
-        axis.plot(
-            x, np.where(np.isfinite(y), y, np.nan), "o-", color=SERIES[number % 5], markersize=3.5, label="median"
-        )
+        y, colour = curves.column(name) * scale, SERIES[number % 5]
+        axis.plot(x, np.where(np.isfinite(y), y, np.nan), "o-", color=colour, label="median")
         if name == "sigma_depth" and not budgets:
             p90 = curves.column("sigma_depth_p90") * scale
-            axis.plot(x, p90, "--", color=SERIES[number % 5], linewidth=1.0, label="90 % of the pixels below")
-            axis.legend(frameon=False, fontsize=9)
-        axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=label)
-        if name in ("outlier_probability", "estimate_fraction"):
-            axis.set_ylim(-0.03, 1.03)
-        elif positive.size and positive.max() > 20 * positive.min():
-            axis.set_yscale("log")
-        if numeric and x.min() > 0 and x.max() > 30 * x.min():
-            axis.set_xscale("log")
+            axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
+            axis.legend()
+        axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=wrapped(label, 1.5))
+        _value_axis(axis, y, probability=name in ("outlier_probability", "estimate_fraction"))
+        if not numeric:
+            space = 0.95 * axis.get_position().width * width / len(x)
+            # Names of presets break at any hyphen.
+            texts = [wrapped(str(value).replace("-", "- "), space, size=7) for value in curves.values]
+            axis.set_xticks(x, [text.replace("- ", "-") for text in texts])
+            axis.set_xlim(-0.5, len(x) - 0.5)
+        elif x.min() > 0 and x.max() > 30 * x.min():
+            log_axis(axis, "x")
+        else:
+            axis.xaxis.minorticks_on()
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool) -> None:
+    """From 0 to 1, or logarithmic over more than a factor of 20, else from 0."""
+    known = y[np.isfinite(y)]
+    positive = known[known > 0]
+    if not probability and positive.size and positive.max() > 20 * positive.min():
+        log_axis(axis, "y")
+        return
+    if probability:
+        axis.set_ylim(-0.03, 1.03)
+    elif known.size:
+        axis.set_ylim(min(0.0, 1.1 * known.min()), 1.1 * known.max() or 1.0)
+        span = np.ptp(known) / max(np.abs(known).max(), 1e-300)
+        if 1e-6 < span < 0.1:
+            text = f"{known.min():.4g} to {known.max():.4g}: a span of {100 * span:.2g} %"
+            axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize="small", color="0.35")
+    axis.yaxis.minorticks_on()
 
 
 def _unit(field: str) -> str:
@@ -116,10 +157,11 @@ def _unit(field: str) -> str:
     return found.group(0) if found else ""
 
 
-def _grid(panels: int) -> tuple[Figure, list[Axes]]:
-    columns = 2 if panels in (2, 4) else min(panels, 3)
+def _grid(panels: int, width: float) -> tuple[Figure, list[Axes]]:
+    columns = columns_that_fit(panels, width, 2.3)
     lines = math.ceil(panels / columns)
-    figure = new_figure(4.6 * columns, 3.3 * lines + 0.4)
+    columns = math.ceil(panels / lines)
+    figure = new_figure(width, 2.1 * lines + 0.5)
     axes = list(np.ravel(figure.subplots(lines, columns)))
     for axis in axes[panels:]:
         axis.remove()
@@ -128,13 +170,14 @@ def _grid(panels: int) -> tuple[Figure, list[Axes]]:
     return figure, axes[:panels]
 
 
-def _plain_range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
+def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
+    """The ranges themselves where they are few, else 1, 2 and 5 times the powers of ten."""
     low, high = min(ranges), max(ranges)
     ticks = sorted(set(ranges))
     if len(ticks) > 6:
         ticks = [m * 10.0**e for e in range(-2, 4) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
     if len(ticks) > 1:
         axis.set_xlim(low * (low / high) ** 0.05, high * (high / low) ** 0.05)  # also where nothing comes back
+        log_axis(axis, "x")
         axis.xaxis.set_major_locator(FixedLocator(ticks))
-        axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

@@ -14,43 +14,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.viz.panels import mark_pixels
 from spadwarp.viz.style import (
     BLUE,
     DEPTH_MAP,
     GREEN,
     ORANGE,
+    PAGE,
     PURPLE,
     RED,
     SKY,
     colour_map,
+    columns_that_fit,
+    log_axis,
     new_figure,
+    paper,
     plain_axis,
     save,
+    wrapped,
 )
 
-__all__ = ["COLOURS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_reliability", "draw_samples"]
+__all__ = ["METHODS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_reliability", "draw_samples"]
 __all__ += ["draw_scores"]
 
-_METHODS = {
-    "input": ("noisy input", "0.55"),
-    "median": ("median, best window", ORANGE),
-    "gating": ("backscatter gating", SKY),
-    "bm3d": ("BM3D", PURPLE),
-    "usdn": ("USDN", GREEN),
-    "dncnn": ("DnCNN", RED),
-    "pyramid": ("PyramidNet", BLUE),
-    "histograms": ("PyramidNet, histograms", "black"),
-    "likelihood": ("likelihood of each pixel", "0.4"),
-    "pooled": ("pooled likelihood", "0.5"),
-    "semi-global": ("semi-global matching", "0.6"),
-    "total-variation": ("total variation", "0.7"),
+METHODS = {
+    "input": ("noisy input", "0.5", "x", "--"),
+    "median": ("median, best window", ORANGE, "s", "-."),
+    "gating": ("backscatter gating", SKY, "v", "-"),
+    "bm3d": ("BM3D", PURPLE, "D", "-"),
+    "usdn": ("USDN", GREEN, "^", "-"),
+    "dncnn": ("DnCNN", RED, "P", "-"),
+    "pyramid": ("PyramidNet", BLUE, "o", "-"),
+    "histograms": ("PyramidNet, histograms", "black", "*", "-"),
+    "likelihood": ("likelihood of each pixel", "0.35", "+", ":"),
+    "pooled": ("pooled likelihood", "#882255", "<", "-"),
+    "semi-global": ("semi-global matching", "#999933", ">", "-"),
+    "total-variation": ("total variation", "#332288", "h", "-."),
 }
+"""Title, colour, marker and line of each method: Okabe and Ito's colours, then some of Paul Tol's muted ones."""
 
-TITLES = {method: title for method, (title, _) in _METHODS.items()}
+TITLES = {method: title for method, (title, *_) in METHODS.items()}
 """Names of methods in tables and figures."""
-
-COLOURS = {method: colour for method, (_, colour) in _METHODS.items()}
-"""Colours of methods in figures."""
 
 SCORES = {
     "psnr": ("PSNR [dB]", "{:.2f}"),
@@ -66,6 +70,7 @@ SCORES = {
 Sample = tuple[NDArray[np.float32], tuple[float, float], Mapping[str, NDArray[np.float32]], str]
 
 
+@paper()
 def draw_scores(
     scores: Mapping[tuple[str, str, str], Mapping[str, float]],
     path: str | Path,
@@ -74,18 +79,21 @@ def draw_scores(
     targets: Sequence[str],
     levels: Sequence[str],
     note: str,
+    width: float = PAGE,
 ) -> Path:
-    """Scores against the level, target by target; `note` is written below. Returns the path."""
+    """Scores against the level, target by target; `note` is written below. Returns the path.
+
+    `width`: of the picture [inch], more where there are too many targets for it.
+    """
     fields = ("psnr", "ssim", "entropy", "rmse_mm")
-    width = max(3.1 * len(targets) + 1.0, 5.2)
-    figure = new_figure(width, 2.3 * len(fields) + 0.9)
+    width = max(width, 1.3 * len(targets) + 0.6)
+    in_line = columns_that_fit(len(methods), width, 1.75)
+    figure = new_figure(width, 1.45 * len(fields) + 1.0 + 0.15 * (len(methods) // in_line))
     axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
     counted = any("photons" in level for level in levels)
     places = [float(k) for k in range(len(levels))] if counted else [float(level) for level in levels]
     labels = [level.removesuffix(" photons") if counted else level.lstrip("0") for level in levels]
-    for axis, field in zip(axes[:, 0], fields, strict=True):
-        axis.set_ylabel(SCORES[field][0])
-        axis.set_yscale("log" if field == "rmse_mm" else "linear")
+    every = -(-len(labels) // max(2, int((width - 0.6) / len(targets) / 0.4)))
     lines: dict[str, Any] = {}
     for column, target in enumerate(targets):
         for axis, field in zip(axes[:, column], fields, strict=True):
@@ -99,15 +107,19 @@ def draw_scores(
                     bold = method == "pyramid"
                     (lines[method],) = axis.plot(*zip(*points, strict=True), **_line(method, bold), zorder=2 + bold)
             plain_axis(axis)
-        axes[0, column].set_title(target.replace("_", " "), fontsize=11)
-        axes[-1, column].set_xticks(places, labels, fontsize=8)
-        axes[-1, column].set_xlabel("signal photons per pixel" if counted else "backscatter fraction")
+        axes[0, column].set_title(target.replace("_", " "))
+        axes[-1, column].set_xticks(places[::every], labels[::every])
+        axes[-1, column].set_xlabel(wrapped("signal photons per pixel" if counted else "backscatter fraction", 1.25))
+    for axis, field in zip(axes[:, 0], fields, strict=True):
+        axis.set_ylabel(SCORES[field][0])
+        if field == "rmse_mm":
+            log_axis(axis, "y")
     names = [TITLES[name] for name in lines]
-    columns = min(len(names), int(width / 1.7))  # 1.7 inches hold the longest name and its line
-    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
-    return save(figure, path, note=note, dpi=130)
+    figure.legend(list(lines.values()), names, loc="outside upper center", ncols=in_line)
+    return save(figure, path, note=note)
 
 
+@paper()
 def draw_samples(
     samples: Sequence[Sample],
     path: str | Path,
@@ -116,59 +128,82 @@ def draw_samples(
     note: str,
     rescaled: bool = False,
     enlarged: bool = False,
+    width: float = PAGE,
 ) -> Path:
     """A row for each sample: truth, then the methods. Returns the path.
 
+    Grey: neither the truth nor the method sees a target. Black: a target is missed. Red: a target is invented.
     `rescaled`: colours over the depth of the target, not over the gate. `enlarged`: only the part with most edges.
+    `width`: of the picture [inch], more where there are too many methods for it.
     """
     methods = [name for name in methods if any(name in images for _, _, images, _ in samples)]
     columns = 1 + len(methods)
-    height, width = samples[0][0].shape
-    ratio = 1.0 if enlarged else height / width
-    figure = new_figure(2.05 * columns + 0.7, (2.05 * ratio + 0.34) * len(samples) + 0.5)
+    cell = max((width - 0.5) / columns, 0.8)
+    height, across = samples[0][0].shape
+    ratio = 1.0 if enlarged else height / across
+    figure = new_figure(cell * columns + 0.5, (cell * ratio + 0.28) * len(samples) + 0.75)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)  # type: ignore[call-arg,union-attr]
     axes = figure.subplots(len(samples), columns, squeeze=False)
     for axis, title in zip(axes[0], ["truth", *(TITLES[name] for name in methods)], strict=True):
-        axis.set_title(title, fontsize=9)
+        axis.set_title(wrapped(title, cell - 0.05, size=7), fontsize=7)
     for row, (clean, gate, images, caption) in zip(axes, samples, strict=True):
         part = _detail(clean, gate) if enlarged else (slice(None), slice(None))
         low, high = _limits(clean[part], gate) if rescaled else gate
+        target = np.isfinite(clean) & (clean < gate[1])
         for axis, (name, image) in zip(row, [("truth", clean), *((n, images.get(n)) for n in methods)], strict=True):
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_color("0.8")
             if image is None:
                 axis.text(0.5, 0.5, "not run", ha="center", va="center", color="0.5", transform=axis.transAxes)
                 continue
-            visible = np.where(np.isfinite(clean) | (name == "input"), image, np.nan)[part]
-            drawn = axis.imshow(visible, cmap=colour_map(DEPTH_MAP), vmin=low, vmax=high, interpolation="nearest")
+            shown = np.where(target, image, np.nan)[part]
+            drawn = axis.imshow(shown, cmap=colour_map(DEPTH_MAP), vmin=low, vmax=high)
+            found = np.isfinite(image)
+            if name != "truth":
+                mark_pixels(axis, (target & ~found)[part], (found & ~target)[part])
         bar = figure.colorbar(drawn, ax=list(row), fraction=0.02, pad=0.01)
-        bar.set_label("depth z [m]", fontsize=8)
-        bar.ax.tick_params(labelsize=7)
+        bar.set_label("depth z [m]", fontsize=7)
+        bar.ax.locator_params(axis="y", nbins=4)
+        bar.ax.tick_params(labelsize=6)
         bar.outline.set_visible(False)
-        text = row[0].text(0.0, -0.04, caption, fontsize=7.5, va="top", transform=row[0].transAxes)
+        text = row[0].text(0.0, -0.04, caption, fontsize=6.5, va="top", transform=row[0].transAxes)
         text.set_in_layout(False)  # may extend below the other images
-    figure.get_layout_engine().set(hspace=0.1)  # type: ignore[call-arg,union-attr]
-    return save(figure, path, note=f"grey: no target; {note}", dpi=130)
+    return save(figure, path, note=f"grey: no target; black: target missed; red: target invented; {note}")
 
 
+@paper()
 def draw_ranking(
-    means: Mapping[str, Mapping[str, float]], path: str | Path, *, larger_is_better: Mapping[str, bool], note: str
+    means: Mapping[str, Mapping[str, float]],
+    path: str | Path,
+    *,
+    larger_is_better: Mapping[str, bool],
+    note: str,
+    width: float = PAGE,
 ) -> Path:
-    """Mean scores `{method: {field: value}}` as bars, the first method on top. Returns the path."""
+    """Mean scores `{method: {field: value}}` as bars, the first method on top. Returns the path.
+
+    `width`: of the picture [inch].
+    """
     fields = ("psnr", "ssim", "rmse_mm", "edge_mm")
     order = list(means)[::-1]
-    figure = new_figure(12.0, 0.42 * len(order) + 1.5)
-    for axis, field in zip(figure.subplots(1, len(fields), sharey=True), fields, strict=True):
+    columns = columns_that_fit(len(fields), width, 1.6)
+    lines = len(fields) // columns
+    figure = new_figure(width, lines * (0.24 * len(order) + 0.65) + 0.45)
+    for axis, field in zip(figure.subplots(lines, columns, sharey=True).ravel(), fields, strict=True):
         values = [means[method][field] for method in order]
-        axis.barh(range(len(order)), values, color=[COLOURS[method] for method in order], height=0.7)
+        axis.barh(range(len(order)), values, color=[METHODS[method][1] for method in order], height=0.7)
         for y, value in enumerate(values):
-            axis.text(value, y, " " + SCORES[field][1].format(value), va="center", fontsize=8)
+            axis.text(value, y, " " + SCORES[field][1].format(value), va="center", fontsize=6.5)
         axis.set_yticks(range(len(order)), [TITLES[method] for method in order])
-        axis.set_xlim(0, 1.25 * max(values))
-        axis.set_xlabel(SCORES[field][0] + (" (more is better)" if larger_is_better[field] else " (less is better)"))
+        axis.set_xlim(0, 1.45 * max(values))
+        axis.locator_params(axis="x", nbins=3)
+        better = "more is better" if larger_is_better[field] else "less is better"
+        axis.set_xlabel(f"{SCORES[field][0]}\n({better})")
         axis.spines[["top", "right"]].set_visible(False)
-    return save(figure, path, note=note, dpi=130)
+    return save(figure, path, note=note)
 
 
+@paper()
 def draw_photon_sweep(
     rmse: Mapping[str, NDArray[np.float64]],
     bound: NDArray[np.float64],
@@ -177,45 +212,68 @@ def draw_photon_sweep(
     photons: Sequence[float],
     sbr: Sequence[float],
     note: str,
+    width: float = PAGE,
 ) -> Path:
     """RMSE [m] by method `[S, P]` against signal photons `[P]`, beside the Cramér–Rao bound `[S, P]` [m].
 
-    One panel for each signal-to-background ratio (SBR), `[S]`. Returns the path.
+    One panel for each signal-to-background ratio (SBR), `[S]`. `width`: of the picture [inch]. Returns the path.
     """
-    columns = len(sbr)
-    figure = new_figure(3.3 * columns + 0.4, 3.9)
-    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
-    for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=True)):
+    columns = columns_that_fit(len(sbr), width, 1.6)
+    lines = -(-len(sbr) // columns)
+    in_line = columns_that_fit(len(rmse) + 1, width, 1.75)
+    figure = new_figure(width, 2.3 * lines + 0.7 + 0.14 * (len(rmse) // in_line))
+    axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=False)):
         for name, values in rmse.items():
             label = "likelihood of each pixel" if name == "input" else TITLES[name]
             axis.plot(photons, 1e3 * values[row], label=label, **_line(name, name == "histograms"))
         axis.plot(photons, 1e3 * bound[row], color="black", linestyle=":", label="Cramér–Rao bound of a pixel")
-        axis.set(xscale="log", yscale="log", xlabel="signal photons per pixel", title=f"SBR {ratio:g}")
-        plain_axis(axis, grid="both")
-    axes[0].set_ylabel("RMSE of depth [mm]")
+        axis.set(xscale="log", yscale="log", title=f"signal to background {ratio:g}")
+        if row % columns == 0:
+            axis.set_ylabel("RMSE of depth [mm]")
+        if row >= len(sbr) - columns:
+            axis.set_xlabel("signal photons per pixel")
+            axis.tick_params(labelbottom=True)
+        plain_axis(axis)
+    for axis in axes[len(sbr) :]:
+        axis.remove()
+    for axis in axes[: len(sbr)]:
+        log_axis(axis, "x", most=4)
+        log_axis(axis, "y")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5)
+    figure.legend(handles, labels, loc="outside upper center", ncols=in_line)
     return save(figure, path, note=note)
 
 
-def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: str | Path, *, note: str) -> Path:
+@paper()
+def draw_reliability(
+    tables: Mapping[tuple[str, str], NDArray[np.int64]], path: str | Path, *, note: str, width: float = PAGE
+) -> Path:
     """How often it was true, against the probability that was given, by tenths; returns the path.
 
-    `tables`: by method and what the probability is of, pixels and those of which it was true, `[10, 2]`.
+    `tables`: by method and what the probability is of, pixels and those of which it was true, `[10, 2]`. A bar is the
+    standard error of a part of so many pixels, taken as independent. `width`: of the picture [inch].
     """
-    figure = new_figure(9.0, 3.9)
-    axes = figure.subplots(1, 2, sharey=True)
+    columns = columns_that_fit(2, width, 2.8)
+    figure = new_figure(width, 3.3 if columns == 2 else 5.6)
+    axes = figure.subplots(2 // columns, columns, sharex=True, sharey=True).ravel()
     kinds = {"target": "the pixel sees a target", "confidence": "its depth is right to 1 % of the gate"}
     for axis, (kind, title) in zip(axes, kinds.items(), strict=True):
-        axis.plot([0, 1], [0, 1], color="0.7", linestyle=":")
+        axis.plot([0, 1], [0, 1], color="0.7", linestyle=":", label="exactly right")
         for (method, of), table in tables.items():
             if of == kind:
                 some = table[:, 0] >= 20
                 middle, part = (np.arange(10) + 0.5) / 10, table[:, 1] / np.maximum(table[:, 0], 1)
-                axis.plot(middle[some], part[some], **_line(method, True))
-        axis.set(xlabel="probability given", title=title, xlim=(0, 1), ylim=(0, 1))
+                error = np.sqrt(part * (1 - part) / np.maximum(table[:, 0], 1))
+                line = {**_line(method, True), "markersize": 3.0}
+                axis.errorbar(middle[some], part[some], yerr=error[some], label=TITLES[method], **line)
+        axis.set(title=title, xlim=(0, 1), ylim=(0, 1), ylabel="part of the pixels of which it is true")
+        axis.minorticks_on()
+        axis.legend(loc="upper left")
         plain_axis(axis)
-    axes[0].set_ylabel("part of the pixels of which it is true")
+        axis.label_outer()
+    axes[-1].set_xlabel("probability given")
+    axes[0].set_xlabel("probability given" if columns == 2 else "")
     return save(figure, path, note=note)
 
 
@@ -223,8 +281,8 @@ def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: 
 
 
 def _line(method: str, bold: bool) -> dict[str, Any]:
-    line = {"linewidth": 2.2 if bold else 1.2, "linestyle": "--" if method == "input" else "-"}
-    return {"color": COLOURS[method], "marker": "o", "markersize": 3.5, **line}
+    _, colour, marker, line = METHODS[method]
+    return {"color": colour, "marker": marker, "linestyle": line, "linewidth": 1.8 if bold else 1.0}
 
 
 def _limits(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[float, float]:

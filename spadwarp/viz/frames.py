@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from spadwarp.frames import first_photon_probabilities
 from spadwarp.viz.panels import Panels, arrival_line, median_pixel, shown_limits, target_limits
-from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PROBABILITY_MAP, save, spaced
+from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, PROBABILITY_MAP, paper, save, spaced
 
 if TYPE_CHECKING:
     from spadwarp.analytic import AnalyticResult
@@ -22,19 +23,22 @@ if TYPE_CHECKING:
 __all__ = ["analytic_figure", "draw_analytic", "draw_recording"]
 
 
-def draw_recording(recording: Recording, result: Result, path: str | Path) -> Path:
+@paper()
+def draw_recording(recording: Recording, result: Result, path: str | Path, *, width: float = PAGE) -> Path:
     """The first frame: depth by the last estimator, its error, the bound, counts; one pixel's counts over time.
 
-    `result` is what the frames were drawn from. Returns the path.
+    `result` is what the frames were drawn from; `width` [inch]. Returns the path.
     """
     truth, first = result.truth.depth, recording.first
     method, frame = list(recording.depth.items())[-1]
-    panels = Panels(truth.shape, 4, below=2.6)
+    panels = Panels(truth.shape, 4, width=width, below=2.0)
     panels.show_depth(frame, f"Depth ({method})", target_limits(truth, frame))
-    panels.show_error(1e3 * (frame - truth), "Depth − truth", "error [mm]", percentile=95.0)
-    panels.show_positive(1e3 * recording.bound_depth, "Cramér–Rao bound", "standard deviation of depth [mm]")
+    panels.show_error(frame - truth, "Depth − truth")
+    panels.show_positive(1e3 * recording.bound_depth, "Cramér–Rao bound", "standard deviation [mm]")
     panels.show_intensity(first.intensity[0], "Intensity", "counts in a frame")
     _plot_counts(recording, result, panels.below())
+    columns = 4 if width > 5 else 2
+    panels.figure.legend(*panels.figure.axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     mode = result.scene.detector.mode.replace("_", "-")
     panels.caption(f"frame {first.first_frame}: {spaced(first.pulses)} pulses, {mode}; seed {first.seed}")
     return save(panels.figure, path)
@@ -51,16 +55,17 @@ def _plot_counts(recording: Recording, result: Result, axis: Axes) -> None:
     with_dead_time = detector.mode == "free_running" and detector.dead_time_ns > 0
     label = "expected without dead time" if with_dead_time else "expected"
     axis.stairs(counts, edges, fill=True, color="0.72", label="counts of the frame")
-    axis.stairs(expected, edges, baseline=None, color=BLUE, linewidth=1.4, label=label)
-    axis.stairs(background, edges, baseline=None, color=GREEN, linewidth=1.0, label="background part")
+    axis.stairs(expected, edges, baseline=None, color=BLUE, linewidth=1.0, label=label)
+    axis.stairs(background, edges, baseline=None, color=GREEN, linewidth=0.8, label="background part")
     arrival_line(axis, result, row, column, edges)
     top = float(max(counts.max(), expected.max(), 1.0))
     if top > 50 * max(float(np.median(expected)), 0.02):
         axis.set_yscale("symlog", linthresh=1.0)
         axis.set_yticks([0] + [10**e for e in range(int(np.log10(top)) + 1)])
+        axis.yaxis.set_minor_locator(SymmetricalLogLocator(base=10, linthresh=1.0, subs=range(2, 10)))
     axis.set(xlim=edges[[0, -1]], ylim=(0, 1.3 * top), xlabel="time of flight [ns]", ylabel="counts per bin")
-    axis.set_title(f"Pixel in row {row}, column {column}", fontsize=10)
-    axis.legend(frameon=False, fontsize=8, ncols=4)
+    axis.xaxis.minorticks_on()
+    axis.set_title(f"Pixel in row {row}, column {column}")
 
 
 def _mean_counts(
@@ -74,12 +79,13 @@ def _mean_counts(
     return mean, share * mean
 
 
-def draw_analytic(result: AnalyticResult, path: str | Path) -> Path:
-    """Maps of the model and a frame, its first one or one that is drawn now; returns the path."""
-    return save(analytic_figure(result), path)
+def draw_analytic(result: AnalyticResult, path: str | Path, *, width: float = PAGE) -> Path:
+    """Maps of the model and a frame, its first one or one that is drawn now; `width` [inch]; returns the path."""
+    return save(analytic_figure(result, width), path)
 
 
-def analytic_figure(result: AnalyticResult) -> Figure:
+@paper()
+def analytic_figure(result: AnalyticResult, width: float = PAGE) -> Figure:
     """The figure of `draw_analytic`."""
     if len(result.depth):
         frame, labels = result.depth[0], result.labels[0]
@@ -89,10 +95,12 @@ def analytic_figure(result: AnalyticResult) -> Figure:
     seen = result.fisher > 0
     limits = shown_limits(truth[seen] if seen.any() else truth, margin=0.05)
     outliers = f", {labels.sum()} outliers" if labels.any() else ""
-    panels = Panels(truth.shape, 3, lines=2)
+    panels = Panels(truth.shape, 6, width=width)
     panels.show_positive(result.signal, "Signal S", "detections per pulse", INTENSITY_MAP)
-    panels.show_positive(1e3 * result.sigma_depth, "Cramér–Rao bound σ*", "standard deviation of depth [mm]")
-    panels.show_positive(result.signal_to_backscatter, "Signal to backscatter", "ratio", INTENSITY_MAP)
+    panels.show_positive(1e3 * result.sigma_depth, "Cramér–Rao bound σ*", "standard deviation [mm]")
+    panels.show_positive(
+        result.signal_to_backscatter, "Signal to backscatter", "signal over backscatter", INTENSITY_MAP
+    )
     false_peak = np.where(np.isnan(truth), np.nan, result.outlier_probability)
     panels.show(false_peak, "Outlier probability", "probability of a false peak", PROBABILITY_MAP, (0.0, 1.0))
     panels.show_depth(truth, "Truth", limits)

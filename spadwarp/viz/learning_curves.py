@@ -6,32 +6,56 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
-from spadwarp.viz.style import BLUE, TEXT, new_figure, plain_axis, save
+from spadwarp.viz.style import (
+    BLUE,
+    PAGE,
+    TEXT,
+    columns_that_fit,
+    log_axis,
+    new_figure,
+    paper,
+    plain_axis,
+    save,
+    wrapped,
+)
 
 __all__ = ["draw_learning_curves"]
 
 
-def draw_learning_curves(log: Sequence[Mapping[str, Any]], path: str | Path, *, title: str) -> Path:
+@paper()
+def draw_learning_curves(
+    log: Sequence[Mapping[str, Any]], path: str | Path, *, title: str, width: float = PAGE
+) -> Path:
     """Loss and validation PSNR against steps; returns the picture's path.
 
     `log`: for each report its `step`, `loss` and `psnr` [dB], a mapping from the backscatter fraction, or from the
-    signal photons per pixel (1 and more), to the PSNR there.
+    signal photons per pixel (1 and more), to the PSNR there. `width`: of the picture [inch].
     """
     steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
-    style: dict[str, Any] = {"marker": "o", "markersize": 6.0 if len(log) == 1 else 3.0}  # one point has no line
-    figure = new_figure(9.6, 3.4)
-    loss, psnr = figure.subplots(1, 2)
-    loss.plot(steps, losses, color=BLUE, **style)
-    loss.set(yscale="log" if min(losses) > 0 else "linear", xlabel="step", ylabel="loss")  # "psnr" is a logarithm
+    style: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
+    columns = columns_that_fit(2, width, 3.0)
     levels = list(log[-1]["psnr"])
-    for level, shade in zip(levels, np.linspace(0.75, 0.0, len(levels)), strict=True):
-        label = f"backscatter fraction {level}" if float(level) < 1 else f"{float(level):g} photons"
-        psnr.plot(steps, [line["psnr"][level] for line in log], color=str(shade), label=label, **style)
+    counted = all(float(level) >= 1 for level in levels)
+    in_line = columns_that_fit(len(levels) + 1, width, 0.8)
+    figure = new_figure(width, 4.9 - 2.1 * (columns - 1) + 0.14 * (len(levels) // in_line))
+    loss, psnr = figure.subplots(2 // columns, columns)
+    loss.plot(steps, losses, color=BLUE, **style)
+    loss.set(xlabel="step", ylabel="loss")
+    if min(losses) > 0:  # "psnr" is a logarithm
+        log_axis(loss, "y")
+    for level, shade in zip(levels, np.linspace(0.85, 0.0, len(levels)), strict=True):
+        colour = matplotlib.colormaps["viridis"](shade)
+        label = f"{float(level):g}" if counted else level
+        psnr.plot(steps, [line["psnr"][level] for line in log], color=colour, label=label, **style)
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
-    psnr.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    plain_axis(loss)
-    plain_axis(psnr)
-    figure.suptitle(title, fontsize=10, color=TEXT)
+    title_of_levels = "signal photons per pixel" if counted else "backscatter fraction"
+    figure.legend(title=title_of_levels, loc="outside lower center", ncols=in_line)
+    for axis in (loss, psnr):
+        plain_axis(axis)
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    figure.suptitle(wrapped(title, width - 0.3), color=TEXT)
     return save(figure, path)

@@ -24,13 +24,14 @@ from spadwarp.units import with_prefix
 from spadwarp.viz.frames import analytic_figure
 from spadwarp.viz.panels import Panels, median_pixel, shown_limits
 from spadwarp.viz.result import KINDS, result_figure
-from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, spaced
+from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, paper, spaced
 
 __all__ = ["html", "plot"]
 
-_HTML_DPI = 72
+_HTML_DPI = 100
 
 
+@paper()
 def plot(
     shown: Result | Frames | Scene | AnalyticResult,
     kind: Literal["depth", "intensity", "histogram", "truth"] | None = None,
@@ -38,6 +39,7 @@ def plot(
     method: Any = "centroid",
     frame: int = 0,
     device: Any = None,
+    width: float = PAGE,
 ) -> Figure:
     """A figure of a result, of frames or of a scene; notebooks show it, `savefig` writes it.
 
@@ -48,20 +50,21 @@ def plot(
         method: Estimator of a result's depth.
         frame: Number of the frame.
         device: Warp device.
+        width: Of the figure [inch]: 7.2 for a journal's page, 3.5 for its column.
 
     Raises:
-        ArgumentError: Another kind, or a frame that is not there.
+        ArgumentError: Another kind, a frame that is not there, or a width outside [2.5, 50].
         MeshError: A target of the scene cannot be read.
     """
     if isinstance(shown, Result):
         if kind not in (None, *KINDS):
             raise ArgumentError(f"kind = {kind!r} is not one of {', '.join(map(repr, KINDS))}")
-        return result_figure(shown, kind or "depth", method=method, device=device)
+        return result_figure(shown, kind or "depth", method=method, device=device, width=width)
     if kind is not None:
         raise ArgumentError(f"kind = {kind!r} goes with results only, not with {type(shown).__name__}")
     if isinstance(shown, AnalyticResult):
-        return analytic_figure(shown)
-    return _frames_figure(shown, frame) if isinstance(shown, Frames) else _scene_figure(shown, device)
+        return analytic_figure(shown, width)
+    return _frames_figure(shown, frame, width) if isinstance(shown, Frames) else _scene_figure(shown, device, width)
 
 
 def html(shown: Result | Frames | Scene | AnalyticResult | Proposal) -> str:
@@ -91,23 +94,23 @@ def _png(figure: Figure) -> str:
 # Figures
 
 
-def _scene_figure(scene: Scene, device: Any) -> Figure:
+def _scene_figure(scene: Scene, device: Any, width: float) -> Figure:
     truth = truth_maps(scene, device=device)
-    panels = Panels(truth.depth.shape, 2)
+    panels = Panels(truth.depth.shape, 2, width=width)
     panels.show_depth(truth.depth, "Truth", shown_limits(truth.depth))
     panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
     panels.caption(repr(scene))
     return panels.figure
 
 
-def _frames_figure(frames: Frames, number: int) -> Figure:
+def _frames_figure(frames: Frames, number: int, width: float) -> Figure:
     if not 0 <= number < (1 if frames.summed else frames.frames):
         raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
     counts = np.asarray(frames.counts if frames.summed else frames.counts[number])
     intensity = counts.sum(axis=-1)
     row, column = median_pixel(intensity, intensity > 0)
     edges = 1e9 * (frames.gate_start + frames.edges)
-    panels = Panels(intensity.shape, 2, below=2.4)
+    panels = Panels(intensity.shape, 2, width=width, below=2.0)
     panels.show_intensity(intensity, "Intensity", "counts in a frame")
     fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
     panels.show_depth(fullest, "Fullest bin", shown_limits(fullest), "time of flight [ns]")
@@ -118,9 +121,11 @@ def _frames_figure(frames: Frames, number: int) -> Figure:
         curve = np.broadcast_to(np.asarray(values)[row, column], counts.shape[-1:]) * pulses
         axis.stairs(curve, edges, baseline=None, color=colour, label=f"{name}, before pile-up")
     axis.set(xlabel="time of flight [ns]", ylabel="counts per bin", xlim=edges[[0, -1]])
-    axis.set_title(f"Pixel in row {row}, column {column}", fontsize=10)
-    axis.legend(frameon=False, fontsize=8)
-    panels.caption(_frames_rows(frames)["frames"] + f", seed {frames.seed}")
+    axis.set_title(f"Pixel in row {row}, column {column}")
+    axis.xaxis.minorticks_on()
+    panels.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3 if width > 5 else 1)
+    which = "all frames added up" if frames.summed else f"frame {number} of {frames.frames}"
+    panels.caption(f"{which}: {spaced(frames.pulses)} pulses; seed {frames.seed}")
     return panels.figure
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
@@ -22,29 +21,41 @@ from spadwarp.viz.style import (
     DEPTH_MAP,
     ERROR_MAP,
     INTENSITY_MAP,
+    PAGE,
+    RED,
     TEXT,
     colour_map,
+    columns_that_fit,
     new_figure,
+    wrapped,
+    wrapped_items,
 )
 
-__all__ = ["Panels", "arrival_line", "coloured_depth", "depth_bar", "median_pixel", "shown_limits", "strips"]
-__all__ += ["target_limits"]
+__all__ = ["Panels", "arrival_line", "coloured_depth", "error_limit", "mark_pixels", "median_pixel", "percent"]
+__all__ += ["shown_limits", "strip_bar", "strips", "target_limits"]
 
-_WIDTH = 3.4  # of a panel [inch]
+_LEAST = 1.7  # width of a panel with its numbers [inch]
+_LARGEST = 3.4
 
 
 class Panels:
-    """A figure of images of `shape` (height, width), line after line, each with its colour bar below.
+    """A figure of `count` images of `shape` (height, width), as many in a line as fit, each with its colour bar below.
 
-    `below`: height of one more axis over the whole width, `self.below` [inch].
+    `width`: of the figure [inch]. `below`: height of one more axis over the whole width, `self.below` [inch].
     """
 
-    def __init__(self, shape: tuple[int, ...], columns: int, *, lines: int = 1, below: float = 0.0) -> None:
-        height = float(np.clip(_WIDTH * shape[0] / shape[1], 0.8, 7.0))
-        self.figure = new_figure(_WIDTH * columns, lines * (height + 1.05) + below + 0.3)
-        ratios = [height, 0.15] * lines + [below] * bool(below)
+    def __init__(self, shape: tuple[int, ...], count: int, *, width: float = PAGE, below: float = 0.0) -> None:
+        columns = columns_that_fit(count, width, _LEAST)
+        columns = math.ceil(count / math.ceil(count / columns))  # lines of equal length
+        lines = math.ceil(count / columns)
+        self._cell = min(width / columns, _LARGEST)
+        height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
+        # Titles, numbers and labels; more below for its labels and a legend.
+        self.figure = new_figure(width, lines * (height + 1.1) + (below + 0.7) * bool(below) + 0.25)
+        self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.05)  # type: ignore[call-arg,union-attr]
+        ratios = [height, 0.1] * lines + [below] * bool(below)
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
-        self._free = iter([(grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
+        self._free = iter([(k, c, grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
         self._last = grid[-1, :]
 
     def below(self) -> Axes:
@@ -53,13 +64,16 @@ class Panels:
 
     def caption(self, text: str) -> None:
         """Writes what the figure shows above it."""
-        self.figure.suptitle(text, fontsize=9, color=TEXT)
+        text = wrapped_items(text, self.figure.get_figwidth() - 0.3)
+        self.figure.set_figheight(self.figure.get_figheight() + 0.14 * text.count("\n"))
+        self.figure.suptitle(text, color=TEXT)
 
     def place(self, title: str) -> tuple[Axes, Axes]:
         """The axis of the next image, and that of its colour bar."""
-        axis, bar = map(self.figure.add_subplot, next(self._free))
-        axis.set_title(title, fontsize=10)
-        axis.set(xlabel="column [pixel]", ylabel="row [pixel]")
+        _, column, *cells = next(self._free)
+        axis, bar = map(self.figure.add_subplot, cells)
+        axis.set_title(wrapped(title, self._cell - 0.2))
+        axis.set(xlabel="column [pixel]", ylabel="" if column else "row [pixel]")
         for side in (axis.xaxis, axis.yaxis):
             side.set_major_locator(MaxNLocator(nbins=5, integer=True))
         return axis, bar
@@ -69,59 +83,78 @@ class Panels:
         image: NDArray[Any],
         title: str,
         label: str,
-        colours: str,
+        colours: str | Colormap,
         limits: tuple[float, float],
-        scale: str = "linear",
-    ) -> None:
-        """The next image: grey where it is NaN; its colour bar has pointed ends where values exceed the limits."""
+        scale: Literal["linear", "log"] = "linear",
+    ) -> Axes:
+        """The next image; returns its axis. Grey: NaN. Pointed ends of the colour bar: values beyond the limits."""
         axis, bar = self.place(title)
         (height, width), (low, high) = image.shape[:2], limits
         if max(height, width) > 5 * min(height, width):  # there is space for two numbers along the short side
             (axis.yaxis if height < width else axis.xaxis).set_major_locator(MaxNLocator(nbins=1, integer=True))
-        shown = axis.imshow(image, interpolation="nearest", cmap=colour_map(colours), norm=scale, clim=limits)
+        shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
         extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[
             int((image < low).any()), int((image > high).any())
         ]
+        label = wrapped(label, self._cell - 0.2)
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
         if scale == "log":
-            ticks = _log_ticks(low, high)
+            ticks, digits = _log_ticks(low, high, (self._cell - 0.3) / 0.4)
             colour_bar.set_ticks(list(ticks), labels=list(ticks.values()))
-            colour_bar.minorticks_off()
+            colour_bar.set_ticks(digits, minor=True, labels=[])
         else:
-            long_labels = high >= 1e4 or 0 < high - low < 1e-3 * abs(high)
-            colour_bar.locator = MaxNLocator(nbins=4 if long_labels else 6)
+            colour_bar.locator = MaxNLocator(nbins=_numbers(low, high, self._cell - 0.4))
             colour_bar.formatter = ScalarFormatter(useOffset=False)
+            bar.xaxis.minorticks_on()
+        return axis
 
     def show_depth(
         self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = "depth z [m]"
-    ) -> None:
+    ) -> Axes:
         """Depth [m]."""
-        self.show(image, title, label, DEPTH_MAP, limits)
+        return self.show(image, title, label, DEPTH_MAP, limits)
 
-    def show_error(self, error: NDArray[Any], title: str, label: str, *, percentile: float) -> None:
-        """Signed errors; the colours reach to this percentile of their absolute values."""
-        known = np.abs(error[np.isfinite(error)])
-        reach = max(float(np.percentile(known, percentile)), 0.1) if known.size else 1.0
-        self.show(error, title, label, ERROR_MAP, (-reach, reach))
+    def show_error(self, error: NDArray[Any], title: str) -> None:
+        """Signed depth errors [m]; see `error_limit`. How many pixels are beyond the colours is written below."""
+        reach = error_limit(error)
+        factor, unit = (1e3, "mm") if reach < 0.1 else (1e2, "cm") if reach < 1.0 else (1.0, "m")
+        known = max(1, int(np.isfinite(error).sum()))
+        below, above = (100 * np.count_nonzero(side) / known for side in (error < -reach, error > reach))
+        beyond = f"\n{percent(below)} below, {percent(above)} above" if below or above else ""
+        self.show(factor * error, title, f"depth error [{unit}]{beyond}", ERROR_MAP, (-factor * reach, factor * reach))
 
     def show_intensity(self, image: NDArray[Any], title: str, label: str) -> None:
         """From 0 to the 99.5th percentile, which single bright pixels exceed."""
         values = image.astype(np.float64)
         top = float(np.percentile(values, 99.5)) or float(values.max()) or 1.0
-        unit, text = _unit(top)
-        self.show(values / unit, title, label + text, INTENSITY_MAP, (0.0, top / unit))
+        factor, text = _power(top)
+        self.show(values / factor, title, label + text, INTENSITY_MAP, (0.0, top / factor))
 
     def show_positive(self, values: NDArray[Any], title: str, label: str, colours: str = BOUND_MAP) -> None:
-        """Positive values between their 1st and 99th percentile; on a logarithmic scale if these are far apart."""
+        """Positive values between their 5th and 95th percentile; on a logarithmic scale if these are far apart."""
         shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
         known = shown[np.isfinite(shown)]
-        low, high = map(float, np.percentile(known, (1.0, 99.0))) if known.size else (0.1, 1.0)
+        low, high = map(float, np.percentile(known, (5.0, 95.0))) if known.size else (0.1, 1.0)
         if high > 4.0 * low:
             self.show(shown, title, label, colours, (low, high), "log")
             return
-        unit, text = _unit(high)
+        factor, text = _power(high)
         margin = 0.05 * high  # a single value has no interval
-        self.show(shown / unit, title, label + text, colours, ((low - margin) / unit, (high + margin) / unit))
+        self.show(shown / factor, title, label + text, colours, ((low - margin) / factor, (high + margin) / factor))
+
+
+def error_limit(error: NDArray[Any]) -> float:
+    """Largest error in colours [m]: twice the 68th percentile of the absolute errors, at most the 95th.
+
+    Large errors of some pixels, at steps and where nothing returned, do not hide the millimetres of the others.
+    """
+    known = np.abs(error[np.isfinite(error)])
+    if not known.size:
+        return 1.0
+    body, tail = np.percentile(known, (68.0, 95.0))
+    reach = max(min(2.0 * body, tail), 1e-4)
+    digit = 10.0 ** math.floor(math.log10(reach))
+    return float(math.ceil(reach / digit * 2 - 1e-9) / 2 * digit)  # of two digits: 3.5 mm
 
 
 def shown_limits(image: NDArray[Any], *, beyond: float = 0.0, margin: float = 0.0) -> tuple[float, float]:
@@ -152,21 +185,28 @@ def arrival_line(axis: Axes, result: Result, row: int, column: int, edges: NDArr
     """A line where the target's light arrives, within the edges [ns]."""
     arrival = 1e9 * result.true_path()[row, column] / result.pulse_speed
     if edges[0] <= arrival < edges[-1]:
-        axis.axvline(arrival, color="0.2", linewidth=0.9, linestyle=DASHED, label="true arrival")
+        axis.axvline(arrival, color="0.2", linewidth=0.8, linestyle=DASHED, label="true arrival")
 
 
 def strips(
-    count: int, *, columns: int, size: tuple[float, float], spare: float, pads: tuple[float, float]
-) -> tuple[Figure, Sequence[Axes]]:
-    """A figure of `count` axes without frames, each of this size, `spare` for the colour bar [inch]."""
-    columns = min(columns, count)
+    count: int, *, width: float, least: float, ratio: float, title: float, bars: int = 1
+) -> tuple[Figure, list[Axes], list[Axes]]:
+    """A figure of `count` axes without frames, as many in a line as fit, and of `bars` axes for colour bars below them.
+
+    `least`: width of an axis, `title`: height of its title [inch]; `ratio`: its height over its width.
+    """
+    columns = columns_that_fit(count, width, least)
     lines = math.ceil(count / columns)
-    figure = new_figure(size[0] * columns, size[1] * lines + spare)
-    figure.get_layout_engine().set(w_pad=pads[0], h_pad=pads[1])  # type: ignore[call-arg,union-attr]
-    axes = list(np.ravel(figure.subplots(lines, columns, squeeze=False)))
+    height = (width / columns - 0.08) * ratio + title
+    spare = 0.55 if bars == 1 else 0.65
+    figure = new_figure(width, lines * height + spare)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.0, wspace=0.0)  # type: ignore[call-arg,union-attr]
+    images, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(lines * height, spare)).ravel()
+    axes = list(np.ravel(images.subplots(lines, columns, squeeze=False)))
     for axis in axes:
         axis.axis("off")
-    return figure, axes
+    grid = below.add_gridspec(2, 3 * bars, height_ratios=(0.1, 0.4), width_ratios=(1, 8, 1) * bars)
+    return figure, axes, [below.add_subplot(grid[0, 3 * k + 1]) for k in range(bars)]
 
 
 def coloured_depth(depth: NDArray[Any], scale: Normalize) -> NDArray[np.float64]:
@@ -174,31 +214,59 @@ def coloured_depth(depth: NDArray[Any], scale: Normalize) -> NDArray[np.float64]
     return colour_map(DEPTH_MAP, missing=BACKGROUND)(scale(np.ma.masked_invalid(depth)))[..., :3]
 
 
-def depth_bar(figure: Figure, axes: Sequence[Axes], scale: Normalize, label: str, *, fontsize: float) -> None:
-    """One colour bar of depth below all axes."""
-    bar = figure.colorbar(
-        ScalarMappable(scale, DEPTH_MAP), ax=list(axes), orientation="horizontal", fraction=0.012, aspect=70, pad=0.01
-    )
-    bar.set_label(label, fontsize=fontsize)
-    bar.ax.tick_params(labelsize=fontsize - 1)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+def strip_bar(bar: Axes, scale: Normalize, colours: str, label: str, *, bars: int = 1) -> None:
+    """The colour bar of strips, or one of `bars`."""
+    figure = bar.get_figure(root=True)
+    assert figure is not None
+    label = wrapped(label, figure.get_figwidth() / bars - 0.2)
+    shown = figure.colorbar(ScalarMappable(scale, colours), cax=bar, orientation="horizontal", label=label)
+    shown.outline.set_visible(False)  # type: ignore[operator]
+    bar.xaxis.minorticks_on()
 
 
-def _unit(top: float) -> tuple[float, str]:
+def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool_]) -> None:
+    """Colours pixels in which a target was missed black, in which one was invented red."""
+    marks = np.zeros((*missed.shape, 4))
+    marks[missed], marks[invented] = to_rgba("black"), to_rgba(RED)
+    axis.imshow(marks)
+
+
+def percent(value: float) -> str:
+    """A part in percent, with two digits."""
+    return f"{value:.2g} %" if value < 99.5 else "100 %"
+
+
+def _numbers(low: float, high: float, width: float) -> int:
+    """How many numbers of a scale fit into this width [inch]."""
+    step = (high - low) / 4
+    decimals = max(0, -math.floor(math.log10(step))) if step > 0 else 2
+    digits = len(f"{max(abs(low), abs(high)):.{decimals}f}") + (low < 0)
+    return int(np.clip(width / (0.065 * digits + 0.12), 2, 6))
+
+
+def _power(top: float) -> tuple[float, str]:
     """A power of ten for values up to `top`, and its text for a label; 1 for numbers that are short by themselves."""
     exponent = int(np.floor(np.log10(top)))
-    return (1.0, "") if -2 <= exponent <= 3 else (10.0**exponent, f" [$10^{{{exponent}}}$]")
+    return (1.0, "") if -2 <= exponent <= 3 else (10.0**exponent, f" [{_power_text(exponent)}]")
 
 
-def _log_ticks(low: float, high: float) -> dict[float, str]:
-    """A few values between `low` and `high` with their texts: powers of ten, 2 and 5 times these if they are few."""
-    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    digits = (1,) if len(powers) > 4 else (1, 2, 5)
+def _log_ticks(low: float, high: float, most: float) -> tuple[dict[float, str], list[float]]:
+    """Values between `low` and `high` with their texts, of which `most` would fill the scale; all digits of all powers.
+
+    Powers of ten come first, then the other digits where there is space.
+    """
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    every = [(digit, power) for power in powers for digit in range(1, 10) if low <= digit * 10.0**power <= high]
+    gap = math.log10(high / low) / most
     ticks: dict[float, str] = {}
-    for power, digit in ((power, digit) for power in powers for digit in digits):
+    for digit, power in sorted(every, key=lambda one: ((1, 3, 2, 5, 7, 4, 6, 8, 9).index(one[0]), one[1])):
         value = digit * 10.0**power
-        if low <= value <= high:
-            exponential = ("" if digit == 1 else rf"{digit} \cdot ") + f"10^{{{power}}}"
-            ticks[value] = f"{value:g}" if -3 < power < 4 else f"${exponential}$"
-    step = 1 + (len(ticks) - 1) // 7
-    return dict(list(ticks.items())[::step])
+        if all(abs(math.log10(value / other)) >= gap for other in ticks):
+            exponential = ("" if digit == 1 else f"{digit}·") + _power_text(power)
+            ticks[value] = f"{value:g}" if -3 < power < 4 else exponential
+    return ticks, [digit * 10.0**power for digit, power in every]
+
+
+def _power_text(exponent: int) -> str:
+    """A power of ten, such as 10⁻³."""
+    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

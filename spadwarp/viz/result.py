@@ -16,8 +16,20 @@ from spadwarp.result import COMPONENTS, Result
 from spadwarp.scene import Medium
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_path
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
+from spadwarp.viz.sparse import merged_edges, merged_means, typical_weight
 from spadwarp.viz.style import COMPONENTS as STYLES
-from spadwarp.viz.style import GRID, INTENSITY_MAP, MISSING, TEXT, new_figure, save, spaced
+from spadwarp.viz.style import (
+    INTENSITY_MAP,
+    MISSING,
+    PAGE,
+    TEXT,
+    log_axis,
+    new_figure,
+    paper,
+    save,
+    spaced,
+    wrapped_items,
+)
 
 __all__ = ["KINDS", "draw_result", "result_figure"]
 
@@ -25,6 +37,7 @@ KINDS = ("depth", "intensity", "histogram", "truth")
 """Figures of a result."""
 
 
+@paper()
 def draw_result(
     result: Result,
     directory: str | Path,
@@ -32,6 +45,7 @@ def draw_result(
     depth: NDArray[np.float64] | None = None,
     method: Method = "centroid",
     formats: Sequence[str] = ("png",),
+    width: float = PAGE,
 ) -> list[Path]:
     """Writes pictures of depth, intensity, histograms and truth, such as `depth.png`; returns their paths.
 
@@ -41,15 +55,17 @@ def draw_result(
         depth: Depth frame `[H, W]` [m] to show; `result.depth(method=method)` if not given.
         method: Estimator of the depth frame, named in the picture.
         formats: "png", and "pdf" with vectors, for print.
+        width: Of the pictures [inch]: 7.2 for a journal's page, 3.5 for its column.
 
     Raises:
         FileError: The folder or a file cannot be written.
     """
     folder = Path(directory)
-    figures = {name: result_figure(result, name, depth=depth, method=method) for name in KINDS}
+    figures = {name: result_figure(result, name, depth=depth, method=method, width=width) for name in KINDS}
     return [save(figure, folder / f"{name}.{ending}") for name, figure in figures.items() for ending in formats]
 
 
+@paper()
 def result_figure(
     result: Result,
     kind: str,
@@ -57,55 +73,50 @@ def result_figure(
     depth: NDArray[np.float64] | None = None,
     method: Method = "centroid",
     device: Any = None,
+    width: float = PAGE,
 ) -> Figure:
     """One of the figures of `draw_result`, of `KINDS`."""
+    if kind == "histogram":
+        return _histogram_figure(result, width)
+    panels = Panels(result.truth.depth.shape, 2 if kind == "intensity" else 3, width=width)
+    panels.caption(_caption(result))
     if kind == "depth":
         frame = result.depth(method=method, device=device) if depth is None else np.asarray(depth, dtype=np.float64)
-        return _depth_figure(result, frame, method)
-    return {"intensity": _intensity_figure, "histogram": _histogram_figure, "truth": _truth_figure}[kind](result)
+        _show_depth(panels, result, frame, method)
+    else:
+        {"intensity": _show_intensity, "truth": _show_truth}[kind](panels, result)
+    return panels.figure
 
 
-def _panels(result: Result, columns: int) -> Panels:
-    panels = Panels(result.truth.depth.shape, columns)
-    panels.caption(_caption(result))
-    return panels
-
-
-def _depth_figure(result: Result, frame: NDArray[np.float64], method: str) -> Figure:
+def _show_depth(panels: Panels, result: Result, frame: NDArray[np.float64], method: str) -> None:
     truth = result.truth.depth
     limits = target_limits(truth, frame)
-    panels = _panels(result, 3)
     panels.show_depth(frame, f"Measured ({method})", limits)
     panels.show_depth(truth, "Truth", limits)
-    panels.show_error(100.0 * (frame - truth), "Measured − truth", "depth error [cm]", percentile=98.0)
-    return panels.figure
+    panels.show_error(frame - truth, "Measured − truth")
 
 
-def _intensity_figure(result: Result) -> Figure:
+def _show_intensity(panels: Panels, result: Result) -> None:
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     ballistic = result.component("ballistic").sum(axis=-1)
-    panels = _panels(result, 2)
     panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
     panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
-    return panels.figure
 
 
-def _truth_figure(result: Result) -> Figure:
+def _show_truth(panels: Panels, result: Result) -> None:
     truth = result.truth
     normal = 0.5 + 0.5 * truth.normal * np.array([1.0, -1.0, -1.0])
-    panels = _panels(result, 3)
     panels.show_depth(truth.depth, "Depth", shown_limits(truth.depth))
     axis, bar = panels.place("Normal")
-    axis.imshow(np.where(np.isfinite(normal), normal, float(MISSING)).clip(0.0, 1.0), interpolation="nearest")
+    axis.imshow(np.where(np.isfinite(normal), normal, float(MISSING)).clip(0.0, 1.0))
     bar.axis("off")
-    bar.text(0.5, 0.0, "red: right, green: up, blue: to the camera", fontsize=9, ha="center", va="center")
+    bar.text(0.5, 0.0, "red: right, green: up,\nblue: to the camera", ha="center", va="center", transform=bar.transAxes)
     panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
-    return panels.figure
 
 
-def _histogram_figure(result: Result) -> Figure:
-    figure = new_figure(7.0, 6.4)
-    figure.suptitle(_caption(result), fontsize=9, color=TEXT)
+def _histogram_figure(result: Result, width: float) -> Figure:
+    figure = new_figure(width, 5.2)
+    figure.suptitle(wrapped_items(_caption(result), width - 0.3), color=TEXT)
     # Ranked by ballistic light where there is any: in a short run a rare photon of large weight can make any other
     # pixel the brightest.
     ballistic = result.tallies[0].sum(axis=2)
@@ -124,34 +135,67 @@ def _histogram_figure(result: Result) -> Figure:
             axis.set_yticks([])
         else:
             row, column = divmod(int(order[index]), intensity.shape[1])
-            axis.set_title(f"{name} pixel {group}: row {row}, column {column}", fontsize=10)
+            axis.set_title(f"{name} pixel {group}: row {row}, column {column}")
             _plot_pixel(result, axis, row, column)
-            handles |= {line.get_label(): line for line in axis.get_legend_handles_labels()[0]}
+            handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
     if handles:
-        figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+        columns = 5 if width > 5.0 else 2
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
     return figure
 
 
 def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
-    """Components of one pixel over time of flight, and over the range along its line of sight."""
+    """Components of one pixel over time of flight, and over the range along its line of sight.
+
+    Where light is sparse, bins are added up until their sum is known to a third; see `merged_edges`.
+    """
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
     time = 1e9 * result.bin_edges
-    top = parts.max()
-    bottom = np.clip(0.5 * parts[parts > 0].min(), 1e-7 * top, 0.01 * top)
+    total = parts.sum(axis=0)
+    known = result.second_moment is not None and result.photons >= 2 * result.batch_size
+    error = result.standard_error[row, column] * per_pulse if known else None
+    weight = typical_weight(total) if error is None else np.divide(error**2, total, out=0.0 * total, where=total > 0)
+    curves = {}
     for name, values in zip(COMPONENTS, parts, strict=True):
+        edges = np.arange(len(time)) if name == "ballistic" else merged_edges(values, weight * values)
+        curves[name] = edges, merged_means(values, edges)
+    means = np.concatenate([values for _, values in curves.values()])
+    top = float(parts.max())
+    bottom = float(np.clip(0.5 * means[means > 0].min(), 1e-7 * top, 0.01 * top))
+    if error is not None:
+        _plot_band(axis, time, total, error, bottom)
+    for name, (edges, values) in curves.items():
         label, colour = STYLES[name]
         ballistic = name == "ballistic"
         # Zeros lie below the axis, so that a single bin still shows as a spike.
         axis.stairs(
-            np.maximum(values, 0.01 * bottom), time, baseline=None, label=label, color=colour,
-            linewidth=1.6 if ballistic else 1.0, zorder=3 if ballistic else 2,
+            np.maximum(values, 0.01 * bottom), time[edges], baseline=None, label=label, color=colour,
+            linewidth=1.4 if ballistic else 0.9, zorder=3 if ballistic else 2,
         )  # fmt: skip
     arrival_line(axis, result, row, column, time)
-    axis.set(yscale="log", ylim=(bottom, 3.0 * top), ylabel="detections per pulse and bin")
-    axis.grid(which="major", color=GRID, linewidth=0.6)
-    axis.set_axisbelow(True)
+    axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
+    log_axis(axis, "y")
+    axis.xaxis.minorticks_on()
+    axis.grid(which="major")
+    _range_axis(result, axis, row, column)
 
+
+def _plot_band(
+    axis: Axes, time: NDArray[np.float64], total: NDArray[np.float64], error: NDArray[np.float64], bottom: float
+) -> None:
+    """The sum of all light with its standard error, those of the bins of a group taken as independent."""
+    edges = merged_edges(total, error**2)
+    mean, spread = merged_means(total, edges), np.sqrt(np.add.reduceat(error**2, edges[:-1])) / np.diff(edges)
+    lower = np.maximum(mean - spread, 0.01 * bottom)
+    axis.stairs(
+        np.maximum(mean + spread, 0.01 * bottom), time[edges], baseline=lower, fill=True, color="0.75", zorder=1,
+        label="all light ± standard error",
+    )  # fmt: skip
+
+
+def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
+    """A second axis above: range along the line of sight."""
     speed, laser = 1e-9 * result.pulse_speed, result.scene.beam.position
     direction = pixel_directions(result.scene.camera)[row, column]
 
@@ -162,7 +206,9 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     def to_time(at: ArrayLike) -> NDArray[np.float64]:
         return path_from_range(at, direction, laser) / speed
 
-    axis.secondary_xaxis("top", functions=(to_range, to_time)).set_xlabel("range [m]")
+    above = axis.secondary_xaxis("top", functions=(to_range, to_time))
+    above.set_xlabel("range [m]")
+    above.xaxis.minorticks_on()
 
 
 def _caption(result: Result) -> str:

@@ -14,8 +14,8 @@ from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, builtin_names, load_targe
 from spadwarp.scene import Scene, Target
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
-from spadwarp.viz.panels import coloured_depth, depth_bar, strips
-from spadwarp.viz.style import BACKGROUND, save
+from spadwarp.viz.panels import coloured_depth, strip_bar, strips
+from spadwarp.viz.style import BACKGROUND, DEPTH_MAP, PAGE, paper, save, wrapped
 
 __all__ = ["DISTANCE", "describe_targets", "draw_mesh", "draw_targets", "target_scene"]
 
@@ -57,8 +57,14 @@ def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]
     return described
 
 
+@paper()
 def draw_targets(
-    path: str | Path, *, names: Sequence[str] | None = None, pixels: int = 192, device: str | None = None
+    path: str | Path,
+    *,
+    names: Sequence[str] | None = None,
+    pixels: int = 192,
+    width: float = PAGE,
+    device: str | None = None,
 ) -> Path:
     """Draws built-in targets as seen from 15 m, shaded and as depth maps, into one PNG; returns its path.
 
@@ -66,6 +72,7 @@ def draw_targets(
         path: The picture.
         names: Of the targets, in this order; all if None.
         pixels: Width and height of each view, > 0.
+        width: Of the picture [inch].
         device: Warp device for the rays.
 
     Raises:
@@ -73,24 +80,28 @@ def draw_targets(
         FileError: The picture cannot be written.
     """
     chosen = list(builtin_names() if names is None else names)
-    figure, axes = strips(len(chosen), columns=4, size=(3.5, 1.98), spare=0.6, pads=(0.05, 0.03))
+    figure, axes, (bar,) = strips(len(chosen), width=width, least=1.7, ratio=0.5, title=0.2)
     scale = Normalize(DISTANCE - 1.5, DISTANCE + 1.5)
     for axis, name in zip(axes, chosen, strict=False):
         truth = truth_maps(target_scene(name, pixels=2 * pixels), device=device)
         views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
         axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
-        axis.set_title(name, fontsize=11, pad=3)
-    depth_bar(figure, axes, scale, "depth z [m]", fontsize=10)
+        axis.set_title(name, pad=2)
+    strip_bar(bar, scale, DEPTH_MAP, "depth z [m]")
     return save(figure, path)
 
 
-def draw_mesh(mesh: MeshSummary, path: str | Path, *, pixels: int = 256, device: str | None = None) -> Path:
+@paper()
+def draw_mesh(
+    mesh: MeshSummary, path: str | Path, *, pixels: int = 256, width: float = PAGE, device: str | None = None
+) -> Path:
     """Draws a mesh file as the camera sees it, from its side and from above, shaded, with its depth; returns the path.
 
     Args:
         mesh: From `spadwarp.mesh.describe_mesh`.
         path: The picture.
         pixels: Width and height of each view, > 0.
+        width: Of the picture [inch].
         device: Warp device for the rays.
 
     Raises:
@@ -99,7 +110,7 @@ def draw_mesh(mesh: MeshSummary, path: str | Path, *, pixels: int = 256, device:
     """
     shown = _SIDE / max(mesh.extent)  # scale that fills the view
     metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
-    figure, axes = strips(len(_VIEWS), columns=len(_VIEWS), size=(3.5, 2.3), spare=0.6, pads=(0.05, 0.03))
+    figure, axes, (bar,) = strips(len(_VIEWS), width=width, least=1.7, ratio=0.5, title=0.2)
     scale = Normalize(DISTANCE - 0.5 * _SIDE, DISTANCE + 0.5 * _SIDE)
     for axis, rotation in zip(axes, _VIEWS, strict=False):
         centre = rotation_matrix(rotation) @ (shown * np.array(mesh.centre))
@@ -108,9 +119,10 @@ def draw_mesh(mesh: MeshSummary, path: str | Path, *, pixels: int = 256, device:
         truth = truth_maps(_scene(target, 2 * pixels), device=device)
         views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
         axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
-        axis.set_title(f"rotation_deg = {[round(angle) for angle in rotation]}", fontsize=10, pad=3)
-    depth_bar(figure, axes, Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest), "depth from the centre [m]", fontsize=9)
-    figure.suptitle(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}", fontsize=11)
+        axis.set_title(f"rotation_deg = {[round(angle) for angle in rotation]}", pad=3)
+    own = Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest)
+    strip_bar(bar, own, DEPTH_MAP, "depth from the centre [m]")
+    figure.suptitle(wrapped(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}", width - 0.3))
     return save(figure, path)
 
 

@@ -11,6 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
@@ -20,13 +23,13 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.paths import check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
-from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure
+from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure, paper
 from spadwarp.viz.viewer import reported_depths
 
 __all__ = ["video"]
 
 _DECADES = 4.0  # of the logarithmic colour scale
-_DPI = 100
+_DPI = 140
 
 
 def video(
@@ -117,28 +120,34 @@ def _pictures(
     scale: str,
 ) -> Iterator[NDArray[np.uint8]]:
     """RGB pictures, one after the other."""
+    figure, image, title = _figure(cube, label, scale)
+    canvas = FigureCanvasAgg(figure)
+    for index in range(cube.shape[2]):
+        image.set_data(cube[:, :, index])
+        middle = 0.5 * (edges[index] + edges[index + 1])
+        title.set_text(f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+        canvas.draw()
+        if index == 0:
+            figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+@paper()
+def _figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, AxesImage, Text]:
+    """The figure of all pictures, with what changes between them."""
     height, width = cube.shape[:2]
     values = cube[cube > 0]
     top = float(np.percentile(values, 99.9)) if values.size else 1.0
     norm = LogNorm(top * 10.0**-_DECADES, top) if scale == "log" else Normalize(0.0, top)
     colours = colour_map(LIGHT_MAP).with_extremes(bad="black", under="black")
-    image_height = float(np.clip(5.0 * height / width, 1.5, 9.0))
-    figure = new_figure(5.4, image_height + 1.5)
+    image_height = float(np.clip(3.6 * height / width, 1.1, 6.5))
+    figure = new_figure(3.9, image_height + 0.95)
     figure.set_dpi(_DPI)
-    canvas = FigureCanvasAgg(figure)
-    axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.15])
+    axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.1])
     axes.set(xticks=[], yticks=[])
-    image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm, interpolation="nearest")
+    image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm)
     figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
-    title = axes.set_title(" ", fontsize=11)
-    for index in range(cube.shape[2]):
-        image.set_data(cube[:, :, index])
-        middle = 0.5 * (edges[index] + edges[index + 1])
-        title.set_text(f"{middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
-        canvas.draw()
-        if index == 0:
-            figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return figure, image, axes.set_title(" ")
 
 
 def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:

@@ -7,31 +7,40 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spadwarp.viz.style import BLUE, RED, new_figure, save
+from spadwarp.viz.style import BLUE, PAGE, RED, new_figure, paper, plain_axis, save, wrapped
 
 __all__ = ["draw_validation"]
 
 
-def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, title: str) -> Path:
+@paper()
+def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, title: str, width: float = PAGE) -> Path:
     """Draws the quantities of a case as a PNG; returns its path.
 
-    `rows`: of each `quantity` its `value`, `reference`, `standard_error`, `z` and whether it `passed`. Raises
-    `FileError`.
+    `rows`: of each `quantity` its `value`, `reference`, `standard_error`, `z` and whether it `passed`. `width`: of the
+    picture [inch]. Raises `FileError`.
     """
-    figure = new_figure(11.0, 1.6 + 0.26 * len(rows))
-    ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
+    names = [wrapped(row["quantity"], 0.36 * width, size=7) for row in rows]
+    lines = sum(name.count("\n") + 1 for name in names)
+    title = wrapped(title, width - 0.3)
+    figure = new_figure(width, 0.9 + 0.15 * (lines + len(rows)) + 0.14 * title.count("\n"))
+    ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for y, row in enumerate(rows):
-        colour, reference = BLUE if row["passed"] else RED, row["reference"]
+        style: dict[str, Any] = {"color": BLUE if row["passed"] else RED, "marker": "o" if row["passed"] else "X"}
+        reference = row["reference"]
         if reference:
             error = abs(row["standard_error"] / reference)
-            ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, fmt="o", ms=4, color=colour)
+            ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, linestyle="none", **style)
         if math.isfinite(row["z"]):
-            deviation.plot(row["z"], y, "o", ms=4, color=colour)
-    ratio.axvline(0.0, color="0.6", lw=0.8)
+            deviation.plot(row["z"], y, **style)
+    ratio.axvline(0.0, color="0.6", linewidth=0.8)
     ratio.set_xlabel("value / reference − 1")
-    ratio.set_yticks(range(len(rows)), [row["quantity"] for row in rows], fontsize=8)
-    ratio.invert_yaxis()
-    deviation.axvspan(-2.0, 2.0, color="0.92")
-    deviation.set_xlabel("z")
-    figure.suptitle(title, fontsize=10)
+    ratio.set_yticks(range(len(rows)), names)
+    ratio.set_ylim(len(rows) - 0.5, -0.5)
+    deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
+    deviation.set_xlabel(wrapped("z [standard errors]", 0.22 * width))
+    for axis in (ratio, deviation):
+        axis.locator_params(axis="x", nbins=4)
+        axis.xaxis.minorticks_on()
+        plain_axis(axis)
+    figure.suptitle(title)
     return save(figure, path)

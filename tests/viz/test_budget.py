@@ -21,8 +21,9 @@ def test_pictures_are_written_whole(tmp_path):
     assert len(figure.axes) == 4
     assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["1", "3", "9"]
     assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == [
-        "uwoc-clear (0.149/m)",
-        "uwoc-harbour (2.17/m)",
+        "not reached: over 1 % false peaks",
+        "uwoc-clear, c = 0.149 1/m",
+        "uwoc-harbour, c = 2.17 1/m",
     ]
     for of in ("budget", "depth-error"):
         figure = draw_sweep(spadwarp.sweep(SCENE, vary="medium.extinction=0.1:2:3", of=of), tmp_path / f"{of}.pdf")

@@ -1,0 +1,244 @@
+"""Every kind of picture at the widths of a page and of a column: no texts overlap, none is cut."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+import spadwarp
+from helpers import datasets
+from helpers.picture_texts import cut, overlapping, texts
+from helpers.synthetic_result import make_result, make_scene
+from spadwarp.frames import record_frames
+from spadwarp.mesh import describe_mesh
+from spadwarp.viz import evaluation, style, transient_video, validation
+from spadwarp.viz import learning_curves as curves
+from spadwarp.viz.depth import draw_denoised, draw_depth
+
+FOLDER = os.environ.get("SPADWARP_TEST_PICTURES")  # where the pictures stay, to be looked at
+METHODS = ("input", "median", "gating", "bm3d", "usdn", "dncnn", "pyramid")
+LEVELS = ("0.042", "0.183", "0.264", "0.337", "0.394", "0.480")
+
+
+@pytest.fixture(scope="module")
+def result():
+    laser = {"position": [0.1, 0.0, 0.0], "repetition_rate": 5e6, "pulse_fwhm_ps": 100.0}
+    return make_result(make_scene(width=32, height=24, bins=96, laser=laser))
+
+
+@pytest.fixture(scope="module")
+def frames(result):
+    return spadwarp.detect(result, pulses=2_000_000, frames=2, seed=4, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def recording(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "frames.h5"
+    return record_frames(result, path, pulses=2_000_000, frames=1, seed=4, methods=("peak", "matched"), device="cpu")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return datasets.make(datasets.recipe(), tmp_path_factory.mktemp("data") / "set").folder
+
+
+@pytest.fixture(scope="module")
+def mesh(tmp_path_factory):
+    import trimesh
+
+    path = tmp_path_factory.mktemp("mesh") / "a_mesh_with_a_rather_long_name.stl"
+    trimesh.creation.torus(1.0, 0.3).export(path)
+    return describe_mesh(path)
+
+
+SCENE = make_scene(width=12, height=8)
+
+
+def scores():
+    random = np.random.default_rng(1)
+    fields = {"psnr": 20.0, "ssim": 0.5, "entropy": 3.0, "rmse_mm": 50.0, "edge_mm": 9.0}
+    keys = [(m, t, level) for m in METHODS for t in ("staircase", "diver_helmet") for level in LEVELS]
+    return {key: {name: top * random.uniform(0.5, 1.0) for name, top in fields.items()} for key in keys}
+
+
+def samples():
+    truth = np.full((24, 32), np.nan, np.float32)
+    truth[5:20, 8:25] = np.linspace(14.0, 15.0, 17)
+    found = np.where(np.random.default_rng(1).random((24, 32)) < 0.1, np.nan, np.nan_to_num(truth, nan=15.5))
+    caption = "diver_helmet, backscatter fraction 0.183; 34.1 signal photons, 1.3 attenuation lengths one way, sample 3"
+    return [(truth, (13.5, 16.0), dict.fromkeys(METHODS, found), caption)] * 2
+
+
+def rows():
+    return [
+        {"quantity": name, "value": 1.01, "reference": 1.0, "standard_error": 0.02, "z": 0.5, "passed": passed}
+        for name, passed in {
+            "mean free path [m]": True,
+            "second moment of the distance across the beam [m²]": False,
+        }.items()
+    ]
+
+
+def draw_scores(path, width, **_):
+    names = {"methods": METHODS, "targets": ("staircase", "diver_helmet"), "levels": LEVELS}
+    evaluation.draw_scores(scores(), path, note="64 frames of 256 x 192 pixels; split test", width=width, **names)
+
+
+def draw_samples(path, width, **_):
+    evaluation.draw_samples(samples(), path, methods=METHODS, note="split test", rescaled=True, width=width)
+
+
+def draw_ranking(path, width, **_):
+    better = {"psnr": True, "ssim": True, "rmse_mm": False, "edge_mm": False}
+    means = {name: scores()[name, "staircase", "0.042"] for name in METHODS}
+    evaluation.draw_ranking(means, path, larger_is_better=better, note="split test", width=width)
+
+
+def draw_reliability(path, width, **_):
+    table = np.stack([np.full(10, 500), np.linspace(20, 480, 10)], axis=1).astype(np.int64)
+    tables = {(name, of): table for name in ("pyramid", "histograms") for of in ("target", "confidence")}
+    evaluation.draw_reliability(tables, path, note="scenes that no training saw", width=width)
+
+
+def draw_photon_sweep(path, width, **_):
+    photons = np.geomspace(1.0, 1000.0, 7)
+    error = 0.1 / np.sqrt(photons) * np.ones((3, 1))
+    rmse = {name: (2 + k) * error for k, name in enumerate(("input", "median", "pooled", "histograms"))}
+    ratios = (0.1, 1.0, 10.0)
+    evaluation.draw_photon_sweep(rmse, error, path, photons=photons, sbr=ratios, note="a wall", width=width)
+
+
+def draw_curves(path, width, **_):
+    log = [
+        {"step": 5000 * k, "loss": 1.0 / (k + 1), "psnr": {level: 20.0 + k for level in LEVELS}} for k in range(1, 9)
+    ]
+    curves.draw_learning_curves(log, path, title="pyramid, seed 0", width=width)
+
+
+def draw_before_and_after(path, width, truth=True, **_):
+    clean, gate, images, _ = samples()[0]
+    noisy, found = clean + np.float32(0.2), images["pyramid"]
+    options = {"truth": clean} if truth else {}
+    draw_denoised(noisy, found, path, gate=gate, title="frames.h5: histograms", width=width, **options)
+
+
+def draw_budget(path, width, **_):
+    found = spadwarp.budget(SCENE, ranges=np.linspace(1, 40, 14), media=["uwoc-clear", "jerlov-1C-williamson"])
+    spadwarp.viz.draw_budget(found, path, width=width)
+
+
+def draw_sweep(path, width, of="budget", vary="medium.extinction=0.1:0.4:4", **_):
+    spadwarp.viz.draw_sweep(spadwarp.sweep(SCENE, vary=vary, of=of, device="cpu"), path, width=width)
+
+
+def draw_video(path, width, result, **_):
+    transient_video._figure(result.detections, "detections per pulse, pixel and bin", "log")[0].savefig(path)
+
+
+def draw_analytic(path, width, **_):
+    maps = spadwarp.simulate_analytic(SCENE, frames=1, seed=1, device="cpu")
+    spadwarp.viz.draw_analytic(maps, path, width=width)
+
+
+def draw_narrow(path, width, **_):
+    empty = make_result(make_scene(width=30, height=3, bins=8, targets=[]), empty=True)
+    empty.plot("depth", method="peak", width=width).savefig(path)
+
+
+def draw_case(path, width, **_):
+    validation.draw_validation(rows(), path, title="moments: where photons are after n collisions", width=width)
+
+
+PICTURES = {
+    "depth": lambda path, width, result, **_: result.plot("depth", width=width).savefig(path),
+    "intensity": lambda path, width, result, **_: result.plot("intensity", width=width).savefig(path),
+    "truth": lambda path, width, result, **_: result.plot("truth", width=width).savefig(path),
+    "histogram": lambda path, width, result, **_: result.plot("histogram", width=width).savefig(path),
+    "narrow": draw_narrow,
+    "frames": lambda path, width, frames, **_: frames.plot(width=width).savefig(path),
+    "scene": lambda path, width, **_: SCENE.plot(width=width).savefig(path),
+    "recording": lambda path, width, recording, result, **_: spadwarp.viz.draw_recording(
+        recording, result, path, width=width
+    ),
+    "analytic": draw_analytic,
+    "depth_alone": lambda path, width, result, **_: draw_depth(
+        result.truth.depth.astype(float), result.intensity, path, label="depth z [m]", title="Depth (peak)", width=width
+    ),
+    "denoised": draw_before_and_after,
+    "denoised_alone": lambda path, width, **_: draw_before_and_after(path, width, truth=False),
+    "budget": draw_budget,
+    "sweep": draw_sweep,
+    "sweep_error": lambda path, width, **_: draw_sweep(path, width, of="depth-error"),
+    "sweep_flat": lambda path, width, **_: draw_sweep(path, width, vary="laser.wavelength_nm=530:534:3"),
+    "sweep_names": lambda path, width, **_: draw_sweep(
+        path, width, vary="medium.preset=uwoc-clear,uwoc-coastal,jerlov-1C-williamson,uwoc-harbour"
+    ),
+    "dataset": lambda path, width, data, **_: spadwarp.viz.draw_dataset(data, path, frames=6, width=width),
+    "targets": lambda path, width, **_: spadwarp.viz.draw_targets(
+        path, names=["staircase", "naval_mine", "plane", "diver_helmet"], pixels=32, width=width, device="cpu"
+    ),
+    "mesh": lambda path, width, mesh, **_: spadwarp.viz.draw_mesh(mesh, path, pixels=32, width=width, device="cpu"),
+    "learning_curves": draw_curves,
+    "validation": draw_case,
+    "scores": draw_scores,
+    "samples": draw_samples,
+    "ranking": draw_ranking,
+    "reliability": draw_reliability,
+    "photon_sweep": draw_photon_sweep,
+    "video": draw_video,
+}
+
+
+@pytest.mark.parametrize("width", [style.PAGE, style.COLUMN], ids=["page", "column"])
+@pytest.mark.parametrize("kind", PICTURES)
+def test_texts_stand_alone_and_whole(kind, width, tmp_path, monkeypatch, request):
+    draw = PICTURES[kind]
+    wanted = draw.__code__.co_varnames[2 : draw.__code__.co_argcount]
+    given = {name: request.getfixturevalue(name) for name in wanted if name not in ("of", "vary", "truth")}
+    drawn = []
+    original = style.PaperFigure.savefig
+
+    def savefig(figure, *arguments, **options):
+        drawn.append(figure)
+        if FOLDER:
+            Path(FOLDER).mkdir(exist_ok=True)
+            original(figure, Path(FOLDER) / f"{kind}_{width:g}.png")
+
+    monkeypatch.setattr(style.PaperFigure, "savefig", savefig)
+    monkeypatch.setattr(style, "atomic_path", _no_file)
+    draw(tmp_path / "picture.png", width, **given)
+    (figure,) = drawn
+    found = texts(figure)
+    assert cut(found, figure) == []
+    assert overlapping(found) == []
+
+
+class _no_file:
+    def __init__(self, path):
+        self.path = path
+
+    def __enter__(self):
+        return self.path
+
+    def __exit__(self, *_):
+        pass
+
+
+def test_methods_differ_in_colour_and_marker():
+    colours = [to_rgb(colour) for _, colour, *_ in evaluation.METHODS.values()]
+    distance = [np.abs(np.subtract(a, b)).max() for k, a in enumerate(colours) for b in colours[:k]]
+    assert min(distance) > 0.14
+    assert len({marker for _, _, marker, _ in evaluation.METHODS.values()}) == len(evaluation.METHODS)
+
+
+def test_the_style_is_for_figures_of_ones_own_too():
+    import matplotlib
+
+    before = dict(matplotlib.rcParams.copy())
+    with matplotlib.style.context(style.STYLE):
+        assert matplotlib.rcParams["font.size"] == 8.0
+    with style.paper():
+        pass
+    assert all(matplotlib.rcParams[name] == value for name, value in before.items() if name != "backend")
