@@ -225,7 +225,8 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
     invoke("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5 and "http" not in page
+    page, pictures = re.subn(r"data:image/png;base64,[\w+/=]+", "", page)  # any letters may follow there
+    assert pictures == 5 and "http" not in page
     assert re.search(r"[+-]\d+\.\d\d\u00a0dB, [+-]\d+\u00a0%", page)
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert {row["method"] for row in scores["scores"]} == {"input", "median"}
