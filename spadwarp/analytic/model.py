@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.scene import WaterLine, phase_function, water_lines
+from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
 from spadwarp.scene.geometry import depth_per_time
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def pixel_maps(
         outliers: Whether `outlier_probability` is wanted, which takes most of the time; else it is NaN.
 
     Returns:
-        float64 maps `[P]`, and the table.
+        float64 maps `[P]`, `daylight` [1/s] among them, and the table.
 
     Raises:
         ConfigError: A scene that the model does not cover.
@@ -105,6 +105,9 @@ def pixel_maps(
         total_d = on_device(np.full(distances.shape, chosen.backscatter_rate * (stop - start)))
         ends = np.array([[start * scene.medium.pulse_speed, stop * scene.medium.pulse_speed]], np.float32)
         table = BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32))
+    ambient = daylight_rate(
+        scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
+    )
     statistics = kernels.statistics_maps(
         lidar,
         phase_d,
@@ -118,9 +121,11 @@ def pixel_maps(
         pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
         outliers=outliers,
         lines=lines_d,
+        ambient=None if scene.daylight is None else on_device(ambient),
     )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
     maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy()}
+    maps["daylight"] = ambient
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}
     _check_alpha(scene, maps["alpha"])
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -159,7 +159,7 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
             device=device,
             gate=(start, stop),
         )
-        background = maps["backscatter"] + scene.detector.noise_rate * (stop - start)
+        background = maps["backscatter"] + (scene.detector.noise_rate + maps["daylight"]) * (stop - start)
         needed = _pulses_needed(scene, maps, background, stop - start, device)
         for i, distance in enumerate(inside):
             rows.append(

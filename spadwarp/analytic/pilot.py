@@ -22,6 +22,7 @@ from spadwarp.frames import crlb_from_histogram, detect, detector_response, firs
 from spadwarp.frames.estimators import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import merge
+from spadwarp.scene import noise_rate
 from spadwarp.scene.geometry import depth_from_range, depth_per_time, pixel_directions, range_from_path
 from spadwarp.transport import simulate, truth_maps
 from spadwarp.units import path_from_time
@@ -166,7 +167,7 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
     signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
     bound, shot = _bounds(both, device)
-    noise = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
+    noise = float(np.median(noise_rate(scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
         unscattered=median(both.component("ballistic").sum(axis=-1) * scale),
@@ -234,7 +235,7 @@ def _bounds(result: Result, device: str | None) -> tuple[Floats, Floats]:
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
-    background = result.component("backscatter") * scale + scene.detector.noise_rate * scene.gate.bin_width
+    background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     options: dict[str, Any] = {
         "bin_width": scene.gate.bin_width,
         "pulses": 1,

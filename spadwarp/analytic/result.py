@@ -34,6 +34,7 @@ class AnalyticResult:
         signal: S, expected detections of the return per pulse (eq 7); 0 without a return.
         arrival: μ [s] after the pulse left the laser; NaN where nothing is hit.
         backscatter: Expected backscatter detections per pulse within the gate.
+        daylight: Detections of daylight [1/s]; 0 without `[daylight]`.
         alpha: α, all expected detections per pulse within the gate (integral of eq 8).
         fisher: F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate.
         sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
@@ -53,6 +54,7 @@ class AnalyticResult:
     signal: Map
     arrival: Map
     backscatter: Map
+    daylight: Map
     alpha: Map
     fisher: Map
     sigma_time: Map
@@ -159,6 +161,6 @@ class AnalyticResult:
 
 def background_photons(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
     """Expected background photons per pulse within the gate, and the part of them that is flat over the gate, `[P]`."""
-    dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
+    dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
     noise = maps["backscatter"] + dark
     return noise, np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from spadwarp.checks.daylight import check_daylight
 from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
 from spadwarp.checks.optics import check_focus, check_scan
@@ -28,6 +29,7 @@ _CHECKS = (
     check_scan,
     check_timing,
     check_spectrum,
+    check_daylight,
     check_medium,
     check_statistics,
 )

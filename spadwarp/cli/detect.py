@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 # What a detector sees of a scene; the rest has decided which photons came.
 _DETECTOR_FIELDS = (
     "detector",
+    "daylight",
     *(f"laser.{name}" for name in ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps")),
     *(f"laser.{name}" for name in ("linewidth_nm", "spectrum")),
 )
@@ -58,7 +59,8 @@ def detect(
     """Frames of counts that the camera would record.
 
     Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
-    takes fields of the detector, and of the laser its energy or power, repetition_rate, pulse_fwhm_ps and spectrum.
+    takes fields of the detector and of daylight, and of the laser its energy or power, repetition_rate, pulse_fwhm_ps
+    and spectrum.
 
     \b
     Example:

@@ -126,7 +126,7 @@ def _background(
     if not math.isnan(draw.fractions[0]):
         # The backscatter fraction counts all pixels, those that look into open water as well.
         return np.where(backscatter > 0, 1.0, 0.0), np.zeros_like(backscatter), np.array(draw.fractions)
-    dark = scene.detector.noise_rate * (scene.gate.stop - scene.gate.start)
+    dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
     noise = backscatter + dark
     # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
     alone = -np.expm1(-scene.pulses_per_depth_frame * noise)

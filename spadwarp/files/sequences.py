@@ -19,6 +19,7 @@ from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
 from spadwarp.result.result import Result
+from spadwarp.scene import noise_rate
 
 __all__ = ["open_source", "sequence"]
 
@@ -137,7 +138,7 @@ def _of_dataset(reader: FrameReader) -> FrameSequence:
         if not photons[row]:
             return SequenceFrame(**common)
         cubes = histograms[number]
-        noise = scene.detector.noise_rate * scene.gate.bins * scene.gate.bin_width
+        noise = float(np.mean(noise_rate(scene))) * scene.gate.bins * scene.gate.bin_width
         return SequenceFrame(
             counts=np.moveaxis(cubes["counts"], 0, -1).astype(np.uint32),
             expected=np.ascontiguousarray(np.moveaxis(cubes["expected"], 0, -1)),

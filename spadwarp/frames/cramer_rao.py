@@ -12,6 +12,7 @@ from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 from spadwarp.limits import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
+from spadwarp.scene import noise_rate
 
 __all__ = ["crlb", "crlb_from_histogram"]
 
@@ -101,7 +102,7 @@ def crlb(
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
-    background = result.component("backscatter") * scale + scene.detector.noise_rate * scene.gate.bin_width
+    background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     return crlb_from_histogram(
         signal,
         background,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spadwarp.result.result import Result
-from spadwarp.scene import detection_efficiency
+from spadwarp.scene import detection_efficiency, noise_rate
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -76,7 +76,11 @@ def monte_carlo_noise(
     scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
     # Bins are nearly independent: a history adds to few of those of one pixel.
     error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
-    expected = result.intensity * scale + detector.noise_rate * (scene.gate.stop - scene.gate.start)
+    seen = scene.model_copy(update={"detector": detector, "laser": laser})
+    noise = noise_rate(seen, result.truth)
+    expected = result.intensity * scale + (noise[..., 0] if np.ndim(noise) else noise) * (
+        scene.gate.stop - scene.gate.start
+    )
     # A first-photon detector counts one a pulse at most, of light and error in the same measure.
     counted = pulses * (-np.expm1(-expected) if detector.mode == "first_photon" else expected)
     ratios = np.sqrt(counted) * np.divide(error, expected, out=np.zeros_like(error), where=expected > 0)

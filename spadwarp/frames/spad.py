@@ -22,7 +22,7 @@ from spadwarp.frames.response import InstrumentResponse, detector_response, resp
 from spadwarp.frames.window import Window, detector_window, missing_light
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
 from spadwarp.result.file import as_result
-from spadwarp.scene import Detector, Laser, detection_efficiency
+from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 
 __all__ = ["detect"]
 
@@ -42,6 +42,7 @@ def detect(
     bin_width: float | None = None,
     irf: InstrumentResponse | None = None,
     background: Any = None,
+    ambient: ArrayLike | None = None,
     window: tuple[float, int] | None = None,
     tdc_widths: ArrayLike | None = None,
     first_frame: int = 0,
@@ -73,6 +74,8 @@ def detect(
         irf: The response; default: from laser and detector. `InstrumentResponse()` where the source has it already.
         background: The part of `source` that is not target, of the same shape, for the estimators; default: the
             backscatter of a Result.
+        ambient: Detected ambient light [1/s], a number or `[H, W]`, on top of `detector.ambient_rate`; default: the
+            daylight of a Result's scene, on what its pixels see.
         window: (start [s], bins) of the detector; default: those of the source, cut to the period where time wraps.
             If the source is longer than the window, the near-range backscatter of later pulses is wrapped into it.
         tdc_widths: Relative widths of the window's bins, `[bins]`; their mean counts as `bin_width`.
@@ -94,6 +97,9 @@ def detect(
         detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
         if background is None:
             background = source.component("backscatter") * detections_per_photon
+        if ambient is None and scene.daylight is not None:
+            lit = scene.model_copy(update={"detector": detector, "laser": laser})
+            ambient = noise_rate(lit, source.truth)[..., 0] - detector.noise_rate
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
@@ -109,7 +115,7 @@ def detect(
     if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     irf = detector_response(detector, laser) if irf is None else irf
-    camera = _Camera(detector, laser, irf, window, tdc_widths, camera_seed)
+    camera = _Camera(detector, laser, irf, window, tdc_widths, camera_seed, ambient)
     with in_torch_order(source, background, out):
         light = _expected(source, background, camera, (gate_start, bin_width), device)
         drawn = _draw(light, detector, is_torch(source), numbers, summed=summed, tags=tags, out=out)
@@ -152,6 +158,7 @@ class _Camera(NamedTuple):
     window: tuple[float, int] | None
     tdc_widths: ArrayLike | None
     seed: int
+    ambient: ArrayLike | None
 
 
 class _Light(NamedTuple):
@@ -194,6 +201,9 @@ def _expected(source: Any, background: Any, camera: _Camera, axis: tuple[float, 
         device=rows.device,
     )
 
+    if camera.ambient is not None:
+        noise = _with_ambient(noise, camera.ambient, shape)
+
     def with_noise(light: Any) -> Any:
         return kernels.expected_detections(light, **matrix._asdict(), width=np.diff(window.edges), noise_rate=noise)
 
@@ -213,6 +223,19 @@ def _expected(source: Any, background: Any, camera: _Camera, axis: tuple[float, 
             raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
         expected_background = with_noise(known)
     return _Light(hazard, expected_background, window, (shape[0], shape[1]))
+
+
+def _with_ambient(noise: Any, ambient: ArrayLike, shape: tuple[int, ...]) -> Any:
+    """Rates of the pixels with ambient light on top [1/s]."""
+    import warp as wp
+
+    values = np.asarray(ambient, np.float64)
+    if values.shape not in ((), shape[:2]):
+        raise ArgumentError(f"ambient has shape {values.shape}; a number or {shape[:2]} is needed")
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        raise ArgumentError("ambient holds a value outside [0, inf)")
+    rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
+    return wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
 
 
 def _noise_alone(window: Window, noise: Any, *, equal_bins: bool) -> Any:

@@ -4,9 +4,11 @@
 `preset`; the file's own fields lie over it and overrides over both. SI units, except where a name carries its unit.
 """
 
+from spadwarp.scene.ambient_light import daylight_radiance, daylight_rate, downwelling_irradiance, noise_rate
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.calibration import load_calibration, save_calibration
 from spadwarp.scene.camera import Camera
+from spadwarp.scene.daylight import Daylight
 from spadwarp.scene.detector import Detector
 from spadwarp.scene.domain import Domain
 from spadwarp.scene.gate import Gate
@@ -34,6 +36,7 @@ from spadwarp.scene.transport import Transport
 __all__ = [
     "Analytic",
     "Camera",
+    "Daylight",
     "Detector",
     "Domain",
     "Gate",
@@ -51,11 +54,15 @@ __all__ = [
     "Transport",
     "WaterLine",
     "as_scene",
+    "daylight_radiance",
+    "daylight_rate",
     "detection_efficiency",
+    "downwelling_irradiance",
     "filter_transmission",
     "load_calibration",
     "load_scene",
     "look_at",
+    "noise_rate",
     "opencv_pose",
     "parse_override",
     "phase_function",

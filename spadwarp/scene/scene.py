@@ -17,6 +17,7 @@ from spadwarp.limits import shown
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
 from spadwarp.scene.camera import Camera
+from spadwarp.scene.daylight import Daylight
 from spadwarp.scene.detector import Detector
 from spadwarp.scene.domain import Domain
 from spadwarp.scene.gate import Gate
@@ -47,6 +48,7 @@ class Scene(BaseModel):
     scan: Scan = Scan()
     detector: Detector = Detector()
     gate: Gate
+    daylight: Daylight | None = None
     targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
     domain: Domain = Domain()
     transport: Transport = Transport()
@@ -69,6 +71,12 @@ class Scene(BaseModel):
                 "camera.pinhole = true does not go with transport.estimator = 'analog', whose photons cannot hit a "
                 "point: take a small aperture_diameter, or next_event or guided"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _daylight_in_one_water(self) -> Self:
+        if self.daylight is not None and self.medium.layers:
+            raise ValueError(f"medium.layers: {len(self.medium.layers)} given; daylight takes one water")
         return self
 
     @classmethod
@@ -142,7 +150,8 @@ class Scene(BaseModel):
         """Tables from which `from_dict` makes an equal scene."""
         tables: dict[str, Any] = {}
         for name, section in self:
-            tables[name] = [target.to_dict() for target in section] if name == "targets" else section.to_dict()
+            if section is not None:
+                tables[name] = [target.to_dict() for target in section] if name == "targets" else section.to_dict()
         if not tables["targets"]:
             del tables["targets"]
         return tables

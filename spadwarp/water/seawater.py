@@ -91,7 +91,7 @@ def water_optics(
     Raises:
         ArgumentError: A value outside its range.
     """
-    _check(wavelength_nm=wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
+    check_ranges(wavelength_nm=wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
     water = {"temperature": temperature, "salinity": salinity}
     absorption, scattering = pure_water_absorption(wavelength_nm), pure_water_scattering(wavelength_nm, **water)
     particles, dissolved, scatterers = _case_1(wavelength_nm, chlorophyll) if chlorophyll > 0.0 else (0.0, 0.0, 0.0)
@@ -112,7 +112,7 @@ def refractive_index(wavelength_nm: ArrayLike, *, temperature: ArrayLike = 20.0,
     Wavelength in vacuum 400 to 700 [nm], temperature 0 to 30 [°C], salinity 0 to 40 [g/kg] (the fit: to 35); arrays
     broadcast. Raises `ArgumentError` for a value outside its range.
     """
-    _check(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
+    check_ranges(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
     constant, first, second, third = _quan_fry(temperature, salinity)
     wavelength = np.asarray(wavelength_nm, float)
     return _value(constant + first / wavelength + second / wavelength**2 + third / wavelength**3)
@@ -120,7 +120,7 @@ def refractive_index(wavelength_nm: ArrayLike, *, temperature: ArrayLike = 20.0,
 
 def group_index(wavelength_nm: ArrayLike, *, temperature: ArrayLike = 20.0, salinity: ArrayLike = 35.0) -> Value:
     """Group index n − λ·dn/dλ of fresh or sea water, with which pulses travel; arguments as in `refractive_index`."""
-    _check(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
+    check_ranges(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
     constant, first, second, third = _quan_fry(temperature, salinity)
     wavelength = np.asarray(wavelength_nm, float)
     return _value(constant + 2.0 * first / wavelength + 3.0 * second / wavelength**2 + 4.0 * third / wavelength**3)
@@ -132,8 +132,8 @@ def pure_water_absorption(wavelength_nm: ArrayLike) -> Value:
 
     Wavelength in vacuum 400 to 700 [nm]. Raises `ArgumentError` for one outside.
     """
-    _check(wavelength_nm=wavelength_nm)
-    wavelength, absorption = _table("pure_water_absorption")
+    check_ranges(wavelength_nm=wavelength_nm)
+    wavelength, absorption = table_columns("pure_water_absorption")
     return _value(np.interp(np.asarray(wavelength_nm, float), wavelength, absorption))
 
 
@@ -145,7 +145,7 @@ def pure_water_scattering(
     By fluctuations of density and of the salts' concentration; symmetric about 90° and nearly even in all directions.
     Arguments as in `refractive_index`.
     """
-    _check(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
+    check_ranges(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
     wavelength, t, s = np.broadcast_arrays(*(np.asarray(one, float) for one in (wavelength_nm, temperature, salinity)))
     # Quan & Fry's index counts from air (Ciddor 1996).
     inverse = (1000.0 / wavelength) ** 2
@@ -200,7 +200,7 @@ def _quan_fry(temperature: ArrayLike, salinity: ArrayLike) -> tuple[Any, Any, fl
 
 def _case_1(wavelength_nm: float, chlorophyll: float) -> tuple[float, float, float]:
     """Absorption by particles and by dissolved matter, and scattering by particles [1/m]."""
-    wavelength, factor, exponent = _table("particle_absorption")
+    wavelength, factor, exponent = table_columns("particle_absorption")
 
     def particles(at: float) -> float:
         return float(np.interp(at, wavelength, factor) * chlorophyll ** np.interp(at, wavelength, exponent))
@@ -212,14 +212,14 @@ def _case_1(wavelength_nm: float, chlorophyll: float) -> tuple[float, float, flo
 
 
 @functools.cache
-def _table(name: str) -> tuple[NDArray[np.float64], ...]:
+def table_columns(name: str) -> tuple[NDArray[np.float64], ...]:
     """Columns of a table that comes with the package."""
     lines = (files("spadwarp.water") / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
     rows = [line.split(",") for line in lines if line[0].isdigit()]
     return tuple(np.array(rows, dtype=float).T)
 
 
-def _check(**values: ArrayLike) -> None:
+def check_ranges(**values: ArrayLike) -> None:
     for name, value in values.items():
         low, high = _RANGES[name]
         try:

@@ -76,6 +76,7 @@ def _integrate_pulse(
     view: wp.vec3d,
     s: wp.float64,
     mu: wp.float64,
+    ambient: wp.float64,
 ) -> PulseIntegrals:
     """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there, 24
     panels of at most σ/2 with five Gauss-Legendre nodes."""
@@ -89,11 +90,11 @@ def _integrate_pulse(
             high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
         half = (high - low) / wp.float64(48.0)
         if half > ZERO:
-            right = background_rate(lidar, lines, phase, profile, i, view, side, low)
+            right = background_rate(lidar, lines, phase, profile, i, view, side, low) + ambient
             for panel in range(24):
                 middle = low + (TWO * wp.float64(panel) + ONE) * half
                 left = wp.float64(right)
-                right = background_rate(lidar, lines, phase, profile, i, view, side, middle + half)
+                right = background_rate(lidar, lines, phase, profile, i, view, side, middle + half) + ambient
                 for node in range(5):
                     rule = _gauss_legendre(node)
                     x = rule[0]
@@ -104,7 +105,7 @@ def _integrate_pulse(
                     # Straight across a panel; only a profile can have more detail than that.
                     noise_rate = HALF * (left + right) + HALF * (right - left) * x
                     if lidar.source == 2:
-                        noise_rate = background_rate(lidar, lines, phase, profile, i, view, side, t)
+                        noise_rate = background_rate(lidar, lines, phase, profile, i, view, side, t) + ambient
                     rate = noise_rate + pulse
                     if rate > ZERO:
                         total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
@@ -124,6 +125,7 @@ def _statistics(
     signal: wp.array(dtype=wp.float64),
     arrival: wp.array(dtype=wp.float64),
     backscatter: wp.array(dtype=wp.float64),
+    ambient: wp.array(dtype=wp.float64),
     count_law: int,
     acquisitions: wp.float64,
     pulses_per_frame: wp.float64,
@@ -141,7 +143,8 @@ def _statistics(
     mu = arrival[i]
     sigma = lidar.sigma
     gate = lidar.stop - lidar.start
-    noise = lidar.dark * gate + backscatter[i]
+    beside = ambient[i % ambient.shape[0]]
+    noise = lidar.dark * gate + backscatter[i] + beside * gate
     fraction = wp.float64(0.0)
     if s > ZERO:
         fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
@@ -149,7 +152,7 @@ def _statistics(
     alpha[i] = a
     pulse = PulseIntegrals()
     if s * fraction > ZERO:
-        pulse = _integrate_pulse(lidar, lines, phase, profile, i, view[i], s, mu)
+        pulse = _integrate_pulse(lidar, lines, phase, profile, i, view[i], s, mu, beside)
     counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
     f = wp.float64(0.0)
     sigma_star = wp.float64(wp.nan)
@@ -230,6 +233,7 @@ def statistics_maps(
     pulses_per_frame: float = 1.0,
     outliers: bool = True,
     lines: wp.array | None = None,
+    ambient: wp.array | None = None,
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
@@ -247,6 +251,7 @@ def statistics_maps(
         pulses_per_frame: ην, for the laws per frame.
         outliers: Whether their probability is wanted, which takes most of the time; else it is NaN.
         lines: As for `single_scatter_table`, used where `lidar.source` is 1.
+        ambient: float64 `[1 or pixel]`, rate of each pixel on top of `lidar.dark` [1/s].
 
     Where no signal falls into the gate, F is 0, and σ* and the outlier probability are NaN.
 
@@ -271,7 +276,12 @@ def statistics_maps(
         wp.float64(pulses_per_frame),
         int(bool(outliers)),
     ]
-    inputs = [lidar, spectral_lines(lidar, lines, device), phase, profile, view, signal, arrival, backscatter]
+    if ambient is None:
+        ambient = wp.zeros(1, dtype=wp.float64, device=device)
+    check_array("ambient", ambient, wp.float64, (None,), device)
+    if ambient.size not in (1, count):
+        raise ArgumentError(f"ambient has {ambient.size} entries; 1 or {count} are needed")
+    inputs = [lidar, spectral_lines(lidar, lines, device), phase, profile, view, signal, arrival, backscatter, ambient]
     launch_pixels(_statistics, count, [*inputs, *counting, *out], device=device)
     return out
 

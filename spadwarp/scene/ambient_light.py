@@ -1,0 +1,327 @@
+"""Daylight that the pixels detect: radiance in the water and on targets, through aperture, filter and detector.
+
+Quasi-single scattering (Gordon 1973): light scattered forward counts as not scattered, so that radiance along a line of
+sight is attenuated by κ = a + b_b, and all of the light field falls with depth as the downwelling irradiance,
+exp(−K_d·z). What a stretch ds of water sends to the lens is then J ds, J = ∫ b·p(Θ)·L dΩ over the sun and the sky in
+the water. Surfaces reflect sun, sky and the light of the water.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.errors import ConfigError
+from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.medium import Medium
+from spadwarp.scene.phase import PhaseFunction, phase_function
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.spectrum import filter_band, filter_transmission
+from spadwarp.units import PLANCK, SPEED_OF_LIGHT
+from spadwarp.water.daylight import (
+    SKY_REFLECTANCE,
+    clear_sky_irradiance,
+    daylight_attenuation,
+    refracted_cosine,
+    surface_reflectance,
+)
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["daylight_radiance", "daylight_rate", "downwelling_irradiance", "noise_rate"]
+
+Floats = NDArray[np.float64]
+
+_ANGLES = np.linspace(0.0, math.pi, 1441)  # of scattering
+_BAND_NODES = 13
+_PART_PIXELS = 1 << 16
+
+
+class _Field(NamedTuple):
+    """The light at the lens at one wavelength, per nm; directions in the camera frame.
+
+    Attributes:
+        attenuation: κ = a + b_b along a line of sight [1/m].
+        decay: K_d with depth [1/m].
+        sun: Irradiance across the sun's light [W/m²].
+        sky: Radiance within Snell's window [W/m²/sr].
+        window: Cosine of its half angle.
+        towards: Direction in which the sun's light goes.
+        down: Away from the surface.
+        scattered: b·p(Θ) over `_ANGLES` [1/m/sr].
+        by_sky: What the sky sends into directions of propagation, over the cosine with `down` from -1 to 1.
+    """
+
+    attenuation: float
+    decay: float
+    sun: float
+    sky: float
+    window: float
+    towards: Floats
+    down: Floats
+    scattered: Floats
+    by_sky: Floats
+
+    def source(self, view: Floats) -> Floats:
+        """J towards the lens on lines of sight `[..., 3]` [W/m³/sr]."""
+        angle = np.arccos(np.clip(view @ -self.towards, -1.0, 1.0))
+        of_sky = np.interp(-(view @ self.down), np.linspace(-1.0, 1.0, self.by_sky.size), self.by_sky)
+        return self.sun * np.interp(angle, _ANGLES, self.scattered) + of_sky
+
+    def of_water(self, view: Floats, distance: Floats, depth: float) -> Floats:
+        """Radiance of the water up to a distance on lines of sight; up to the surface at most [W/m²/sr]."""
+        downwards = view @ self.down
+        to_surface = np.where(downwards < -1e-9, depth / np.maximum(-downwards, 1e-9), np.inf)
+        length = np.minimum(distance, to_surface)
+        rate = self.attenuation + self.decay * downwards
+        # ∫ exp(-rate s) ds; level or downwards the water may go on for ever.
+        product = np.where(np.isinf(length), np.inf, rate * np.where(np.isinf(length), 0.0, length))
+        small = np.abs(product) < 1e-8
+        safe = np.where(np.abs(rate) < 1e-12, 1e-12, rate)
+        return self.source(view) * np.where(small, length, -np.expm1(-np.where(small, 0.0, product)) / safe)
+
+    def of_sky(self, view: Floats) -> Floats:
+        """Radiance of the sky within Snell's window, at the lens."""
+        return np.where(-(view @ self.down) > self.window, self.sky, 0.0)
+
+
+def downwelling_irradiance(scene: Scene, wavelength_nm: ArrayLike, depth: float | None = None) -> Any:
+    """Spectral irradiance from above on a horizontal surface in the water [W/m²/nm], at the lens or another depth [m].
+
+    Raises `ConfigError` for a scene without `[daylight]`, `ArgumentError` outside 400 to 700 nm.
+    """
+    daylight = _daylight(scene)
+    nm = np.asarray(wavelength_nm, np.float64)
+    values = [_irradiance(scene, float(one), daylight.depth if depth is None else depth) for one in nm.ravel()]
+    total = np.array([direct + diffuse for direct, diffuse, _ in values]).reshape(nm.shape)
+    return total if nm.ndim else float(total)
+
+
+def daylight_radiance(
+    scene: Scene,
+    wavelength_nm: float,
+    view: ArrayLike,
+    *,
+    distance: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    reflectance: ArrayLike | None = None,
+) -> Floats:
+    """Spectral radiance that comes to the lens along lines of sight [W/m²/nm/sr].
+
+    Args:
+        scene: With `[daylight]`.
+        wavelength_nm: 400 to 700 [nm].
+        view: Unit vectors in the camera frame `[..., 3]`.
+        distance: To a surface `[...]` [m]; NaN or 0 for open water; default: open water.
+        normal: Of the surface, unit vectors towards the camera `[..., 3]`.
+        reflectance: Of it, Lambertian `[...]`.
+
+    Raises:
+        ConfigError: A scene without `[daylight]`.
+        ArgumentError: A wavelength out of range.
+    """
+    seen = _Seen.of(np.asarray(view, np.float64), distance, normal, reflectance)
+    return _radiance(_field(scene, wavelength_nm), seen, _daylight(scene).depth)
+
+
+def daylight_rate(
+    scene: Scene,
+    *,
+    view: ArrayLike | None = None,
+    distance: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    reflectance: ArrayLike | None = None,
+) -> Floats:
+    """Daylight detected per second and pixel [1/s]: aperture, a pixel's solid angle, filter, PDE.
+
+    Without a filter all light from 400 to 700 nm counts, with the PDP of the laser's wavelength. 0 without
+    `[daylight]`. `view`: unit vectors of pixels `[..., 3]`, default those of the camera `[H, W, 3]`; the others as in
+    `daylight_radiance`, which says what is raised.
+    """
+    camera = scene.camera
+    view = pixel_directions(camera) if view is None else np.asarray(view, np.float64)
+    if scene.daylight is None:
+        return np.zeros(view.shape[:-1])
+    nodes, widths = _band(scene)
+    photons = (
+        widths * filter_transmission(scene.laser, scene.detector, nodes) * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
+    )
+    fields = [(_field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
+    seen = _Seen.of(view, distance, normal, reflectance)
+    total = np.zeros(len(seen.view))
+    for first in range(0, len(total), _PART_PIXELS):
+        part = slice(first, first + _PART_PIXELS)
+        pixels = seen.part(part)
+        for field, weight in fields:
+            total[part] += _radiance(field, pixels, scene.daylight.depth) * weight
+    etendue = camera.aperture_area * camera.pixel_tangent**2 * view[..., 2] ** 4
+    return total.reshape(view.shape[:-1]) * etendue * scene.detector.pde
+
+
+def noise_rate(scene: Scene, truth: Any = None) -> Any:
+    """Mean counts per second without light of the laser: dark counts, ambient light, daylight [1/s].
+
+    A number without `[daylight]`, else `[H, W, 1]`; `truth`: what the pixels see, open water if not given.
+    """
+    if scene.daylight is None:
+        return scene.detector.noise_rate
+    seen = {} if truth is None else {"distance": truth.range, "normal": truth.normal, "reflectance": truth.reflectance}
+    return (daylight_rate(scene, **seen) + scene.detector.noise_rate)[..., None]
+
+
+# Parts
+
+
+class _Seen(NamedTuple):
+    """What pixels see: lines of sight `[P, 3]`, distance `[P]` (infinite in open water), and of surfaces the normal and
+    the reflectance."""
+
+    view: Floats
+    distance: Floats
+    normal: Floats
+    reflectance: Floats
+    shape: tuple[int, ...]
+
+    @classmethod
+    def of(cls, view: Floats, distance: Any, normal: Any, reflectance: Any) -> _Seen:
+        shape, count = view.shape[:-1], view[..., 0].size
+        far = np.full(count, np.inf)
+        faces, shade = np.zeros((count, 3)), np.zeros(count)
+        if distance is not None:
+            given = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0).reshape(-1)
+            far = np.where(given > 0.0, given, np.inf)
+            faces = np.nan_to_num(np.asarray(normal, np.float64)).reshape(-1, 3)
+            shade = np.nan_to_num(np.asarray(reflectance, np.float64)).reshape(-1)
+        return cls(view.reshape(-1, 3), far, faces, shade, shape)
+
+    def part(self, pixels: slice) -> _Seen:
+        """Some of the pixels."""
+        view, distance = self.view[pixels], self.distance[pixels]
+        return _Seen(view, distance, self.normal[pixels], self.reflectance[pixels], distance.shape)
+
+
+def _radiance(field: _Field, seen: _Seen, depth: float) -> Floats:
+    """Radiance that comes to the lens [W/m²/nm/sr], of the shape of what is seen."""
+    hit = np.isfinite(seen.distance)
+    total = field.of_water(seen.view, seen.distance, depth) + np.where(hit, 0.0, field.of_sky(seen.view))
+    if hit.any():
+        below = seen.distance[hit] * (seen.view[hit] @ field.down)
+        along = np.exp(-field.attenuation * seen.distance[hit] - field.decay * np.maximum(below, -depth))
+        total[hit] += seen.reflectance[hit] / math.pi * _on_faces(field, seen.normal[hit], depth) * along
+    return total.reshape(seen.shape)
+
+
+def _daylight(scene: Scene) -> Any:
+    if scene.daylight is None:
+        raise ConfigError("daylight: the scene has no such section")
+    return scene.daylight
+
+
+def _band(scene: Scene) -> tuple[Floats, Floats]:
+    """Wavelengths [nm] and what each stands for [nm], from 400 to 700 nm."""
+    band = filter_band(scene.laser, scene.detector)
+    if band is None:
+        nodes = np.linspace(400.0, 700.0, 31)
+    else:
+        open_at = band[filter_transmission(scene.laser, scene.detector, band) > 0.0]
+        low, high = (max(400.0, float(open_at[0])), min(700.0, float(open_at[-1]))) if open_at.size else (1.0, 0.0)
+        if not low < high:
+            raise ConfigError(
+                f"detector: the filter passes nothing from 400 to 700 nm, where daylight is known; it is open from "
+                f"{open_at[0] if open_at.size else 0:g} to {open_at[-1] if open_at.size else 0:g} nm"
+            )
+        coarse = np.linspace(low, high, _BAND_NODES)
+        # A table with steep sides keeps its own points.
+        inside = band[(band >= low) & (band <= high)]
+        nodes = np.unique(np.concatenate([coarse, inside])) if inside.size <= 4 * _BAND_NODES else coarse
+    widths = np.gradient(nodes)
+    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
+    return nodes, widths
+
+
+def _optics(scene: Scene, wavelength_nm: float) -> tuple[Medium, PhaseFunction]:
+    medium = scene.medium
+    if medium.follows_wavelength:
+        medium = medium.at_wavelength(wavelength_nm)
+    return medium, phase_function(medium)
+
+
+def _irradiance(scene: Scene, wavelength_nm: float, depth: float) -> tuple[float, float, float]:
+    """Of the sun and of the sky on a horizontal surface at a depth [W/m²/nm], and K_d [1/m]."""
+    daylight = _daylight(scene)
+    medium, phase = _optics(scene, wavelength_nm)
+    elevation = daylight.sun_elevation_deg
+    above = clear_sky_irradiance(
+        wavelength_nm, sun_elevation_deg=elevation, aerosol_optical_depth=daylight.aerosol_optical_depth
+    )
+    backward = phase.backscatter_fraction * medium.scattering
+    decay = daylight_attenuation(medium.absorption, backward, sun_elevation_deg=elevation)
+    factor = daylight.cloud_factor * math.exp(-decay * depth)
+    direct = above.direct * (1.0 - surface_reflectance(elevation, medium.phase_index))
+    return factor * direct, factor * above.diffuse * (1.0 - SKY_REFLECTANCE), decay
+
+
+def _field(scene: Scene, wavelength_nm: float) -> _Field:
+    daylight = _daylight(scene)
+    medium, phase = _optics(scene, wavelength_nm)
+    direct, diffuse, decay = _irradiance(scene, wavelength_nm, daylight.depth)
+    to_camera = rotation_matrix(scene.camera.rotation_deg)  # its columns are the camera's axes
+    index = medium.phase_index
+    scattered = medium.scattering * phase.density(np.maximum(_ANGLES, 2e-5))
+    sky = diffuse / (math.pi / index**2)  # even within the window: E = π L sin²
+    window = math.sqrt(1.0 - 1.0 / index**2)
+    return _Field(
+        attenuation=medium.absorption + phase.backscatter_fraction * medium.scattering,
+        decay=decay,
+        sun=direct / refracted_cosine(daylight.sun_elevation_deg, index),
+        sky=sky,
+        window=window,
+        towards=daylight.sun_direction(index) @ to_camera,
+        down=daylight.down @ to_camera,
+        scattered=scattered,
+        by_sky=sky * _window_average(scattered, window),
+    )
+
+
+def _window_average(scattered: Floats, window: float) -> Floats:
+    """∫ b·p over the directions in which the sky's light goes, for directions of propagation by their cosine with down.
+
+    Rings of equal solid angle; the forward peak within the window is light that goes on, and is left out.
+    """
+    cosines = np.linspace(-1.0, 1.0, 121)
+    rings, azimuths = 12, 32
+    mu = window + (1.0 - window) * (np.arange(rings) + 0.5) / rings
+    phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
+    weight = 2.0 * math.pi * (1.0 - window) / (rings * azimuths)
+    sines = np.sqrt(1.0 - cosines**2)[:, None, None] * np.sqrt(1.0 - mu**2)[None, :, None]
+    angles = np.arccos(np.clip(cosines[:, None, None] * mu[None, :, None] + sines * np.cos(phi), -1.0, 1.0))
+    return np.interp(np.maximum(angles, 0.1), _ANGLES, scattered).sum(axis=(1, 2)) * weight
+
+
+def _on_faces(field: _Field, normals: Floats, depth: float) -> Floats:
+    """Irradiance on faces of unit normals `[P, 3]` at the depth of the lens [W/m²/nm]: sun, sky, and the light that the
+    water sends up."""
+    rings, azimuths = 16, 24
+    down = field.down
+    first = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(down, first)
+    z = (2.0 * np.arange(rings) + 1.0) / rings - 1.0
+    phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
+    across = np.cos(phi)[:, None] * first + np.sin(phi)[:, None] * second
+    seen = (z[:, None, None] * down + np.sqrt(1.0 - z**2)[:, None, None] * across).reshape(-1, 3)
+    water = field.of_water(seen, np.full(len(seen), np.inf), depth)
+    # All light that goes down, scattered or not, is in what K_d leaves of sun and sky.
+    water[seen @ down < 0.0] = 0.0
+    # The window's edge is not on the rings: its own irradiance sets the scale.
+    inside = -seen @ down > field.window
+    sky = np.where(inside, math.pi * (1.0 - field.window**2) * field.sky / max((-seen @ down)[inside].sum(), 1e-9), 0.0)
+    solid_angle = 4.0 * math.pi / len(seen)
+    # Faces of a mesh share normals.
+    kinds, index = np.unique(np.round(normals, 4), axis=0, return_inverse=True)
+    total = np.maximum(kinds @ seen.T, 0.0) @ (water * solid_angle + sky)
+    return (total + field.sun * np.maximum(kinds @ -field.towards, 0.0))[index.reshape(-1)]
