@@ -14,7 +14,7 @@ from spadwarp.cli._app import Commands, app, fail, say
 from spadwarp.cli._progress import progress
 
 group = Commands(no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(group, name="dataset", help="Datasets of labelled depth frames: make, verify, info, preview.")
+app.add_typer(group, name="dataset", help="Datasets of labelled depth frames: make, verify, info, preview, export.")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset's folder.", show_default=False)]
 
@@ -142,6 +142,70 @@ def info(folder: Folder, overwrite: opt.Overwrite = False, json_path: opt.Json =
     outputs.write_json(manifest)
 
 
+class ExportFormat(enum.StrEnum):
+    """`spadwarp.dataset.EXPORT_FORMATS`, known without loading it."""
+
+    parquet = "parquet"
+    webdataset = "webdataset"
+    zarr = "zarr"
+
+
+@group.command(name="export")
+def export_command(
+    folder: Folder,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="A new folder for the files.", show_default=False)],
+    format: Annotated[ExportFormat, typer.Option(help="Format of the files.")] = ExportFormat.parquet,
+    fields: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--field",
+            metavar="NAME",
+            help="Image of a frame; may be repeated: noisy, clean, label, intensity, bound, normal, albedo, prior, and "
+            "of traced scenes features, counts, expected. By default the first five, and features.",
+        ),
+    ] = None,
+    frames_per_file: Annotated[
+        int, typer.Option(parser=opt.whole_number, metavar="N", help="Most frames of a Parquet file or an archive.")
+    ] = 1000,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    json_path: opt.Json = None,
+) -> None:
+    """A dataset as trainers load it in one line: depth in metres, labels, numbers.
+
+    \b
+    parquet     datasets.load_dataset(DIR) of Hugging Face
+    webdataset  train-00000.tar, ... of .npy images and one .json a frame
+    zarr        xarray.open_zarr(DIR / "frames.zarr", group="train")
+
+    With a card (README.md) and Croissant metadata (croissant.json). Needs spadwarp[datasets], but webdataset.
+
+    \b
+    Examples:
+      spadwarp dataset export data/small/ --format parquet --out data/small-parquet/
+      spadwarp dataset export data/small/ --format webdataset --field noisy --field clean --out data/small-tar/
+    """
+    outputs = opt.check_outputs(json=json_path, inputs=(folder,), overwrite=overwrite)
+    if out.resolve() == folder.resolve() or out.resolve() in folder.resolve().parents:
+        raise typer.BadParameter(f"{out} holds the dataset", param_hint="--out")
+    if out.exists() and not overwrite and not (out.is_dir() and not any(out.iterdir())):
+        raise typer.BadParameter(f"{out} exists; --overwrite replaces it", param_hint="--out")
+    with progress(quiet=quiet, unit="frames") as report:
+        spadwarp.dataset.export_dataset(
+            folder,
+            out,
+            format.value,
+            fields=fields,
+            frames_per_file=frames_per_file,
+            overwrite=overwrite,
+            progress=report,
+        )
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    if not quiet:
+        say(opt.rows({"written": f"{out}, {opt.in_bytes(size)}"}))
+    outputs.write_json({"folder": out, "bytes": size})
+
+
 class Split(enum.StrEnum):
     """What `spadwarp.dataset.FrameReader` takes as split."""
 
@@ -179,4 +243,4 @@ def preview(
     say(f"written: {path}")
 
 
-__all__ = ["group", "info", "make", "preview", "verify"]
+__all__ = ["export_command", "group", "info", "make", "preview", "verify"]

@@ -83,6 +83,7 @@ def make_dataset(
         KeyboardInterrupt: Ctrl-C, once the shards that were begun are finished.
     """
     plan = Plan(recipe if isinstance(recipe, Recipe) else load_recipe(recipe))
+    plan.check_targets()
     number, parts = check_part("part", part)
     processes = check_integer("processes", processes, "[1, 1000]")
     folder = Path(out).absolute()

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
 from spadwarp.dataset.card import card
+from spadwarp.dataset.croissant import croissant
 from spadwarp.dataset.recipe import SPLITS, load_recipe
 from spadwarp.dataset.sampling import Plan, Shard
 from spadwarp.dataset.schema import FORMAT_VERSION
@@ -59,6 +60,7 @@ class _Splits(_Strict):
 class _Manifest(_Strict):
     name: str
     version: str
+    license: str = ""
     seed: str
     frames: _Count
     scenes: _Count
@@ -196,6 +198,8 @@ def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
         files["scenes.h5"] = checksum(folder / "scenes.h5")
         manifest = _manifest(plan, files)
         write_text(card(plan, manifest), folder / "README.md")
+        described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
+        write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
         write_json(manifest, folder / "manifest.json", indent=1)
     return tuple(missing)
 
@@ -213,6 +217,7 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
         "version": __version__,
         "name": plan.recipe.name,
         "description": plan.recipe.description,
+        "license": plan.recipe.license,
         "seed": str(plan.recipe.seed),
         "frames": plan.sample_count,
         "scenes": plan.scene_count,

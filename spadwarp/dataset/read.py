@@ -80,6 +80,9 @@ class FrameReader:
             raise ArgumentError(f"crop = {crop} is outside [1, {self.shape[0]}] x [1, {self.shape[1]}]")
         splits = [self.manifest["splits"][name] for name in (SPLITS if split == "all" else (split,))]
         self.shards: list[str] = [shard for described in splits for shard in described["shards"]]
+        if not self.shards:
+            held = [name for name in SPLITS if self.manifest["splits"][name]["frames"]]
+            raise ArgumentError(f"split = {split!r}: {self.path} has no frames in it; it has {', '.join(held)}")
         if only is not None:
             if only not in self.shards:
                 raise FileError(f"{path}: not a shard of {self.path}, split {split!r}")
@@ -144,6 +147,15 @@ class FrameReader:
             shard = self._shard(number)
             values[shard.first_scene : shard.first_scene + shard.scenes.count] = shard.scenes.array(name)
         return values
+
+    @property
+    def histogram_bins(self) -> int:
+        """Bins of the histograms of traced scenes; 0 where no scene was traced."""
+        for number, name in enumerate(self.shards):
+            if name.replace("frames-", "histograms-") in self.manifest["files"]:
+                histograms = self._shard(number).histograms
+                return 0 if histograms is None else histograms.shape[-1]
+        return 0
 
     def _row(self, frame: int) -> tuple[ShardFile, int]:
         """The shard of a frame, and the frame's row in it."""

@@ -150,7 +150,16 @@ class Targets(_Table):
     )
     meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
-        3.6, ge=1e-6, le=1e6, description="longest side that meshes are scaled to [m]; none if not given"
+        None,
+        ge=1e-6,
+        le=1e6,
+        description="longest side that meshes are scaled to [m]; if not given they stay as they are",
+    )
+    mesh_scale: float = Field(1.0, ge=1e-9, le=1e9, description="metres per unit of the mesh files; 0.001 for mm")
+    orientation: Literal["camera", "y_up", "z_up"] = Field(
+        "camera",
+        description='axes of the mesh files: "camera" (+x right, +y down, +z away), "y_up" (glTF, +z to the viewer) '
+        'or "z_up" (CAD, ROS; -y to the viewer)',
     )
     exports: Names = Field((), description="*_RGBD.EXR of a game engine, or folders of them, rendered with the camera")
     export_preset: Literal["unreal", "blender"] = Field("unreal", description="program that wrote the exports")
@@ -238,6 +247,9 @@ class Recipe(_Table):
 
     name: str = Field(..., min_length=1, description="what the dataset is called")
     description: str = Field("", description="one or two sentences for its card")
+    license: str = Field(
+        "", max_length=200, description='licence of the dataset, an SPDX identifier such as "CC-BY-4.0"; for its card'
+    )
     seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of every draw; one seed gives the same dataset")
     scenes_per_target: Whole = Field(50, ge=1, le=1_000_000, description="scenes, each with its own pose and water")
     scenes_per_shard: Whole = Field(25, ge=1, le=1_000_000, description="scenes in one file, all of one target")

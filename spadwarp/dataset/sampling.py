@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
-from spadwarp.dataset.targets import TargetSource, find_targets
+from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
 from spadwarp.scene import Camera, Scene
 from spadwarp.scene.renamed import former_path
 from spadwarp.units import time_from_range
@@ -105,6 +105,10 @@ class Plan:
         self.shape = (self._template.camera.height, self._template.camera.width)
         self.depth_offset, self.depth_step = self._depth_code()
 
+    def check_targets(self) -> None:
+        """Raises `ConfigError` for mesh files that cannot be seen where the recipe puts them."""
+        check_extents(self.recipe, self.targets, self._template.camera)
+
     def split_of(self, scene_index: int) -> str:
         """The split of a scene."""
         return self.targets[scene_index // self.recipe.scenes_per_target].split
@@ -166,8 +170,8 @@ class Plan:
             "reflectance": draw("pose.reflectance", pose.reflectance),
             "scale": draw("pose.size", pose.size),
         }
-        fill, longest = draw("pose.fill", pose.fill), self.recipe.targets.mesh_size
-        targets = [source.placed(placed, longest=longest, fill=fill, camera=camera)]
+        fill = draw("pose.fill", pose.fill)
+        targets = [source.placed(placed, chosen=self.recipe.targets, fill=fill, camera=camera)]
         if draw("backdrop.probability", _UNIFORM) < wall.probability:
             behind = distance + draw("backdrop.behind", wall.behind)
             side = 4.0 * behind * camera.pixel_tangent * max(camera.width, camera.height)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,16 @@ from spadwarp.dataset.sampling import Plan
 from spadwarp.scene import phase_function
 from spadwarp.units import range_from_time
 
-__all__ = ["FORMAT_VERSION", "FRAME_COLUMNS", "HISTOGRAM_COLUMNS", "PACKED", "describe", "scene_columns", "scene_row"]
+__all__ = [
+    "FORMAT_VERSION",
+    "FRAME_COLUMNS",
+    "HISTOGRAM_COLUMNS",
+    "PACKED",
+    "Column",
+    "describe",
+    "scene_columns",
+    "scene_row",
+]
 
 FORMAT_VERSION = 1
 
@@ -69,6 +79,20 @@ _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
     "pde": ("1", "photon detection efficiency"),
     "dark_count_rate": ("1/s", "of a pixel"),
 }
+
+
+@dataclass(frozen=True)
+class Column:
+    """A field of an exported frame: shape, type (`object`: text), unit and meaning."""
+
+    shape: tuple[int, ...]
+    kind: np.dtype[Any]
+    unit: str
+    meaning: str
+
+    @property
+    def is_text(self) -> bool:
+        return self.kind.kind == "O"
 
 
 def describe(file: Any, columns: Mapping[str, tuple[str, str]]) -> None:

@@ -11,16 +11,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.recipe import Recipe
+from spadwarp.dataset.recipe import Recipe, Targets
 from spadwarp.errors import ConfigError, FileError, MeshError
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.targets import placement
 from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Target
+from spadwarp.scene.pose import rotation_angles
 
-__all__ = ["TargetSource", "find_targets"]
+__all__ = ["TargetSource", "check_extents", "find_targets"]
 
 _MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb")
+# The axes of mesh files in those of the camera.
+_UPRIGHT = {
+    "camera": np.eye(3),
+    "y_up": np.diag([1.0, -1.0, -1.0]),
+    "z_up": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
 _DEPTH_ENDING, _NORMAL_ENDING, _ALBEDO_ENDING = "_RGBD", "_Surf_Norm", "_Base_Col"
 
 
@@ -41,31 +48,40 @@ class TargetSource:
     export: Path | None = None
     export_preset: Literal["unreal", "blender"] = "unreal"
 
-    def placed(
-        self, pose: dict[str, Any], *, longest: float | None, fill: float | None, camera: Camera
-    ) -> dict[str, Any]:
+    def placed(self, pose: dict[str, Any], *, chosen: Targets, fill: float | None, camera: Camera) -> dict[str, Any]:
         """The fields of a scene's target, its centre at the pose's translation, scaled as the recipe asks.
 
         Args:
             pose: `translation`, `rotation_deg`, `scale`, `reflectance`.
-            longest: Longest side that a mesh file is scaled to first [m].
+            chosen: Size, unit and orientation of mesh files.
             fill: Part of the view that the target fills; replaces `scale`.
             camera: Whose view.
         """
         if self.mesh is None and fill is None:
             return {"builtin": self.name, **pose}
         scale, (lower, upper) = pose["scale"], _bounds(self)
-        sides = upper - lower
+        upright = np.eye(3) if self.mesh is None else _UPRIGHT[chosen.orientation]
+        sides = np.abs(upright @ (upper - lower))
         if fill is not None:
             view = pose["translation"][2] * camera.pixel_tangent * np.array([camera.width, camera.height])
             scale = fill * float((view / sides[:2]).min())
-        elif longest is not None:
-            scale *= longest / float(sides.max())
+        else:
+            scale *= self.metres_per_unit(chosen)
         if self.mesh is None:
             return {"builtin": self.name, **pose, "scale": scale}
-        matrix = placement(np.full(3, scale), pose["rotation_deg"], (0.0, 0.0, 0.0))[:3, :3]
+        matrix = placement(np.full(3, scale), pose["rotation_deg"], (0.0, 0.0, 0.0))[:3, :3] @ upright
         shift = np.asarray(pose["translation"]) - matrix @ (0.5 * (lower + upper))
-        return {"mesh": str(self.mesh), **pose, "scale": scale, "translation": shift.tolist()}
+        turned = {"scale": scale, "translation": shift.tolist()}
+        if chosen.orientation != "camera":
+            turned["rotation_deg"] = list(rotation_angles(matrix / scale))
+        return {"mesh": str(self.mesh), **pose, **turned}
+
+    def metres_per_unit(self, chosen: Targets) -> float:
+        """Scale of a mesh file before its pose."""
+        if chosen.mesh_size is None:
+            return chosen.mesh_scale
+        lower, upper = _bounds(self)
+        return chosen.mesh_size / float((upper - lower).max())
 
     def truth(self, camera: Camera) -> Truth:
         """The truth maps of an `export`, with normals and colours where their files lie beside it."""
@@ -100,6 +116,26 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
     if problems:
         raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
     return tuple(TargetSource(name, splits[name], **source) for name, source in sources.items())
+
+
+def check_extents(recipe: Recipe, targets: tuple[TargetSource, ...], camera: Camera) -> None:
+    """Raises `ConfigError` that names each mesh file, and its extent, that is too large or too small to be seen where
+    the recipe puts it."""
+    if recipe.pose.fill is not None:
+        return
+    (nearest, farthest), (smallest, largest) = recipe.pose.distance.limits, recipe.pose.size.limits
+    problems = []
+    for target in (target for target in targets if target.mesh is not None):
+        lower, upper = _bounds(target)
+        sides = (upper - lower) * target.metres_per_unit(recipe.targets)
+        extent = f"targets.meshes: {target.mesh}: " + " x ".join(f"{side:.4g}" for side in sides) + " m"
+        advice = "in another unit? targets.mesh_scale is metres per unit, targets.mesh_size the longest side"
+        if 0.5 * largest * float(np.linalg.norm(sides)) >= nearest:
+            problems.append(f"{extent}: reaches the camera from pose.distance = {nearest:g} m; {advice}")
+        elif smallest * float(sides.max()) < farthest * camera.pixel_tangent:
+            problems.append(f"{extent}: less than a pixel at pose.distance = {farthest:g} m; {advice}")
+    if problems:
+        raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
 
 
 def _builtins(recipe: Recipe, problems: list[str]) -> list[str]:

@@ -293,6 +293,71 @@ def test_the_centre_of_a_mesh_is_at_the_distance_of_the_recipe(tmp_path):
     assert height == pytest.approx(0.5 * 15.0 * camera.pixel_tangent * camera.height, rel=1e-5)
 
 
+def plan_of_mesh(mesh, folder, **targets):
+    (folder / "meshes").mkdir(exist_ok=True)
+    mesh.export(folder / "meshes/block.stl")
+    tables = {**TABLES, "targets": {"meshes": ["meshes"], **targets}, "scenes_per_target": 1}
+    return Plan(load_recipe(written(Recipe.from_dict(tables).with_overrides({"pose.yaw_deg": 0.0}), folder)))
+
+
+def test_a_mesh_in_metres_stays_as_it_is(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box(extents=(1.1, 0.7, 0.3))
+    size = np.ptp(build_mesh(plan_of_mesh(box, tmp_path).scene(0).scene).bounds, axis=0)
+    np.testing.assert_allclose(size, (1.1, 0.7, 0.3), rtol=1e-5)
+    millimetres = trimesh.creation.box(extents=(1100, 700, 300))
+    plan = plan_of_mesh(millimetres, tmp_path, mesh_scale=0.001)
+    np.testing.assert_allclose(np.ptp(build_mesh(plan.scene(0).scene).bounds, axis=0), size, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "up", "front"),
+    [("camera", (0, -1, 0), (0, 0, -1)), ("y_up", (0, 1, 0), (0, 0, 1)), ("z_up", (0, 0, 1), (0, -1, 0))],
+)
+def test_orientation_turns_what_is_up_in_the_file_up_in_the_image(orientation, up, front, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    arrow = np.array([np.zeros(3), 0.8 * np.array(up), 0.4 * np.array(front)])  # its tip, then its front
+    tetrahedron = trimesh.Trimesh([*arrow, 0.1 * np.cross(up, front)], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    placed = build_mesh(plan_of_mesh(tetrahedron, tmp_path, orientation=orientation).scene(0).scene)
+    height, depth = placed.bounds[:, 1], placed.bounds[:, 2]
+    assert np.ptp(height) == pytest.approx(0.8, rel=1e-5) and np.ptp(depth) == pytest.approx(0.4, rel=1e-5)
+    tip = placed.vertices[np.argmin(placed.vertices[:, 1])]  # the image's +y is down
+    nearest = placed.vertices[np.argmin(placed.vertices[:, 2])]
+    assert tip[2] == pytest.approx(depth[1], abs=1e-5) and nearest[1] == pytest.approx(height[1], abs=1e-5)
+
+
+@pytest.mark.parametrize(("side", "words"), [(900.0, "reaches the camera"), (1e-4, "less than a pixel")])
+def test_a_mesh_in_another_unit_is_named_before_the_first_scene(side, words, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    plan = plan_of_mesh(trimesh.creation.box(extents=(side, side, side)), tmp_path)
+    with pytest.raises(spadwarp.ConfigError) as caught:
+        make(plan.recipe, tmp_path / "data")
+    text = str(caught.value)
+    assert "block.stl" in text and f"{side:.4g} x {side:.4g} x {side:.4g} m" in text and words in text
+    assert "mesh_scale" in text and not list((tmp_path / "data").glob("*.h5"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_a_torch_loader_gives_the_same_items_from_any_kind_of_worker(folder, start):
+    torch = pytest.importorskip("torch")
+    pairs = SpadDataset(folder, "train", crop=16, augment=True, repeats=3)
+    alone = list(torch.utils.data.DataLoader(pairs, batch_size=4))
+    options = {"num_workers": 2, "multiprocessing_context": start, "persistent_workers": True}
+    loader = torch.utils.data.DataLoader(pairs, batch_size=4, **options)
+    for _ in range(2):
+        for batch, expected in zip(loader, alone, strict=True):
+            for name, values in expected.items():
+                assert torch.equal(batch[name].nan_to_num(-1.0), values.nan_to_num(-1.0)), name
+
+
+def test_a_split_without_frames_is_named_at_once(folder, tmp_path):
+    make(recipe(**{"targets.validation": [], "frames.per_scene": 1}), tmp_path / "data")
+    for reader in (FrameReader, SpadDataset, iterate_dataset):
+        with pytest.raises(ValueError, match=r"split = 'validation': .*data has no frames in it; it has train, test"):
+            reader(tmp_path / "data", "validation")
+
+
 def test_depth_maps_of_an_engine_become_targets(tmp_path):
     depth = np.full((24, 36), 65504.0, np.float16)
     depth[4:20, 6:30] = 1500.0  # centimetres

@@ -1,0 +1,298 @@
+"""Datasets for trainers: float depth, clean depth, labels, intensity and numbers, as Parquet, WebDataset or Zarr."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.dataset.card import export_card
+from spadwarp.dataset.croissant import croissant
+from spadwarp.dataset.features import FEATURE_NAMES, histogram_features
+from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset.recipe import SPLITS
+from spadwarp.dataset.schema import Column
+from spadwarp.dataset.shards import checksum
+from spadwarp.errors import ArgumentError, FileError
+from spadwarp.io.text import write_json, write_text
+from spadwarp.limits import check_choice, check_integer
+
+__all__ = ["EXPORT_FIELDS", "EXPORT_FORMATS", "export_dataset"]
+
+EXPORT_FORMATS = ("parquet", "webdataset", "zarr")
+
+EXPORT_FIELDS: dict[str, tuple[str, str]] = {
+    "noisy": ("m", "depth frame; NaN: no return"),
+    "clean": ("m", "true planar depth; NaN: nothing is hit"),
+    "label": ("1", "1: the pixel reports backscatter or other background"),
+    "intensity": ("1", "recorded photons"),
+    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
+    "normal": ("1", "unit normals towards the camera, [3, height, width]"),
+    "albedo": ("1", "Lambertian reflectance"),
+    "prior": ("1/m", "density with which the water alone reports the depth in noisy"),
+    "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
+    "counts": ("1", "histogram of the frame, [bin, height, width]"),
+    "expected": ("1", "expected histogram before pile-up, [bin, height, width]"),
+}
+"""Images of an exported frame: unit and meaning."""
+
+_DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
+_ZARR_FRAMES = 16  # of a chunk
+_NUMBERS: dict[str, tuple[type, str, str]] = {
+    "sample": (np.int64, "1", "id of the frame in the whole dataset"),
+    "scene": (np.int64, "1", "id of the scene"),
+    "backscatter_fraction": (
+        np.float32,
+        "1",
+        "requested part of pixels that report backscatter; NaN: the rates decide",
+    ),
+    "attenuation_lengths": (np.float32, "1", "extinction times distance, one way"),
+    "distance": (np.float32, "m", "of the target's centre along the optical axis"),
+    "gate_near": (np.float32, "m", "range at which the gate opens"),
+    "gate_far": (np.float32, "m", "range at which the gate closes"),
+    "pulses": (np.float64, "1", "laser pulses of the frame"),
+    "photons": (np.float64, "1", "photons traced for the scene; 0: analytic"),
+}
+
+
+Progress = Callable[[str, int, int], None]
+
+
+def export_dataset(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    format: str = "parquet",
+    *,
+    fields: Sequence[str] | None = None,
+    frames_per_file: int = 1000,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Writes a dataset as others load it in one line; returns `out`.
+
+    - `"parquet"`: `datasets.load_dataset(out)` of Hugging Face, with its splits and shaped arrays.
+    - `"webdataset"`: `train-00000.tar`, … of `.npy` images and one `.json` a frame.
+    - `"zarr"`: `frames.zarr`, a group for each split: `xarray.open_zarr(out / "frames.zarr", group="train")`.
+
+    All hold float32 depth in metres, `label` as uint8, and for each frame the numbers `sample`, `scene`, `target`,
+    `backscatter_fraction`, `attenuation_lengths`, `distance`, `gate_near`, `gate_far`, `pulses` and `photons`. Beside
+    them a card (`README.md`) and Croissant metadata (`croissant.json`).
+
+    Args:
+        folder: The dataset.
+        out: A new folder.
+        format: Of `EXPORT_FORMATS`.
+        fields: Images, of `EXPORT_FIELDS`; default: noisy, clean, label, intensity, bound, and with traced scenes
+            features. Scenes that were not traced have NaN in features, counts and expected.
+        frames_per_file: At most, in [1, 1000000]; Parquet and WebDataset.
+        overwrite: Whether an existing `out` is replaced.
+        progress: Called with ("frames", frames written, frames to write).
+
+    Raises:
+        ArgumentError: An argument out of range, or a field that the dataset does not have.
+        FileError: No dataset, `out` exists or cannot be written, or a package is missing.
+    """
+    check_choice("format", format, EXPORT_FORMATS)
+    frames_per_file = check_integer("frames_per_file", frames_per_file, "[1, 1000000]")
+    place, out = Path(folder), Path(out)
+    if out.exists() and not overwrite and not (out.is_dir() and not any(out.iterdir())):
+        raise FileError(f"{out} exists; overwrite replaces it")
+    source = _Source(place, fields)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    writer = {"parquet": _write_parquet, "webdataset": _write_webdataset, "zarr": _write_zarr}[format]
+    total, done = source.frames, 0
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+        made = Path(temporary) / "made"
+        made.mkdir()
+        try:
+            for _ in writer(source, made, frames_per_file):
+                done += 1
+                if progress is not None:
+                    progress("frames", done, total)
+        except ModuleNotFoundError as error:
+            raise FileError(f"{out}: {format} needs {error.name}: pip install 'spadwarp[datasets]'") from error
+        except OSError as error:
+            raise FileError(f"{out}: cannot be written: {error}") from error
+        files = {path.relative_to(made).as_posix(): checksum(path) for path in _files(made, format)}
+        write_json(croissant(source.manifest, format, files, source.columns), made / "croissant.json", indent=1)
+        write_text(export_card(source.manifest, format, files, source.columns, source.sizes), made / "README.md")
+        if out.exists():
+            shutil.rmtree(out)
+        os.replace(made, out)
+    return out
+
+
+class _Source:
+    """The frames of a dataset by split, as rows of columns."""
+
+    def __init__(self, folder: Path, fields: Sequence[str] | None) -> None:
+        base = FrameReader(folder, "all", fields=())
+        self.folder, self.manifest, self.shape = folder, base.manifest, base.shape
+        self.sizes = {name: self.manifest["splits"][name]["frames"] for name in SPLITS}
+        self.sizes = {name: size for name, size in self.sizes.items() if size}
+        self.frames = sum(self.sizes.values())
+        self._numbers = {name: base.scene_numbers(name) for name in ("pulses", "photons")}
+        bins = base.histogram_bins
+        chosen = tuple(fields) if fields else (*_DEFAULT, *(("features",) if bins else ()))
+        if unknown := [name for name in chosen if name not in EXPORT_FIELDS]:
+            raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, EXPORT_FIELDS))}")
+        if not bins and (lost := [name for name in chosen if name in ("features", "counts", "expected")]):
+            raise ArgumentError(f"fields: {lost[0]!r}: no scene of {folder} was traced: it has no histograms")
+        self.fields = tuple(dict.fromkeys(chosen))
+        deep = {"normal": (3,), "features": (len(FEATURE_NAMES),), "counts": (bins,), "expected": (bins,)}
+        self.columns = {
+            name: Column(
+                (*deep.get(name, ()), *base.shape),
+                np.dtype(np.uint8 if name == "label" else np.float32),
+                *EXPORT_FIELDS[name],
+            )
+            for name in self.fields
+        }
+        for name, (kind, unit, meaning) in _NUMBERS.items():
+            self.columns[name] = Column((), np.dtype(kind), unit, meaning)
+        self.columns["target"] = Column((), np.dtype(object), "1", "name of the target")
+
+    def rows(self, split: str) -> Iterator[dict[str, Any]]:
+        """The frames of a split, all columns of each."""
+        stored = tuple(name for name in self.fields if name not in ("features", "counts", "expected"))
+        reader = FrameReader(self.folder, split, fields=stored)
+        cubes = reader.with_fields("counts")
+        for index in range(len(reader)):
+            item = reader[index]
+            row: dict[str, Any] = {name: item[name] if name == "normal" else item[name][0] for name in stored}
+            if "label" in row:
+                row["label"] = row["label"].astype(np.uint8)
+            for name in (name for name in self.fields if name not in stored):
+                row[name] = self._histogram(name, cubes, index, int(item["scene"]))
+            scene = int(item["scene"])
+            row |= {"gate_near": item["gate"][0], "gate_far": item["gate"][1]}
+            row |= {name: values[scene] for name, values in self._numbers.items()}
+            row |= {name: item[name] for name in _NUMBERS if name in item}
+            row["target"] = self.manifest["targets"][int(item["target"])]
+            yield row
+
+    def _histogram(self, name: str, cubes: FrameReader, index: int, scene: int) -> NDArray[np.float32]:
+        if not self._numbers["photons"][scene]:
+            return np.full(self.columns[name].shape, np.nan, np.float32)
+        if name == "features":
+            return histogram_features(cubes[index]["counts"], cubes.scene(index))
+        return cubes.with_fields(name)[index][name]
+
+
+def _shards(source: _Source, split: str, size: int) -> Iterator[tuple[str, Iterator[dict[str, Any]], int]]:
+    """Name, rows and number of rows of each file of a split."""
+    count = -(-source.sizes[split] // size)
+    rows = source.rows(split)
+    for number in range(count):
+        length = min(size, source.sizes[split] - number * size)
+        yield f"{split}-{number:05}-of-{count:05}", (next(rows) for _ in range(length)), length
+
+
+def _write_parquet(source: _Source, out: Path, size: int) -> Iterator[None]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    def kind_of(column: Column) -> Any:
+        kind = pa.string() if column.is_text else pa.from_numpy_dtype(column.kind)
+        for _ in column.shape:
+            kind = pa.list_(kind)
+        return kind
+
+    def array_of(column: Column, values: list[Any]) -> Any:
+        if not column.shape:
+            return pa.array(values, kind_of(column))
+        flat = np.ascontiguousarray(values, column.kind).reshape(-1)
+        array = pa.array(flat)
+        for side in reversed(column.shape):
+            array = pa.ListArray.from_arrays(pa.array(np.arange(0, len(array) + 1, side, dtype=np.int32)), array)
+        return array
+
+    schema = pa.schema([(name, kind_of(column)) for name, column in source.columns.items()])
+    per_row = sum(int(np.prod(column.shape)) * 4 for column in source.columns.values())
+    group = int(np.clip((1 << 26) // max(per_row, 1), 1, 1000))  # rows of 64 MiB
+    (out / "data").mkdir()
+    for split in source.sizes:
+        for name, rows, length in _shards(source, split, size):
+            with parquet.ParquetWriter(out / "data" / f"{name}.parquet", schema, compression="zstd") as file:
+                for first in range(0, length, group):
+                    part = []
+                    for row in (next(rows) for _ in range(min(group, length - first))):
+                        part.append(row)
+                        yield
+                    arrays = [array_of(column, [row[name] for row in part]) for name, column in source.columns.items()]
+                    file.write_table(pa.table(arrays, schema=schema))
+
+
+def _write_webdataset(source: _Source, out: Path, size: int) -> Iterator[None]:
+    def add(file: tarfile.TarFile, name: str, content: bytes) -> None:
+        entry = tarfile.TarInfo(name)
+        entry.size = len(content)
+        file.addfile(entry, io.BytesIO(content))
+
+    for split in source.sizes:
+        for number, (_, rows, _) in enumerate(_shards(source, split, size)):
+            with tarfile.open(out / f"{split}-{number:05}.tar", "w") as file:
+                for row in rows:
+                    key = f"{int(row['sample']):09}"
+                    for name in source.fields:
+                        packed = io.BytesIO()
+                        np.save(packed, np.asarray(row[name], source.columns[name].kind))
+                        add(file, f"{key}.{name}.npy", packed.getvalue())
+                    numbers = {name: _plain(row[name]) for name in source.columns if name not in source.fields}
+                    add(file, f"{key}.json", json.dumps(numbers).encode())
+                    yield
+
+
+def _plain(value: Any) -> Any:
+    """A number as JSON can hold it; NaN is null."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not np.isfinite(plain) else plain
+
+
+def _write_zarr(source: _Source, out: Path, size: int) -> Iterator[None]:
+    import zarr
+
+    store = zarr.open_group(out / "frames.zarr", mode="w")
+    for split, length in source.sizes.items():
+        group = store.create_group(split)
+        arrays = {name: _zarr_array(group, name, column, length) for name, column in source.columns.items()}
+        for name, side in zip(("y", "x"), source.shape, strict=True):
+            group.create_array(name, data=np.arange(side), dimension_names=[name])
+        rows = source.rows(split)
+        for first in range(0, length, _ZARR_FRAMES):
+            part = []
+            for row in (next(rows) for _ in range(min(_ZARR_FRAMES, length - first))):
+                part.append(row)
+                yield
+            for name, column in source.columns.items():
+                kind = np.dtypes.StringDType() if column.is_text else column.kind
+                arrays[name][first : first + len(part)] = np.array([row[name] for row in part], dtype=kind)
+
+
+def _zarr_array(group: Any, name: str, column: Column, length: int) -> Any:
+    first = {"normal": "axis", "features": "feature", "counts": "bin", "expected": "bin"}
+    dimensions = ["frame", *([first[name]] if len(column.shape) == 3 else []), "y", "x"]
+    array = group.create_array(
+        name,
+        shape=(length, *column.shape),
+        dtype="string" if column.is_text else column.kind,
+        chunks=(min(_ZARR_FRAMES, length), *column.shape),
+        dimension_names=dimensions if column.shape else ["frame"],
+    )
+    array.attrs.update({"units": column.unit, "long_name": column.meaning})
+    return array
+
+
+def _files(made: Path, format: str) -> list[Path]:
+    """The files of an export, for checksums; of a Zarr store, which has one for each frame, its metadata."""
+    found = sorted(path for path in made.rglob("*") if path.is_file())
+    return [path for path in found if path.name == "zarr.json"] if format == "zarr" else found
