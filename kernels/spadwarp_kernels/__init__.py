@@ -81,6 +81,7 @@ from .surface import (
     sample_lambert,
     surface_choices,
     unshadowed,
+    update_surfaces,
 )
 from .tally import COMPONENTS, COUNTERS, LEDGER_ENTRIES, LEDGER_UNIT, Batches, has_overflowed, to_fixed_point
 from .transport import (
@@ -219,5 +220,6 @@ __all__ = [
     "u01_fine",
     "u01_tail",
     "unshadowed",
+    "update_surfaces",
     "write_poses",
 ]

@@ -116,8 +116,8 @@ def _pack_kernel(
             nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
 
 
-def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; to be made anew after a refit.
+def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; see `repack_bvh` after a refit.
 
     Args:
         mesh: Any `wp.Mesh`.
@@ -127,6 +127,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
         faces: vec4 [3 * slots], see `face_distance`.
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
+        before: int32, for `repack_bvh`: how many nodes with children stand before each node of the mesh's tree.
     """
     count, device = mesh.indices.size // 3, mesh.device
     has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
@@ -136,17 +137,34 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
     order = wp.zeros(count, dtype=int, device=device)
     wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
     wp.utils.array_scan(has_children, before, inclusive=False)
+    repack_bvh(mesh, extent, nodes, faces, order, before)
+    return nodes, faces, order, before
+
+
+def repack_bvh(
+    mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array, before: wp.array
+) -> None:
+    """Writes what `pack_bvh` returns anew for moved points, after `mesh.refit()`; allocates and reads nothing."""
     padding = 2.5 * WIDENING * extent + 1e-9
-    wp.launch(_pack_kernel, has_children.size, [mesh.id, padding, before], outputs=[nodes, order], device=device)
-    wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=device)
-    return nodes, faces, order
+    wp.launch(_pack_kernel, before.size, [mesh.id, padding, before], outputs=[nodes, order], device=mesh.device)
+    wp.launch(pack_faces_kernel, order.size, [mesh.id, order], outputs=[faces], device=mesh.device)
 
 
-def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
+def pack_faces(mesh: wp.Mesh) -> tuple[wp.array, wp.array]:
+    """Faces and order without Warp's tree: each face in the slot of its own number, for `wp.mesh_query_ray`."""
+    count = mesh.indices.size // 3
+    order = wp.array(np.arange(count), dtype=int, device=mesh.device)
+    faces = wp.zeros(3 * count, dtype=wp.vec4, device=mesh.device)
+    wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=mesh.device)
+    return faces, order
+
+
+def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array, wp.array]:
     """What `pack_bvh` returns, for no faces at all: a root whose two children no ray meets."""
     x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
     nodes = wp.array([[x, x, x, bits]] * 4, dtype=wp.vec4, device=device)
-    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
+    faces, order, before = (wp.zeros(0, dtype=dtype, device=device) for dtype in (wp.vec4, int, int))
+    return nodes, faces, order, before
 
 
 @wp.struct

@@ -29,6 +29,9 @@ class TransportSpec(NamedTuple):
         measured_beam: Emit from the laser's measured profile.
         confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
         rotated_domain: The domain has axes of its own.
+        public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
+        stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
+            ones.
     """
 
     estimator: str = "next_event"
@@ -46,3 +49,5 @@ class TransportSpec(NamedTuple):
     measured_beam: bool = False
     confocal: bool = False
     rotated_domain: bool = False
+    public_tree: bool = False
+    stepped: bool = False

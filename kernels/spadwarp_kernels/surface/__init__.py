@@ -2,7 +2,7 @@
 
 from .ggx import ggx_brdf, ggx_normals, ggx_pdf, reflection_pdf, sample_ggx, sample_reflection, unshadowed
 from .lambert import lambert_brdf, sample_cosine_law, sample_lambert
-from .mesh import Surfaces, Textures, make_surfaces, make_textures, surface_choices
+from .mesh import Surfaces, Textures, make_surfaces, make_textures, surface_choices, update_surfaces
 from .reflectance import reflectance_at
 from .trace import SurfaceHit, intersect_mesh, intersect_surfaces, offset_from_surface
 
@@ -27,4 +27,5 @@ __all__ = [
     "sample_reflection",
     "surface_choices",
     "unshadowed",
+    "update_surfaces",
 ]

@@ -16,7 +16,8 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_values,
 )
-from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh
+from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pack_faces, repack_bvh
+from spadwarp_kernels.intersect.triangle import pack_faces_kernel
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import near_depth_map
 
@@ -52,6 +53,8 @@ class Surfaces:
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
+        before: What `update_surfaces` needs of the tree, see `pack_bvh`.
+        extent: Largest coordinate that the tree is made for [m].
     """
 
     mesh: wp.uint64
@@ -66,6 +69,8 @@ class Surfaces:
     textures: Textures
     specular: wp.array(dtype=float)
     roughness: wp.array(dtype=float)
+    before: wp.array(dtype=int)
+    extent: float
 
 
 def make_surfaces(
@@ -78,6 +83,8 @@ def make_surfaces(
     roughness: wp.array | float = 0.2,
     camera: "Camera | None" = None,
     device: wp.DeviceLike = None,
+    extent: float | None = None,
+    public_tree: bool = False,
 ) -> Surfaces:
     """The kernel's view of a mesh.
 
@@ -85,7 +92,8 @@ def make_surfaces(
     `TransportSpec` that go with what is returned.
 
     Args:
-        mesh: Any `wp.Mesh`; None for no surface at all. After a refit, make the surfaces anew; the arrays may stay.
+        mesh: Any `wp.Mesh`; None for no surface at all. Where its points move, see `update_surfaces`, or make the
+            surfaces anew after a refit; the arrays may stay.
         reflectance: Lambertian, in [0, 1]: one number or a float32 array with one entry a face.
         corner_reflectance: Lambertian reflectance at the corners of each face, vec3 [faces], interpolated between them;
             replaces `reflectance`.
@@ -94,6 +102,9 @@ def make_surfaces(
         roughness: GGX width parameter of the lobe, in [0.01, 1]: one number or an array as above.
         camera: Saves most of the rays between scattering events and its lens.
         device: Where the empty arrays go if there is no mesh.
+        extent: Largest coordinate that a moving mesh will have [m]; then its bounding box is taken to be this large.
+        public_tree: Rays take `wp.mesh_query_ray` instead of a tree that is read from Warp's private structs: slower,
+            and the way back when another version of Warp changes these.
 
     Raises:
         ArgumentError: An array whose length is not the number of faces, a value out of range, a mesh without faces or
@@ -126,7 +137,7 @@ def make_surfaces(
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
     _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device)
+    surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before = empty_bvh(device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
         return surfaces
@@ -139,15 +150,50 @@ def make_surfaces(
     if not np.isfinite(points).all():
         raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
     lower, upper = points.min(axis=0), points.max(axis=0)
-    extent = float(abs(points).max())
-    padding = 1e-6 * extent + 1e-6
+    if extent is not None:
+        upper = np.full(3, check_number("extent", extent, "(0, inf)"))
+        lower = -upper
+    surfaces.extent = float(abs(points).max()) if extent is None else float(extent)
+    padding = 1e-6 * surfaces.extent + 1e-6
     surfaces.mesh = mesh.id
-    surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, extent)
+    if public_tree:
+        surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
+        surfaces.faces, surfaces.order = pack_faces(mesh)
+    else:
+        surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before = pack_bvh(mesh, surfaces.extent)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
         surfaces.near_depth = near_depth_map(mesh, camera)
     return surfaces
+
+
+def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
+    """Follows the points of a mesh that have moved, on the device: refits its tree and writes the surfaces' anew.
+
+    Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
+    from each other, surfaces made from a new `wp.Mesh` are faster.
+
+    Args:
+        surfaces: From `make_surfaces` of this mesh, with an `extent` that holds its points and without a camera.
+        mesh: The mesh, whose `points` have changed in place.
+
+    Raises:
+        ArgumentError: Surfaces of another mesh, or with a map of what the camera cannot miss.
+    """
+    check_struct("surfaces", surfaces, Surfaces)
+    check_kind("mesh", mesh, wp.Mesh)
+    if surfaces.mesh != mesh.id:
+        raise ArgumentError("surfaces are not those of mesh")
+    if surfaces.near_depth.size:
+        raise ArgumentError("surfaces know what the camera cannot miss; for moving points, make them without camera")
+    mesh.refit()
+    if surfaces.nodes.size:
+        repack_bvh(mesh, surfaces.extent, surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before)
+    else:
+        wp.launch(
+            pack_faces_kernel, surfaces.order.size, [mesh.id, surfaces.order], [surfaces.faces], device=mesh.device
+        )
 
 
 def _check_mesh(mesh: Any) -> wp.Device:
@@ -172,8 +218,12 @@ def _check_sum(surfaces: Surfaces) -> None:
 
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
-    """The fields of `TransportSpec` that surfaces need: `pattern` and `specular`."""
-    return {"pattern": surfaces.corner_reflectance.size > 0, "specular": surfaces.specular.size > 0}
+    """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `public_tree`."""
+    return {
+        "pattern": surfaces.corner_reflectance.size > 0,
+        "specular": surfaces.specular.size > 0,
+        "public_tree": surfaces.nodes.size == 0,
+    }
 
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:

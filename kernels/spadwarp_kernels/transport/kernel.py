@@ -92,17 +92,17 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     cross, score = estimator.cross, estimator.score
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = cross is not None, request_flight is not None, score is not None
-    has_mesh, random_albedo, confocal = spec.mesh, spec.random_albedo, spec.confocal
+    has_mesh, random_albedo, confocal, stepped = spec.mesh, spec.random_albedo, spec.confocal, spec.stepped
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
-    brute_force = has_mesh and spec.brute_force and cuda
+    brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
     has_bvh = has_mesh and not brute_force
     queues = scores and cuda and not has_bvh
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, fly, collide = make_emit(spec), make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
-    aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(cuda)
+    aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores))
 
@@ -134,11 +134,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         ledger: wp.array(dtype=wp.int64),
         out: Records,
         cursor: wp.array(dtype=int),
+        offset: wp.array(dtype=wp.uint64),
     ):
         thread = wp.tid()
         lane = thread % wp.static(32 if cuda else 1)  # on the CPU one thread moves all photons
         if wp.static(not cuda):
             thread = slot_of_core(first_id)
+        base = wp.uint64(first_id)
+        if wp.static(stepped):
+            base += offset[0]
         s = first_state(medium, camera)
         if wp.static(has_bvh and cuda):
             stack = Stack()
@@ -153,7 +157,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             waiting = int(0)
             while waiting < wp.static(ray_lanes):
                 if s.stage == FLIGHT:
-                    id = first_id + wp.uint64(s.photon)
+                    id = base + wp.uint64(s.photon)
                     s.flight = fly(s, medium, layers, camera, gate, limits, keys, id)
                     s.hit.face = -1
                     s.stage = EVENT
@@ -228,7 +232,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
-                    id = first_id + wp.uint64(s.photon)
+                    id = base + wp.uint64(s.photon)
                     new = scatter(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread)
                     s.u = new.u
                     s.weight = new.weight
@@ -253,7 +257,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if s.taken >= 32:
                             s.first = take_photons(cursor)
                             s.taken = 0
-                            exchange(True, lane, emit(laser, scan, seed, first_id + wp.uint64(s.first + lane)))
+                            exchange(True, lane, emit(laser, scan, seed, base + wp.uint64(s.first + lane)))
                         entry += s.taken
                         s.taken += count_lanes(wanting)
                     elif wanting:
@@ -262,7 +266,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.photon = s.first + entry
                         s.stage = wp.where(s.photon < photon_count, FLIGHT, DONE)
                         if s.stage == FLIGHT:
-                            id = first_id + wp.uint64(s.photon)
+                            id = base + wp.uint64(s.photon)
                             if wp.static(confocal):
                                 s.target = int(id % wp.uint64(scan.count))
                                 s.view = scan.view[s.target]

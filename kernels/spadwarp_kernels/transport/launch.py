@@ -74,12 +74,14 @@ class Data:
         records: Terminal states of the last launch's photons.
         cursor: int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
             stream.
+        offset: uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on.
     """
 
     tally: wp.array
     ledger: wp.array
     records: Records
     cursor: wp.array
+    offset: wp.array | None = None
 
 
 def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
@@ -99,6 +101,7 @@ def make_data(model: Model, *, tally: wp.array | None = None, record_count: int 
         ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
         records=make_records(record_count, device=model.device),
         cursor=wp.zeros(1, dtype=int, device=model.device),
+        offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
     )
 
 
@@ -157,7 +160,7 @@ def launch_transport(
             photon_count,
             model.scale,
         ],
-        outputs=[data.tally, data.ledger, data.records, data.cursor],
+        outputs=[data.tally, data.ledger, data.records, data.cursor, data.offset],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )

@@ -70,8 +70,10 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
 
 
 @functools.cache
-def make_begin_walk(cuda: bool) -> wp.Function:
-    """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU."""
+def make_begin_walk(spec: TransportSpec, cuda: bool) -> wp.Function:
+    """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU and with
+    Warp's own queries."""
+    whole = spec.public_tree or not cuda
 
     @wp.func
     def begin_walk(surfaces: Surfaces, ray: Ray, any_hit: bool) -> TreeWalk:
@@ -79,7 +81,7 @@ def make_begin_walk(cuda: bool) -> wp.Function:
         walk.found = -1
         walk.nearest = ray.length
         walk.depth = 1  # below everything stands NO_NODE
-        if wp.static(not cuda):
+        if wp.static(whole):
             hit = intersect_surfaces(surfaces, ray.origin, ray.direction, ray.length, any_hit)
             walk.found = hit.slot
             walk.nearest = hit.distance

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.backscatter import check_phase, single_scatter_rate
+from spadwarp_kernels.analytic.backscatter import check_phase, single_scatter_rate, spectral_lines
 from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
 from spadwarp_kernels.arguments import (
     ArgumentError,
@@ -184,6 +184,18 @@ class SpadConfig:
         cumulative = 0.5 * (1.0 + np.vectorize(math.erf)(edges / (math.sqrt(2.0) * sigma)))
         return np.diff(cumulative, axis=1), -reach
 
+    def bin_response(self) -> np.ndarray:
+        """What light that is spread evenly over a bin leaves in the bins about it, `[taps]`, the bin itself midmost."""
+        sigma = self.timing_sigma * self.speed / self.bin_path
+        reach = math.ceil(5.0 * sigma) + 1
+        ramp = sigma * np.array([_normal_integral(k / sigma) for k in range(-reach - 1, reach + 2)])
+        return ramp[2:] - 2.0 * ramp[1:-1] + ramp[:-2]
+
+
+def _normal_integral(z: float) -> float:
+    """Integral of the normal distribution function up to z."""
+    return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+
 
 def check_config(config: object) -> SpadConfig:
     """A `SpadConfig`, or the default for None."""
@@ -198,6 +210,7 @@ def check_config(config: object) -> SpadConfig:
 def _backscatter_kernel(
     first: int,
     lidar: Lidar,
+    lines: wp.array(dtype=wp.vec3d),
     phase: wp.array(dtype=wp.float64),
     view: wp.array(dtype=wp.vec3d),
     # Out:
@@ -211,7 +224,7 @@ def _backscatter_kernel(
         total = wp.float64(0.0)
         for n in range(4):
             time = lidar.start + (wp.float64(k) + (wp.float64(n) + wp.float64(0.5)) / wp.float64(4.0)) * width
-            total += single_scatter_rate(lidar, phase, view[i], time)
+            total += single_scatter_rate(lidar, lines, phase, view[i], time)
         rates[i, k] = float(total * width / wp.float64(4.0))
 
 
@@ -223,13 +236,10 @@ def backscatter_rates(config: SpadConfig, device: wp.Device) -> np.ndarray:
         phase = wp.array(config.phase_table(), dtype=wp.float64, device=device)
         check_phase(phase, device)
         view = wp.array(config.lines_of_sight(), dtype=wp.vec3d, device=device)
-        launch_pixels(_backscatter_kernel, rates.shape[0], [config.lidar(), phase, view, rates], device=device)
-    return _blur(rates.numpy(), config)
-
-
-def _blur(rates: np.ndarray, config: SpadConfig) -> np.ndarray:
-    """Rows of rates, spread over the bins by the response."""
-    sigma = config.timing_sigma * config.speed / config.bin_path
-    edge = (np.arange(config.bins + 1)[None, :] - (np.arange(config.bins)[:, None] + 0.5)) / (math.sqrt(2.0) * sigma)
-    spread = np.diff(0.5 * (1.0 + np.vectorize(math.erf)(edge)), axis=1)
-    return (rates @ spread).astype(np.float32)
+        lidar = config.lidar()
+        inputs = [lidar, spectral_lines(lidar, None, device), phase, view, rates]
+        launch_pixels(_backscatter_kernel, rates.shape[0], inputs, device=device)
+    taps = config.bin_response()
+    reach = taps.size // 2
+    padded = np.pad(rates.numpy(), ((0, 0), (reach, reach)))
+    return np.lib.stride_tricks.sliding_window_view(padded, taps.size, axis=1) @ taps.astype(np.float32)

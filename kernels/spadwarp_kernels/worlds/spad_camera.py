@@ -6,41 +6,14 @@ import warp as wp
 
 from spadwarp_kernels.analytic.lidar import Lidar, beam_path
 from spadwarp_kernels.analytic.signal import radiometric_signal
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_kind
+from spadwarp_kernels.arguments import check_array
 
-from .config import SpadConfig, check_config
-from .detect import Detection
-from .frames import optical_to
-from .shapes import Shapes, ShapeTable, intersect_shapes, move_shapes
+from .cameras import WorldCameras
+from .config import SpadConfig
+from .shapes import Shapes
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
-
-
-@wp.kernel(enable_backward=False)
-def _trace_kernel(
-    shapes: ShapeTable,
-    camera_q: wp.array(dtype=wp.transform),
-    optical: wp.transform,
-    world: wp.array(dtype=int),
-    view: wp.array(dtype=wp.vec3),
-    # Out, [cameras, height, width]:
-    depth: wp.array3d(dtype=float),
-    normal: wp.array3d(dtype=wp.vec3),
-    albedo: wp.array3d(dtype=float),
-):
-    """Launch: (cameras, height, width)."""
-    v, i, j = wp.tid()
-    pose = wp.transform_multiply(camera_q[v], optical)
-    u = view[i * depth.shape[2] + j]
-    hit = intersect_shapes(shapes, world[v], wp.transform_get_translation(pose), wp.transform_vector(pose, u))
-    depth[v, i, j] = wp.NAN
-    normal[v, i, j] = wp.vec3(wp.NAN)
-    albedo[v, i, j] = wp.NAN
-    if hit.shape >= 0:
-        depth[v, i, j] = hit.distance * u[2]
-        normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
-        albedo[v, i, j] = hit.albedo
 
 
 @wp.kernel(enable_backward=False)
@@ -183,7 +156,7 @@ def _rates_kernel(
     rates[row, k] = dark + water + wp.max(surface, 0.0)
 
 
-class SpadCamera:
+class SpadCamera(WorldCameras):
     """Single-photon cameras in many worlds: histograms, counts and noisy depth of all in a few launches.
 
     A pixel sees one surface, the water between by single scattering, and dark counts. A step allocates nothing, reads
@@ -221,19 +194,8 @@ class SpadCamera:
         frame: str = "optical",
         device: wp.DeviceLike = None,
     ) -> None:
-        self.config = check_config(config)
-        self.device = check_device("device", device)
-        self.cameras = check_integer("cameras", cameras, 1)
-        self._optical = optical_to(frame)
-        self._world = camera_worlds(world, self.cameras, self.device)
-        image = (self.cameras, self.config.height, self.config.width)
-        self._detection = Detection(self.config, self.cameras, self.device)
+        super().__init__(config, cameras, world=world, frame=frame, device=device)
         self._lidar = self.config.lidar()
-        self.rates, self.histogram = self._detection.rates, self._detection.histogram
-        self.counts, self.depth, self.step = self._detection.counts, self._detection.depth, self._detection.step
-        self.true_depth = wp.full(image, wp.nan, dtype=float, device=self.device)
-        self.normal = wp.zeros(image, dtype=wp.vec3, device=self.device)
-        self.albedo = wp.zeros(image, dtype=float, device=self.device)
         rows = self._detection.rows[0]
         self._signal, self._path = (wp.zeros(rows, dtype=float, device=self.device) for _ in range(2))
         self._none = wp.empty((0, 0, 0), dtype=float, device=self.device)
@@ -248,12 +210,7 @@ class SpadCamera:
             camera_q: Poses of the cameras in their worlds, `wp.transform` `[cameras]`.
             body_q: Poses of the bodies, `wp.transform` `[bodies]`, as Newton's `state.body_q`.
         """
-        check_kind("shapes", shapes, Shapes)
-        check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
-        move_shapes(shapes, body_q)
-        inputs = [shapes.table, camera_q, self._optical, self._world, self._detection.view]
-        outputs = [self.true_depth, self.normal, self.albedo]
-        wp.launch(_trace_kernel, self.true_depth.shape, inputs, outputs, device=self.device)
+        self._look(shapes, camera_q, body_q)
         self._draw()
 
     def update_from_images(
@@ -303,18 +260,3 @@ class SpadCamera:
         rates = self.rates.reshape(detection.rows)
         wp.launch(_rates_kernel, detection.rows, inputs, [rates], device=self.device)
         detection.launch()
-
-    def point_cloud(self, out: wp.array, *, frame: str = "optical") -> None:
-        """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none."""
-        check_array("out", out, wp.vec3, self.depth.shape, self.device)
-        self._detection.points(optical_to(frame), out)
-
-
-def camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device: wp.Device) -> wp.array:
-    """World of each camera on the device."""
-    if isinstance(world, wp.array):
-        return check_array("world", world, wp.int32, (cameras,), device)
-    world = list(range(cameras)) if world is None else [check_integer("world", one, 0) for one in world]
-    if len(world) != cameras:
-        raise ArgumentError(f"world has {len(world)} entries; one for each of {cameras} cameras is needed")
-    return wp.array(world, dtype=int, device=device)

@@ -140,7 +140,7 @@ def test_rates_are_those_of_the_analytic_model(device):
     back = sk.single_scatter_table(config.lidar(), phase, view_d, distance_d)[2].numpy()
     dark = config.dark_rate * 2 * 7.5 / config.speed
     # The response carries what arrives at the gate's start over it, in both directions.
-    assert rates.sum(axis=1) == pytest.approx(signal + back + dark, rel=0.02)
+    assert rates.sum(axis=1) == pytest.approx(signal + back + dark, rel=0.03)
     assert rates.sum(axis=1).sum() == pytest.approx((signal + back + dark).sum(), rel=5e-3)
     # Without water: the mean and spread of the histogram are the arrival time and the response.
     camera = sk.SpadCamera(sk.SpadConfig(**SMALL, gate=(0.5, 8.0), bins=200, dark_rate=0.0, **CLEAR), device=device)

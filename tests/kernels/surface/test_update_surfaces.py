@@ -1,0 +1,154 @@
+"""Surfaces that follow a moving mesh, and rays by Warp's own queries."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+
+import spadwarp_kernels as sk
+from spadwarp_kernels.intersect import pack_bvh
+
+PRIVATE_LAYOUT = (
+    f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/intersect/bvh.py reads "
+    "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
+    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., public_tree=True) "
+    "takes wp.mesh_query_ray."
+)
+
+
+def ball(device, count=24):
+    """Points and triangles of a sphere of radius 1, a little dented."""
+    theta, phi = np.meshgrid(np.linspace(0.05, math.pi - 0.05, count), np.linspace(0.0, 2 * math.pi, 2 * count))
+    r = 1.0 + 0.1 * np.sin(3 * phi) * np.sin(2 * theta)
+    points = np.stack([r * np.sin(theta) * np.cos(phi), r * np.sin(theta) * np.sin(phi), r * np.cos(theta)], axis=-1)
+    first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
+    points = points.reshape(-1, 3).astype(np.float32)
+    mesh = wp.Mesh(wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=int, device=device))
+    return mesh, points
+
+
+@wp.kernel(enable_backward=False)
+def cast(
+    surfaces: sk.Surfaces,
+    x: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    mine: wp.array(dtype=float),
+    hers: wp.array(dtype=float),
+):
+    i = wp.tid()
+    mine[i] = sk.intersect_surfaces(surfaces, x[i], u[i], 100.0, False).distance
+    hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
+
+
+def distances(surfaces, device, count=20_000):
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
+    mine, hers = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    rays = [wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (x, u)]
+    wp.launch(cast, count, [surfaces, *rays], [mine, hers], device=device)
+    return mine.numpy(), hers.numpy()
+
+
+def test_the_tree_is_read_as_warp_writes_it(device):
+    """Warp's private structs: `pack_bvh` finds each face once, in boxes that hold it, whatever the builder."""
+    for constructor in ("sah", "median", *(["lbvh"] if wp.get_device(device).is_cuda else [])):
+        mesh, points = ball(device)
+        mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor)
+        try:
+            nodes, _, order, _ = (one.numpy() for one in pack_bvh(mesh, 1.2))
+        except Exception as error:
+            pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
+        faces = np.where(order < 0, ~order, order)
+        corners = points[mesh.indices.numpy().reshape(-1, 3)]
+        pairs, seen, stack = nodes.reshape(-1, 2, 2, 4), [], [(0, np.full(3, -np.inf), np.full(3, np.inf))]
+        while stack and len(seen) <= len(faces):
+            pair, low, high = stack.pop()
+            for child in range(2):
+                lower, upper = pairs[pair, child, 0, :3], pairs[pair, child, 1, :3]
+                entry = int(pairs[pair, child, 0, 3].view(np.int32))
+                if entry == -1:
+                    continue
+                inside = (lower >= low - 1e-5).all() and (upper <= high + 1e-5).all()
+                assert inside, f"{PRIVATE_LAYOUT} (a child leaves its parent's box, {constructor})"
+                if entry >= 0:
+                    stack.append((entry, lower, upper))
+                    continue
+                slot = -2 - entry
+                while True:
+                    held = (corners[faces[slot]] >= lower).all() and (corners[faces[slot]] <= upper).all()
+                    assert held, f"{PRIVATE_LAYOUT} (a face leaves its box, {constructor})"
+                    seen.append(faces[slot])
+                    if order[slot] >= 0:
+                        break
+                    slot += 1
+        assert sorted(seen) == list(range(len(faces))), f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+
+
+@pytest.mark.parametrize("public_tree", [False, True])
+def test_surfaces_follow_moving_points(public_tree, device):
+    mesh, points = ball(device)
+    surfaces = sk.make_surfaces(mesh, extent=5.0, public_tree=public_tree)
+    assert sk.surface_choices(surfaces)["public_tree"] == public_tree
+    before = distances(surfaces, device)[0]
+    moved = points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)
+    mesh.points.assign(moved.astype(np.float32))
+    sk.update_surfaces(surfaces, mesh)
+    mine, hers = distances(surfaces, device)
+    new = wp.Mesh(wp.array(moved.astype(np.float32), dtype=wp.vec3, device=device), mesh.indices)
+    fresh = distances(sk.make_surfaces(new), device)[0]
+    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
+    assert (np.abs(mine - before) > 1e-3).mean() > 0.1
+
+
+def test_a_camera_map_cannot_follow(device):
+    mesh, _ = ball(device)
+    camera = sk.Camera()
+    camera.width = camera.height = 8
+    camera.pixel_tangent, camera.aperture_area = 0.1, 1e-4
+    with pytest.raises(sk.ArgumentError, match="make them without camera"):
+        sk.update_surfaces(sk.make_surfaces(mesh, camera=camera), mesh)
+    other, _ = ball(device)
+    with pytest.raises(sk.ArgumentError, match="not those of mesh"):
+        sk.update_surfaces(sk.make_surfaces(mesh), other)
+
+
+def small_model(mesh, surfaces):
+    medium, laser, limits, camera, gate = sk.Medium(), sk.Laser(), sk.Limits(), sk.Camera(), sk.Gate()
+    medium.extinction, medium.albedo, medium.anisotropy, medium.axis_threshold = 0.2, 0.7, 0.9, 1.0
+    laser.position, laser.axis, laser.spread = wp.vec3(0.05, 0.0, 0.0), wp.vec3(0.0, 0.0, 1.0), 0.02
+    camera.width, camera.height, camera.pixel_tangent = 8, 8, 0.04
+    camera.aperture_radius, camera.aperture_area = 0.01, math.pi * 1e-4
+    gate.start, gate.stop, gate.bins, gate.bins_per_metre = 2.0, 10.0, 16, 2.0
+    limits.max_path, limits.max_collisions, limits.weight_cutoff = 10.0, 32, 1e-3
+    return sk.Model(mesh.device, medium, laser, camera, gate, limits, sk.Guiding(), mesh, surfaces, 2.0**50)
+
+
+def tally(model, spec, first_id=0, offset=0, count=20_000):
+    data = sk.make_data(model)
+    data.offset.fill_(offset)
+    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=count)
+    return data.tally.numpy()
+
+
+def test_transport_by_public_queries_and_by_steps(device):
+    """Warp's own queries give the light of our tree; photons are numbered from the offset on the device."""
+    mesh, points = ball(device)
+    mesh.points.assign(points + np.array([0.0, 0.0, 3.0], np.float32))
+    mesh.refit()
+    model = small_model(mesh, sk.make_surfaces(mesh, 0.5))
+    spec = sk.TransportSpec("next_event")
+    light = tally(model, spec)
+    public = dataclasses.replace(model, surfaces=sk.make_surfaces(mesh, 0.5, public_tree=True))
+    with pytest.raises(sk.ArgumentError, match="public_tree = False does not go with"):
+        tally(public, spec)
+    other = tally(public, spec._replace(public_tree=True))
+    # A ray on an edge may fall on either side of it: the same photons otherwise.
+    assert light.sum() > 0 and np.abs(light - other).sum() < 1e-3 * light.sum()
+    stepped = spec._replace(stepped=True)
+    assert np.array_equal(tally(model, stepped), light)
+    assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
