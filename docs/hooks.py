@@ -1,15 +1,19 @@
-"""For MkDocs: pages that live elsewhere in the repository, and links between all of them as the repository has them.
+"""For MkDocs: pages that live elsewhere in the repository, notebooks, and links between all of them.
 
 Links in the sources lead from file to file, so that they work where the files are read; here they become those of the
-site. What a link leads to that is not on the site keeps its text.
+site. What a link leads to that is not on the site keeps its text. Notebooks are executed; those with outputs are kept
+in out/notebooks until the notebook changes.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import posixpath
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from mkdocs.structure.files import File
@@ -37,10 +41,44 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages from elsewhere."""
+    """Adds the pages from elsewhere, and a page for each notebook."""
     for source, page in ELSEWHERE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        for name, content in notebook_page(path):
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
     return files
+
+
+def notebook_page(path: Path) -> Iterator[tuple[str, str | bytes]]:
+    """A notebook with its outputs as Markdown, and its pictures: names and contents."""
+    from nbconvert import MarkdownExporter
+
+    folder = f"{path.stem}_files"
+    body, resources = MarkdownExporter().from_notebook_node(
+        executed(path), {"output_files_dir": folder, "unique_key": path.stem}
+    )
+    title, _, text = body.partition("\n")
+    download = f'<a href="{path.name}" download>Download this notebook</a>'
+    yield f"{path.stem}.md", f"{title}\n\n{download}\n{text}"
+    yield from resources["outputs"].items()
+
+
+def executed(path: Path) -> Any:
+    """The notebook with the outputs of its cells; an error in a cell ends the build."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    source = path.read_bytes()
+    kept = ROOT / "out" / "notebooks" / f"{path.stem}-{hashlib.sha256(source).hexdigest()[:16]}.ipynb"
+    if kept.exists():
+        return nbformat.read(kept, as_version=4)
+    with TemporaryDirectory() as folder:
+        notebook = nbformat.reads(source.decode("utf-8"), as_version=4)
+        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": folder}}).execute()
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, kept)
+    return notebook
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -55,6 +93,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match.group()
         place = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
         on_site = ELSEWHERE.get(place, place.removeprefix("docs/") if place.startswith("docs/") else None)
+        on_site = on_site and re.sub(r"\.ipynb$", ".md", on_site)
         if on_site is None or (ROOT / place).is_dir():
             return text
         relative = os.path.relpath(on_site, posixpath.dirname(here) or ".").replace(os.sep, "/")

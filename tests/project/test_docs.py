@@ -221,6 +221,7 @@ def test_pages_of_the_site_exist():
     named = set(re.findall(r": ([\w/]+\.md)$", text, re.MULTILINE))
     elsewhere = set(re.findall(r'": "([\w/]+\.md)"', (ROOT / "docs" / "hooks.py").read_text()))
     here = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    here |= {f"notebooks/{path.stem}.md" for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")}
     assert named and named <= here | elsewhere
 
 

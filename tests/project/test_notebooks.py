@@ -1,0 +1,52 @@
+"""The notebooks of the documentation run from their first cell to their last, and are kept without outputs."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+def by_name(path):
+    return path.stem
+
+
+def run(path, folder):
+    """The notebook with its outputs, executed in `folder`; an error in a cell is raised."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.read(path, as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
+    roots = os.pathsep.join(str(ROOT / name) for name in (".", "kernels"))
+    environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
+    return client.execute(env={**environment, "PYTHONPATH": roots})
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of Jupyter's own packages
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
+def test_notebook_runs(path, tmp_path):
+    outputs = [output for cell in run(path, tmp_path).cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not [output for output in outputs if output.get("name") == "stderr" and "Warning" in output["text"]]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
+def test_notebook_is_kept_without_outputs_and_leads_somewhere(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    assert not [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")]
+    text = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    assert '-e ".[notebooks]"' in text
+    for link in re.findall(r"\]\(([^)#]+)(?:#[\w-]+)?\)", text):
+        assert (path.parent / link).is_file(), link
+
+
+def test_pages_lead_to_every_notebook():
+    assert len(NOTEBOOKS) == 5
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    linked = re.findall(r"\(\S*notebooks/(\w+)\.ipynb\)", "".join(page.read_text(encoding="utf-8") for page in pages))
+    assert {path.stem for path in NOTEBOOKS} == set(linked)
