@@ -72,7 +72,11 @@ class InstrumentResponse:
         if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
             span = f"{values.min()} … {values.max()}"
             raise ArgumentError(f"values of a measured response ({span}) must be finite, not negative and not all 0")
-        values /= np.trapezoid(values, times)
+        values = _near_1(values)
+        area = float(np.trapezoid(values, times))
+        if not 1e-300 < area < 1e300:
+            raise ArgumentError(f"times of a measured response ({times[0]} … {times[-1]} s) have no usable length")
+        values /= area
         for name, array in {"times": times, "values": values, "_knots": times, "_heights": values}.items():
             object.__setattr__(self, name, array)
 
@@ -275,6 +279,11 @@ def _read_csv(path: Path) -> InstrumentResponse:
         raise ArgumentError(f"{path}: {error}") from None
 
 
+def _near_1(values: Floats) -> Floats:
+    """Values times the power of two that brings the largest near 1: no bit of what is normalised later changes."""
+    return np.ldexp(values, -int(np.frexp(values.max())[1]))
+
+
 def read_response(path: str | Path, *, bin_width: float | None = None) -> InstrumentResponse:
     """A measured response from a file.
 
@@ -300,7 +309,7 @@ def read_response(path: str | Path, *, bin_width: float | None = None) -> Instru
         raise ArgumentError(f"{path}: {values.shape} is not a response: two values or more, not negative, not all 0")
     if bin_width is None:
         raise ArgumentError(f"bin width is missing (--bin-width-ps): {path} has a value for each bin")
-    values = np.concatenate([[0.0], values, [0.0]])  # between its bins linear, to 0 on either side
+    values = np.concatenate([[0.0], _near_1(values), [0.0]])  # between its bins linear, to 0 on either side
     centres = np.arange(values.size) - float(values @ np.arange(values.size)) / float(values.sum())
     return InstrumentResponse(times=centres * bin_width, values=values)
 

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, instrument_response, response_matrix
+from spadwarp.errors import ArgumentError
+from spadwarp.frames.response import (
+    FWHM_PER_SIGMA,
+    InstrumentResponse,
+    instrument_response,
+    read_response,
+    response_matrix,
+)
 
 PS = 1e-12
 
@@ -157,6 +164,26 @@ def test_a_bad_csv_is_named(tmp_path, text, message):
     with pytest.raises(ValueError, match=message) as error:
         instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(path))
     assert "irf.csv" in str(error.value)
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-310, 1e-160, 1e300, 1.7e308 / 4])
+def test_the_unit_of_a_measured_response_does_not_matter(scale, tmp_path):
+    """Neither sums that overflow nor values below the smallest normal number change its shape."""
+    shape = np.array([1.0, 4.0, 2.0])
+    np.save(tmp_path / "unit.npy", shape)
+    np.save(tmp_path / "scaled.npy", shape * scale)
+    unit, scaled = (read_response(tmp_path / f"{name}.npy", bin_width=1e-10) for name in ("unit", "scaled"))
+    assert scaled.mean == pytest.approx(unit.mean, abs=1e-22) and scaled.fwhm == pytest.approx(unit.fwhm)
+    times = [0.0, 1e-10, 2e-10]
+    assert (
+        InstrumentResponse(times=times, values=shape * scale).fwhm == InstrumentResponse(times=times, values=shape).fwhm
+    )
+
+
+@pytest.mark.parametrize("times", [[0.0, 5e-324, 1e-323], [-1.7e308, 0.0, 1.7e308]])
+def test_times_of_no_usable_length_are_refused(times):
+    with pytest.raises(ArgumentError, match="times of a measured response"):
+        InstrumentResponse(times=times, values=[0.0, 1.0, 0.0])
 
 
 def test_wrong_input_is_named():
