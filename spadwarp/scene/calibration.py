@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -128,10 +128,17 @@ def _xml_entries(text: str) -> dict[str, Any]:
         raise ValueError(f"not valid XML: {error}") from None
     entries: dict[str, Any] = {}
     for element in root:
-        data = element.find("data")
-        words: Sequence[str] = ((element if data is None else data).text or "").split()
-        entries[element.tag] = {"data": list(words)} if data is not None else words[0] if len(words) == 1 else [*words]
+        if element.find("data") is not None:  # a matrix
+            parts = {part.tag: (part.text or "").split() for part in element}
+            entries[element.tag] = {**parts, "rows": _one(parts.get("rows")), "cols": _one(parts.get("cols"))}
+        else:
+            entries[element.tag] = _one((element.text or "").split())
     return entries
+
+
+def _one(words: list[str] | None) -> list[str] | str | None:
+    """The word of a list of one, else the list."""
+    return words[0] if words is not None and len(words) == 1 else words
 
 
 class _Loader(yaml.BaseLoader):
@@ -176,7 +183,12 @@ def _numbers(name: str, value: Any) -> list[float]:
     data = value.get("data") if isinstance(value, Mapping) else value
     items = data if isinstance(data, list) else [data]
     cells = [cell for item in items for cell in (item if isinstance(item, list) else [item])]
-    return [_number(name, cell) for cell in cells]
+    numbers = [_number(name, cell) for cell in cells]
+    if isinstance(value, Mapping) and value.get("rows") is not None and value.get("cols") is not None:
+        rows, columns = (_number(f"{name}.{side}", value[side]) for side in ("rows", "cols"))
+        if rows * columns != len(numbers):
+            raise ValueError(f"{name} has {len(numbers)} numbers in {rows:g} rows and {columns:g} columns")
+    return numbers
 
 
 def _number(name: str, cell: Any) -> float:

@@ -58,12 +58,12 @@ def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
         name = r.choice(names)
         damage = (
             mutations.in_text
-            if name.rpartition(".")[2] in ("csv", "yaml", "json", "obj", "mtl")
+            if name.rpartition(".")[2] in ("csv", "yaml", "json", "xml", "obj", "mtl")
             else mutations.in_bytes
         )
         scene = corpus["calibrated.toml"]
-        if name == "camera.json":
-            scene = scene.replace(b"camera.yaml", b"camera.json")
+        if name.startswith("camera"):
+            scene = scene.replace(b"camera.yaml", name.encode())
         files = {**_calibrated(), "calibrated.toml": scene, name: damage(r, corpus[name])}
         run = ("simulate", "calibrated.toml", "--photons", "100", "--out", "out", "--quiet", *CPU)
         return Case(r.choice((("check", "calibrated.toml"), run)), files, ("out",))
@@ -176,7 +176,7 @@ def _command_line(r: random.Random, corpus: Corpus) -> Case:
 CATEGORIES: dict[str, Callable[[random.Random, Corpus], Case]] = {
     "scene": _scene,
     "recipe": _recipe,
-    "calibration": _beside_a_scene("camera.yaml", "camera.json"),
+    "calibration": _beside_a_scene("camera.yaml", "camera.json", "camera.xml"),
     "table": _beside_a_scene("phase.csv", "irf.csv", "beam.npy"),
     "mesh": _mesh,
     "picture": _beside_a_scene("target.png", "target.mtl", "target.obj"),

@@ -87,6 +87,23 @@ distortion_coefficients: !!opencv-matrix
    data: [ -0.01, 0.001, 0.0, 0.0, 0.0 ]
 """
 
+CAMERA_XML = b"""<?xml version="1.0"?>
+<opencv_storage>
+<image_width>10</image_width>
+<image_height>8</image_height>
+<camera_matrix type_id="opencv-matrix">
+  <rows>3</rows>
+  <cols>3</cols>
+  <dt>d</dt>
+  <data>17. 0. 3. 0. 17. 2. 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix">
+  <rows>1</rows>
+  <cols>5</cols>
+  <dt>d</dt>
+  <data>-0.01 0.001 0. 0. 0.</data></distortion_coefficients>
+</opencv_storage>
+"""
+
 TRAINING = b"""model = "usdn"
 data = "none"
 seed = 4
@@ -110,7 +127,7 @@ def make_corpus(folder: Path) -> None:
     """Writes all files; takes a few seconds."""
     for name, content in {
         "scene.toml": SCENE, "calibrated.toml": CALIBRATED, "camera.yaml": CAMERA, "training.toml": TRAINING,
-        "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
+        "camera.xml": CAMERA_XML, "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
     }.items():  # fmt: skip
         (folder / name).write_bytes(content)
     matrix = [[17.0, 0.0, 3.0], [0.0, 17.0, 2.0], [0.0, 0.0, 1.0]]
