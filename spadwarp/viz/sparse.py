@@ -52,7 +52,10 @@ def merged_edges(values: NDArray[np.float64], variance: NDArray[np.float64]) -> 
     changes = np.flatnonzero(np.diff(np.concatenate([[True], alone, [True]]).astype(np.int8)))
     for start, stop in changes.reshape(-1, 2):
         edges += list(range(edges[-1], start + 1))  # bins that stand alone
-        edges += _cuts(values, variance, max(start, first), min(stop, last))
+        if first < start < last and not values[start:stop].any():
+            edges.pop()  # a stretch without light is part of the bin before it
+        else:
+            edges += _cuts(values, variance, max(start, first), min(stop, last))
         edges.append(int(stop))
     edges += list(range(edges[-1], len(values) + 1))
     return np.unique(edges)

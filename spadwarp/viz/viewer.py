@@ -75,11 +75,11 @@ def view(
     """Writes one self-contained HTML file; returns its path.
 
     It shows the depth frame as a point cloud coloured by its error, the depth frame, its truth, error and intensity as
-    images, and the histogram of the pixel that is clicked on: a result's components, or counts of a frame with their
-    expectation and background, with the instrument response; where there is depth alone, the depths that the frames of
-    one scene report. `view.html#row,column` opens on a pixel. Histograms are
-    kept to 7 decades and 7 %, counts exactly; where they would take more than `HISTOGRAM_BYTES`, bins and then blocks
-    of pixels are averaged, and the page says so.
+    images, and the histogram of the pixel that is clicked on: a result's components, in wider bins where light is
+    sparse, or counts of a frame with their expectation and background, with the instrument response; where there is
+    depth alone, the depths that the frames of one scene report. `view.html#row,column` opens on a pixel. Histograms
+    are kept to 7 decades and 7 %, counts exactly; where they would take more than `HISTOGRAM_BYTES`, bins and then
+    blocks of pixels are averaged, and the page says so.
 
     Args:
         source: What `spadwarp.load` returns, or a path that it takes: a result, frames, an analytic file, a dataset.
@@ -248,6 +248,7 @@ def _data(page: _Page) -> dict[str, Any]:
         "merged": merged,
         "edges": [round(1e9 * float(edge), 6) for edge in edges],
         "unit": page.unit,
+        "sparse": not any(layer.filled for layer in page.layers),
         "response": _response(page.response),
         "first": median_pixel(page.intensity, np.isfinite(page.depth) & np.isfinite(page.truth)),
     }

@@ -153,12 +153,23 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
         browser.wait("document.getElementById('pixel').textContent.startsWith('row 7, column 10: ')", seconds=20)
         assert browser.run("location.hash") == "#7,10"
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detector.pde
+        width = result.scene.gate.bin_width * 1e9
+        for index, name in enumerate(COMPONENTS):  # bins that are added up keep their light
+            time, drawn = (
+                np.array(browser.run(f"Array.from(document.getElementById('histogram').data[{index}].{axis})"))
+                for axis in "xy"
+            )
+            light = (np.diff(time) * drawn[:-1]).sum() / width
+            np.testing.assert_allclose(light, result.component(name)[7, 10].sum() * per_pulse, rtol=0.02)
+        browser.run("document.getElementById('merge').click()")
         for index, name in enumerate(COMPONENTS):
             drawn = np.array(browser.run(f"Array.from(document.getElementById('histogram').data[{index}].y)"))
             exact = result.component(name)[7, 10] * per_pulse
             bright = exact > 1e-6 * exact.max()
             np.testing.assert_allclose(drawn[:-1][bright], exact[bright], rtol=0.034)
-        assert browser.run("document.getElementById('cloud').data[0].x.length") == np.isfinite(result.depth()).sum()
+        on_target, reported = np.isfinite(result.truth.depth), np.isfinite(result.depth())
+        points = browser.run("document.getElementById('cloud').data.map((trace) => trace.x.length)")
+        assert [points[0], points[2]] == [np.sum(reported & on_target), np.sum(reported & ~on_target)]
         # Ticks of the range axis are where light of that range arrives: r + |r u - p| over the speed.
         ticks = browser.run(
             "(({ tickvals, ticktext }) => tickvals.map((time, k) => [time, Number(ticktext[k])]))"

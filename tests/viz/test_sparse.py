@@ -1,0 +1,38 @@
+"""Bins that are added up where light is sparse."""
+
+import numpy as np
+import pytest
+
+from spadwarp.viz.sparse import merged_edges, merged_means, typical_weight
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_groups_keep_the_light_and_are_known_to_a_third(seed):
+    random = np.random.default_rng(seed)
+    counts = random.poisson(300 * np.exp(-np.arange(400) / 40.0)) * 1.0
+    edges = merged_edges(counts, counts)
+    assert edges[0] == 0 and edges[-1] == 400 and (np.diff(edges) > 0).all()
+    sums = merged_means(counts, edges) * np.diff(edges)
+    assert sums.sum() == counts.sum()
+    some = sums > 0
+    assert (sums[some] >= 9).mean() > 0.85  # 9 counts are known to a third; a bin between two such bins may hold fewer
+    assert (np.diff(edges)[:80] == 1).all() and np.diff(edges)[some][-2:].max() > 20
+
+
+def test_light_stays_in_its_time_and_a_peak_in_its_bin():
+    light = np.zeros(100)
+    light[40], light[60] = 1000.0, 1.0
+    edges = merged_edges(light, light)
+    assert {40, 41, 61} <= set(edges) and not set(range(1, 40)) & set(edges)
+
+
+@pytest.mark.parametrize("weight", [1e-3, 5.0])
+def test_the_weight_of_a_photon_is_found_on_a_slope(weight):
+    counts = np.random.default_rng(2).poisson(np.geomspace(2000.0, 20.0, 300))
+    # The median of the square of a normal variable is 0.45 of its mean.
+    assert np.median(typical_weight(weight * counts)) == pytest.approx(0.45 * weight, rel=0.25)
+
+
+def test_nothing_is_one_group_of_nothing():
+    edges = merged_edges(np.zeros(8), np.zeros(8))
+    assert merged_means(np.zeros(8), edges).sum() == 0 and edges[-1] == 8
