@@ -19,6 +19,7 @@ from spadwarp.cli import (  # noqa: F401
     budget,
     sweep,
     water,
+    particles,
     dataset,
     denoise,
     evaluate,

@@ -33,7 +33,7 @@ Value = TypeVar("Value")
 # Commands by stage of work, in the order of the help.
 STAGES = {
     "Begin": ("init", "examples", "schema", "doctor", "devices"),
-    "Plan": ("check", "plan", "budget", "sweep", "water", "presets", "targets"),
+    "Plan": ("check", "plan", "budget", "sweep", "water", "particles", "presets", "targets"),
     "Simulate": ("simulate", "merge", "analytic"),
     "Counts and depth": ("detect", "depth", "denoise"),
     "Look at results": ("info", "view", "video", "export"),
