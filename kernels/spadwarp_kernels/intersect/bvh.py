@@ -17,7 +17,7 @@ import warp as wp
 from spadwarp_kernels.math.bits import bits_of, from_bits
 
 from .box import box_span
-from .triangle import WIDENING, face_distance, pack_faces_kernel
+from .triangle import WIDENING, face_distance, face_in, pack_faces_kernel
 
 # What a walk holds in place of a node when it has come to its end: nodes are above, leaves below.
 NO_NODE = wp.constant(-1)
@@ -116,8 +116,8 @@ def _pack_kernel(
             nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
 
 
-def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; see `repack_bvh` after a refit.
+def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; see `refit_bvh` for moved points.
 
     Args:
         mesh: Any `wp.Mesh`.
@@ -127,7 +127,6 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
         faces: vec4 [3 * slots], see `face_distance`.
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
-        before: int32, for `repack_bvh`: how many nodes with children stand before each node of the mesh's tree.
     """
     count, device = mesh.indices.size // 3, mesh.device
     has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
@@ -137,16 +136,85 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
     order = wp.zeros(count, dtype=int, device=device)
     wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
     wp.utils.array_scan(has_children, before, inclusive=False)
-    repack_bvh(mesh, extent, nodes, faces, order, before)
-    return nodes, faces, order, before
+    inputs = [mesh.id, _padding(extent), before]
+    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
+    wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=device)
+    return nodes, faces, order
 
 
-def repack_bvh(
-    mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array, before: wp.array
+def _padding(extent: float) -> float:
+    return 2.5 * WIDENING * extent + 1e-9
+
+
+@wp.kernel(enable_backward=False)
+def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dtype=int)):
+    """Launch: pairs."""
+    pair = wp.tid()
+    if depth[pair] == level:
+        for k in range(2):
+            entry = bits_of(nodes[4 * pair + 2 * k][3])
+            if entry >= 0:
+                depth[entry] = level + 1
+
+
+def pair_depths(nodes: wp.array) -> tuple[wp.array, int]:
+    """How deep in the tree each pair of nodes of `pack_bvh` stands, int32 [pairs], -1 for none, and the number of
+    levels; waits for the device."""
+    depth = wp.full(nodes.size // 4, -1, dtype=int, device=nodes.device)
+    depth[:1].zero_()
+    for level in range(Stack._length_):
+        wp.launch(_depth_kernel, depth.size, [nodes, level], outputs=[depth], device=nodes.device)
+    return depth, int(depth.numpy().max()) + 1
+
+
+@wp.kernel(enable_backward=False)
+def _refit_kernel(
+    mesh: wp.uint64,
+    padding: float,
+    level: int,
+    depth: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+    nodes: wp.array(dtype=wp.vec4),
+):
+    """Boxes of the pairs of one level, those below being done. Launch: pairs."""
+    pair = wp.tid()
+    if depth[pair] != level:
+        return
+    m = wp.mesh_get(mesh)
+    for k in range(2):
+        entry = bits_of(nodes[4 * pair + 2 * k][3])
+        low = wp.vec3(_NOWHERE)
+        high = wp.vec3(-_NOWHERE)
+        if entry >= 0:
+            for child in range(2):
+                lower = nodes[4 * entry + 2 * child]
+                upper = nodes[4 * entry + 2 * child + 1]
+                low = wp.min(low, wp.vec3(lower[0], lower[1], lower[2]))
+                high = wp.max(high, wp.vec3(upper[0], upper[1], upper[2]))
+        elif entry != NO_NODE:
+            slot = -2 - entry
+            more = bool(True)
+            while more:
+                face = face_in(order, slot)
+                for corner in range(3):
+                    p = m.points[m.indices[3 * face + corner]]
+                    low = wp.min(low, p - wp.vec3(padding))
+                    high = wp.max(high, p + wp.vec3(padding))
+                more = order[slot] < 0
+                slot += 1
+        if entry != NO_NODE:
+            nodes[4 * pair + 2 * k] = _with_bits(low, entry)
+            nodes[4 * pair + 2 * k + 1] = _with_bits(high, 0)
+
+
+def refit_bvh(
+    mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array, depth: wp.array, levels: int
 ) -> None:
-    """Writes what `pack_bvh` returns anew for moved points, after `mesh.refit()`; allocates and reads nothing."""
-    padding = 2.5 * WIDENING * extent + 1e-9
-    wp.launch(_pack_kernel, before.size, [mesh.id, padding, before], outputs=[nodes, order], device=mesh.device)
+    """Boxes and faces of a packed tree for points that have moved: a launch a level, without an allocation or a look
+    at Warp's own tree. `depth` and `levels` are those of `pair_depths`."""
+    for level in reversed(range(levels)):
+        inputs = [mesh.id, _padding(extent), level, depth, order]
+        wp.launch(_refit_kernel, depth.size, inputs, outputs=[nodes], device=mesh.device)
     wp.launch(pack_faces_kernel, order.size, [mesh.id, order], outputs=[faces], device=mesh.device)
 
 
@@ -159,12 +227,11 @@ def pack_faces(mesh: wp.Mesh) -> tuple[wp.array, wp.array]:
     return faces, order
 
 
-def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
     """What `pack_bvh` returns, for no faces at all: a root whose two children no ray meets."""
     x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
     nodes = wp.array([[x, x, x, bits]] * 4, dtype=wp.vec4, device=device)
-    faces, order, before = (wp.zeros(0, dtype=dtype, device=device) for dtype in (wp.vec4, int, int))
-    return nodes, faces, order, before
+    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
 @wp.struct

@@ -16,7 +16,7 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_values,
 )
-from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pack_faces, repack_bvh
+from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pack_faces, pair_depths, refit_bvh
 from spadwarp_kernels.intersect.triangle import pack_faces_kernel
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import near_depth_map
@@ -53,7 +53,7 @@ class Surfaces:
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
-        before: What `update_surfaces` needs of the tree, see `pack_bvh`.
+        depth, levels: Of the tree of a moving mesh, see `pair_depths`; empty for others.
         extent: Largest coordinate that the tree is made for [m].
     """
 
@@ -69,7 +69,8 @@ class Surfaces:
     textures: Textures
     specular: wp.array(dtype=float)
     roughness: wp.array(dtype=float)
-    before: wp.array(dtype=int)
+    depth: wp.array(dtype=int)
+    levels: int
     extent: float
 
 
@@ -137,7 +138,8 @@ def make_surfaces(
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
     _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before = empty_bvh(device)
+    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device)
+    surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
         return surfaces
@@ -160,7 +162,9 @@ def make_surfaces(
         surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
         surfaces.faces, surfaces.order = pack_faces(mesh)
     else:
-        surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before = pack_bvh(mesh, surfaces.extent)
+        surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent)
+        if extent is not None:
+            surfaces.depth, surfaces.levels = pair_depths(surfaces.nodes)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
@@ -169,7 +173,8 @@ def make_surfaces(
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
-    """Follows the points of a mesh that have moved, on the device: refits its tree and writes the surfaces' anew.
+    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `public_tree` the
+    mesh's own.
 
     Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
     from each other, surfaces made from a new `wp.Mesh` are faster.
@@ -187,10 +192,13 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
         raise ArgumentError("surfaces are not those of mesh")
     if surfaces.near_depth.size:
         raise ArgumentError("surfaces know what the camera cannot miss; for moving points, make them without camera")
-    mesh.refit()
     if surfaces.nodes.size:
-        repack_bvh(mesh, surfaces.extent, surfaces.nodes, surfaces.faces, surfaces.order, surfaces.before)
+        if not surfaces.depth.size:
+            raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
+        tree = (surfaces.nodes, surfaces.faces, surfaces.order, surfaces.depth, surfaces.levels)
+        refit_bvh(mesh, surfaces.extent, *tree)
     else:
+        mesh.refit()
         wp.launch(
             pack_faces_kernel, surfaces.order.size, [mesh.id, surfaces.order], [surfaces.faces], device=mesh.device
         )

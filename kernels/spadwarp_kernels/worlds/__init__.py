@@ -6,6 +6,7 @@ from .frames import CAMERA_FRAMES
 from .shapes import Shapes, ShapeTable, intersect_shapes, make_shapes, move_shapes
 from .simulators import mujoco_shapes, newton_shapes, write_poses
 from .spad_camera import SpadCamera
+from .spad_tracer import SpadTracer
 
 __all__ = [
     "CAMERA_FRAMES",
@@ -14,6 +15,7 @@ __all__ = [
     "Shapes",
     "SpadCamera",
     "SpadConfig",
+    "SpadTracer",
     "intersect_shape",
     "intersect_shapes",
     "make_shapes",

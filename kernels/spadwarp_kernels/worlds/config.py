@@ -184,12 +184,16 @@ class SpadConfig:
         cumulative = 0.5 * (1.0 + np.vectorize(math.erf)(edges / (math.sqrt(2.0) * sigma)))
         return np.diff(cumulative, axis=1), -reach
 
-    def bin_response(self) -> np.ndarray:
-        """What light that is spread evenly over a bin leaves in the bins about it, `[taps]`, the bin itself midmost."""
+    def bin_response(self, parts: int = 1) -> tuple[np.ndarray, int]:
+        """Shares in a bin of the light that is spread evenly over each of the parts of the bins about it.
+
+        Returns float64 `[taps]` and the first tap's part, counted from the first part of the bin.
+        """
         sigma = self.timing_sigma * self.speed / self.bin_path
-        reach = math.ceil(5.0 * sigma) + 1
-        ramp = sigma * np.array([_normal_integral(k / sigma) for k in range(-reach - 1, reach + 2)])
-        return ramp[2:] - 2.0 * ramp[1:-1] + ramp[:-2]
+        reach = math.ceil(5.0 * sigma)
+        edges = np.arange(-reach * parts, (reach + 1) * parts + 1) / parts
+        after, before = (np.array([_normal_integral((end - s) / sigma) for s in edges]) for end in (1.0, 0.0))
+        return -parts * sigma * np.diff(after - before), -reach * parts
 
 
 def _normal_integral(z: float) -> float:
@@ -239,7 +243,6 @@ def backscatter_rates(config: SpadConfig, device: wp.Device) -> np.ndarray:
         lidar = config.lidar()
         inputs = [lidar, spectral_lines(lidar, None, device), phase, view, rates]
         launch_pixels(_backscatter_kernel, rates.shape[0], inputs, device=device)
-    taps = config.bin_response()
-    reach = taps.size // 2
-    padded = np.pad(rates.numpy(), ((0, 0), (reach, reach)))
+    taps, lowest = config.bin_response()
+    padded = np.pad(rates.numpy(), ((0, 0), (-lowest, -lowest)))
     return np.lib.stride_tricks.sliding_window_view(padded, taps.size, axis=1) @ taps.astype(np.float32)

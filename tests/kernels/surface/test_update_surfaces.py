@@ -60,7 +60,7 @@ def test_the_tree_is_read_as_warp_writes_it(device):
         mesh, points = ball(device)
         mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor)
         try:
-            nodes, _, order, _ = (one.numpy() for one in pack_bvh(mesh, 1.2))
+            nodes, _, order = (one.numpy() for one in pack_bvh(mesh, 1.2))
         except Exception as error:
             pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
         faces = np.where(order < 0, ~order, order)
@@ -98,6 +98,7 @@ def test_surfaces_follow_moving_points(public_tree, device):
     moved = points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)
     mesh.points.assign(moved.astype(np.float32))
     sk.update_surfaces(surfaces, mesh)
+    mesh.refit()
     mine, hers = distances(surfaces, device)
     new = wp.Mesh(wp.array(moved.astype(np.float32), dtype=wp.vec3, device=device), mesh.indices)
     fresh = distances(sk.make_surfaces(new), device)[0]
@@ -112,6 +113,8 @@ def test_a_camera_map_cannot_follow(device):
     camera.pixel_tangent, camera.aperture_area = 0.1, 1e-4
     with pytest.raises(sk.ArgumentError, match="make them without camera"):
         sk.update_surfaces(sk.make_surfaces(mesh, camera=camera), mesh)
+    with pytest.raises(sk.ArgumentError, match="make_surfaces needs an extent"):
+        sk.update_surfaces(sk.make_surfaces(mesh), mesh)
     other, _ = ball(device)
     with pytest.raises(sk.ArgumentError, match="not those of mesh"):
         sk.update_surfaces(sk.make_surfaces(mesh), other)

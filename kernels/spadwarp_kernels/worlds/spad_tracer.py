@@ -1,0 +1,219 @@
+"""The full camera: Monte Carlo transport of photons through the water and against the shapes, world by world."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.arguments import ArgumentError, check_choice, check_integer, check_kind
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
+from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
+from spadwarp_kernels.tally.tally import COMPONENTS
+from spadwarp_kernels.transport.launch import Data, Model, launch_transport, make_data
+
+from .cameras import WorldCameras
+from .config import SpadConfig
+from .shapes import Shapes
+from .triangles import CameraMeshes, _albedo_kernel
+
+wp.set_module_options({"enable_backward": False})
+
+ESTIMATORS = ("guided", "next_event")
+
+
+@wp.kernel(enable_backward=False)
+def _light_kernel(tally: wp.array(dtype=wp.int64), factor: wp.float64, light: wp.array2d(dtype=float)):
+    """Detections per pulse of all components. Launch: (pixels, bins of the tally)."""
+    pixel, k = wp.tid()
+    voxels = light.shape[0] * light.shape[1]
+    units = wp.int64(0)
+    for part in range(wp.static(len(COMPONENTS))):
+        units += tally[part * voxels + pixel * light.shape[1] + k]
+    light[pixel, k] = float(wp.float64(units) * factor)
+
+
+@wp.kernel(enable_backward=False)
+def _response_kernel(
+    light: wp.array2d(dtype=float),
+    dark: float,
+    taps: wp.array(dtype=float),
+    lowest: int,
+    # Out:
+    rates: wp.array2d(dtype=float),
+):
+    """Expected detections per pulse of one camera: light blurred by the response. Launch: (pixels, bins)."""
+    pixel, k = wp.tid()
+    start = k * (light.shape[1] / rates.shape[1]) + lowest
+    total = float(dark)
+    for t in range(wp.max(0, -start), wp.min(taps.shape[0], light.shape[1] - start)):
+        total += taps[t] * light[pixel, start + t]
+    rates[pixel, k] = total
+
+
+@wp.kernel(enable_backward=False)
+def _advance_kernel(offset: wp.array(dtype=wp.uint64), count: wp.uint64):
+    offset[0] = offset[0] + count
+
+
+class SpadTracer(WorldCameras):
+    """As `SpadCamera`, with all scattering: photons are traced through the water and against the shapes.
+
+    A step is a loop over the cameras of launches that wait for nothing; it allocates nothing and reads nothing back, so
+    that it can be captured in a CUDA graph, after a first one that builds the meshes. Round shapes become polygons of
+    48 sides. The light of a photon depends on `config.seed` and its number, and every step has new photons.
+
+    Args:
+        shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, albedo and the points of meshes may
+            change in place.
+        config, cameras, frame, device: As for `SpadCamera`.
+        world: World of each camera, a list; by default camera k is in world k.
+        photons: Of a step and camera, 1 ... 2^26.
+        estimator: "guided" or "next_event".
+        oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
+        public_tree: See `make_surfaces`.
+
+    Attributes:
+        rates, histogram, counts, depth, true_depth, normal, albedo, step: As of `SpadCamera`; `rates` have the noise of
+            the photons that were traced.
+        data: Ledger of the last step, for `read_ledger`, and the tally of the last camera.
+
+    Raises:
+        ArgumentError: A number out of range, a world without shapes, or arrays that do not fit.
+    """
+
+    def __init__(
+        self,
+        shapes: Shapes,
+        config: SpadConfig | None = None,
+        cameras: int = 1,
+        *,
+        photons: int = 1_000_000,
+        world: Sequence[int] | None = None,
+        frame: str = "optical",
+        estimator: str = "guided",
+        oversampling: int = 4,
+        public_tree: bool = False,
+        device: wp.DeviceLike = None,
+    ) -> None:
+        check_kind("shapes", shapes, Shapes)
+        super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
+        if self.device != shapes.device:
+            raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
+        check_choice("estimator", estimator, ESTIMATORS)
+        self.photons = check_integer("photons", photons, 1, 1 << 26)
+        self.shapes, self._public_tree = shapes, public_tree
+        worlds = [int(one) for one in (range(self.cameras) if world is None else world)]
+        if max(worlds) >= shapes.worlds:
+            raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
+        self._meshes = CameraMeshes(shapes, worlds, self.device)
+        for v, faces in enumerate(self._meshes.face_shape):
+            if not len(faces):
+                raise ArgumentError(f"world {worlds[v]} of camera {v} has no shapes")
+        self._parts = check_integer("oversampling", oversampling, 1)
+        taps, self._lowest = self.config.bin_response(self._parts)
+        self._taps = wp.array(taps, dtype=float, device=self.device)
+        shape = (self.config.height * self.config.width, self._parts * self.config.bins)
+        self._light = wp.zeros(shape, dtype=float, device=self.device)
+        self._estimator = estimator
+        self._models: list[Model] = []
+        self.data: Data | None = None
+
+    def update(self, camera_q: wp.array, body_q: wp.array | None = None) -> None:
+        """A step; see `SpadCamera.update`."""
+        self._look(self.shapes, camera_q, body_q)
+        self._meshes.place(camera_q, self._optical, self.config.gate_paths[1])
+        if not self._models:
+            self._build()
+        config, detection, data = self.config, self._detection, self.data
+        rates = self.rates.reshape((self.cameras, config.height * config.width, config.bins))
+        factor = config.photons * config.pde / (self._models[0].scale * self.photons)
+        dark = config.dark_rate * config.bin_path / config.speed
+        data.ledger.zero_()
+        for v, model in enumerate(self._models):
+            surfaces = model.surfaces
+            inputs = [self._face_shape[v], self.shapes.table]
+            outputs = [surfaces.reflectance, surfaces.corner_reflectance]
+            wp.launch(_albedo_kernel, surfaces.order.size, inputs, outputs, device=self.device)
+            update_surfaces(surfaces, model.mesh)
+            data.tally.zero_()
+            launch_transport(
+                self._spec, model, data, seed=config.seed, first_id=v * self.photons, photon_count=self.photons
+            )
+            wp.launch(_light_kernel, self._light.shape, [data.tally, factor], [self._light], device=self.device)
+            inputs = [self._light, dark, self._taps, self._lowest]
+            wp.launch(_response_kernel, rates[v].shape, inputs, [rates[v]], device=self.device)
+        wp.launch(_advance_kernel, 1, [data.offset, self.cameras * self.photons], device=self.device)
+        detection.launch()
+
+    def rebuild(self) -> None:
+        """Builds the trees anew at the next step, for where things are then: faster rays where they have moved far.
+
+        Not within a graph: captured steps keep the trees that they were captured with.
+        """
+        self._models = []
+
+    def _build(self) -> None:
+        """Meshes, surfaces and models; reads the points back."""
+        config = self.config
+        medium, laser, camera, gate = Medium(), Laser(), Camera(), Gate()
+        limits, guiding = Limits(), Guiding()
+        medium.extinction = config.absorption + config.scattering
+        medium.albedo = config.scattering / medium.extinction if medium.extinction > 0.0 else 0.0
+        medium.anisotropy, medium.axis_threshold = config.anisotropy, 1.0
+        laser.position, laser.axis = wp.vec3(*config.laser_position), wp.vec3(0.0, 0.0, 1.0)
+        laser.profile, laser.spread = LASER_PROFILES.index("uniform_cone"), 1.0 - math.cos(config.half_angle)
+        camera.width, camera.height, camera.pixel_tangent = config.width, config.height, config.pixel_tangent
+        camera.aperture_radius, camera.aperture_area = config.aperture_radius, math.pi * config.aperture_radius**2
+        camera.inverse_focus = 2.0 / (config.gate[0] + config.gate[1])
+        gate.start, gate.stop = config.gate_paths
+        gate.bins, gate.bins_per_metre = self._parts * config.bins, self._parts / config.bin_path
+        limits.max_path, limits.max_collisions, limits.weight_cutoff = gate.stop, 64, 2e-4
+        guiding.probability = guiding.surface_probability = 0.3
+        guiding.anisotropy, guiding.return_probability, guiding.return_anisotropy = 0.97, 0.1, 0.5
+        # 2^62 units hold the thousandth part of all photons in one bin; 2^58 units are the largest contribution.
+        scale = min(2.0**72 / self.photons, 2.0**58)
+        extent = gate.stop + math.hypot(*config.laser_position)  # no photon that counts comes further
+        self._face_shape, models = [], []
+        for mesh, owner in zip(self._meshes.build(), self._meshes.face_shape, strict=True):
+            self._face_shape.append(wp.array(owner, dtype=int, device=self.device))
+            reflectance = wp.zeros(len(owner), dtype=float, device=self.device)
+            textures = self._textures(owner)
+            corners = None if textures is None else wp.zeros(len(owner), dtype=wp.vec3, device=self.device)
+            surfaces = make_surfaces(
+                mesh,
+                reflectance,
+                corner_reflectance=corners,
+                textures=textures,
+                extent=extent,
+                public_tree=self._public_tree,
+            )
+            models.append(Model(self.device, medium, laser, camera, gate, limits, guiding, mesh, surfaces, scale))
+        self._models = models
+        self._spec = TransportSpec(self._estimator, stepped=True, **surface_choices(models[0].surfaces))
+        if self.data is None:
+            self.data = make_data(models[0])
+
+    def _textures(self, owner: np.ndarray) -> "Textures | None":
+        """The shapes' images for the faces of one camera's mesh."""
+        table = self.shapes.table
+        if not table.textures.face.size:
+            return None
+        first = table.first_face.numpy()[owner]
+        _, start, count = np.unique(owner, return_index=True, return_counts=True)
+        number = np.zeros(len(owner), int)  # of the face in its own mesh
+        for begin, faces in zip(start, count, strict=True):
+            number[begin : begin + faces] = np.arange(faces)
+        row = np.where(first >= 0, first + number, 0)
+        textures = Textures()
+        face = np.where(first >= 0, table.textures.face.numpy()[row], -1)
+        textures.face = wp.array(face, dtype=int, device=self.device)
+        textures.coordinates = wp.array(table.textures.coordinates.numpy()[row], dtype=wp.vec2, device=self.device)
+        textures.region, textures.texels = table.textures.region, table.textures.texels
+        return textures
