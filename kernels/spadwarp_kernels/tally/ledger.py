@@ -1,5 +1,7 @@
 """The ledger: where the weight of the photons went, in integers that add up exactly, and counters."""
 
+import functools
+
 import warp as wp
 
 from spadwarp_kernels.medium.limits import EXIT_FACES
@@ -88,3 +90,16 @@ def add_to_ledger(ledger: wp.array(dtype=wp.int64), thread: int, entry: int, val
 def slot_of_core(first_id: wp.uint64) -> int:
     """A thread's number on the CPU: launches on several cores write to cache lines of their own."""
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
+
+
+@functools.cache
+def make_ledger_slot(cuda: bool) -> wp.Function:
+    """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
+
+    @wp.func
+    def ledger_slot(thread: int, first_id: wp.uint64) -> int:
+        if wp.static(cuda):
+            return thread
+        return slot_of_core(first_id)
+
+    return ledger_slot

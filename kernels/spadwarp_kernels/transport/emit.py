@@ -24,3 +24,18 @@ def make_emit(spec: TransportSpec) -> wp.Function:
         return wp.spatial_vector(start, heading)
 
     return emit
+
+
+@functools.cache
+def make_first_photon(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(first_id, offset) -> uint64``: the id of a launch's first photon."""
+    stepped = spec.stepped
+
+    @wp.func
+    def first_photon(first_id: wp.uint64, offset: wp.array(dtype=wp.uint64)) -> wp.uint64:
+        first = wp.uint64(first_id)
+        if wp.static(stepped):
+            first += offset[0]
+        return first
+
+    return first_photon

@@ -56,12 +56,12 @@ from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
-from spadwarp_kernels.tally.ledger import slot_of_core
+from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.tally import deposit
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
-from .emit import make_emit
+from .emit import make_emit, make_first_photon
 from .finish import make_finish, make_flush
 from .flight import draw_albedo, make_fly
 from .scatter import make_flies, make_scatter
@@ -92,7 +92,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     cross, score = estimator.cross, estimator.score
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = cross is not None, request_flight is not None, score is not None
-    has_mesh, random_albedo, confocal, stepped = spec.mesh, spec.random_albedo, spec.confocal, spec.stepped
+    has_mesh, random_albedo, confocal = spec.mesh, spec.random_albedo, spec.confocal
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
@@ -104,6 +104,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues)
+    first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores))
 
     @wp.kernel(
@@ -136,13 +137,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         cursor: wp.array(dtype=int),
         offset: wp.array(dtype=wp.uint64),
     ):
-        thread = wp.tid()
-        lane = thread % wp.static(32 if cuda else 1)  # on the CPU one thread moves all photons
-        if wp.static(not cuda):
-            thread = slot_of_core(first_id)
-        base = wp.uint64(first_id)
-        if wp.static(stepped):
-            base += offset[0]
+        lane = wp.tid() % wp.static(32 if cuda else 1)  # on the CPU one thread moves all photons
+        thread = ledger_slot(wp.tid(), first_id)
+        base = first_photon(first_id, offset)
         s = first_state(medium, camera)
         if wp.static(has_bvh and cuda):
             stack = Stack()
