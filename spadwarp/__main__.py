@@ -3,7 +3,7 @@
 import os
 import sys
 
-from spadwarp.errors import address_space, in_words
+from spadwarp.errors import address_space, in_words, need_memory
 
 
 def main() -> None:
@@ -12,6 +12,7 @@ def main() -> None:
         # OpenBLAS reserves memory for a thread a core, and waits for ever for what the limit keeps from it.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
+        need_memory(0.5, "spadwarp")
         from spadwarp.cli import app
 
         app(prog_name="spadwarp")

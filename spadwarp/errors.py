@@ -119,5 +119,15 @@ def address_space() -> int | None:
     return None if limit == resource.RLIM_INFINITY else limit
 
 
+def need_memory(gibibytes: float, name: str) -> None:
+    """Raises `MemoryError` where a limit leaves less than what `name` needs to be loaded.
+
+    Libraries that meet the limit while they are loaded end the process, or wait for ever.
+    """
+    limit = address_space()
+    if limit is not None and limit < gibibytes * 2**30:
+        raise MemoryError(f"{name} needs {gibibytes:g} GiB")
+
+
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError
+from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory
 from spadwarp.io.parsing import parse_json
 from spadwarp.io.paths import existing_file
 
@@ -67,7 +68,9 @@ def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, 
 
 
 def require_torch() -> Any:
-    """The module torch. Raises `SpadwarpError` where it or safetensors is not installed."""
+    """The module torch. Raises `SpadwarpError` where it or safetensors is not installed, `MemoryError`."""
+    if "torch" not in sys.modules:
+        need_memory(1.0, "denoising")
     try:
         import safetensors  # noqa: F401
         import torch

@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 
+import numpy as np
 import pytest
 
 import spadwarp
@@ -122,16 +123,36 @@ def test_an_interrupt_at_any_moment(scene):
         assert "Traceback" not in complaints or "spadwarp" not in complaints
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mebibytes", [600, 720])
-@pytest.mark.parametrize("command", ["simulate", "budget"])
-def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
+def _limited(mebibytes, *arguments):
     def limit():
         resource.setrlimit(resource.RLIMIT_AS, (mebibytes << 20, mebibytes << 20))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
+    return process(*arguments, stdout=subprocess.DEVNULL, preexec_fn=limit)
+
+
+@pytest.mark.parametrize(
+    ("mebibytes", "needed", "arguments"),
+    [
+        (250, "spadwarp needs 0.5 GiB", ("presets",)),
+        (560, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
+        (700, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
+    ],
+)
+def test_less_memory_than_the_libraries_need(mebibytes, needed, arguments, tmp_path, monkeypatch):
+    """They would end the process, or wait for ever."""
+    monkeypatch.chdir(tmp_path)
+    np.save("depth.npy", np.ones((8, 8), np.float32))
+    done = _limited(mebibytes, *arguments)
+    assert done.returncode == 1 and "not enough memory" in done.stderr and needed in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mebibytes", [600, 720])
+@pytest.mark.parametrize("command", ["simulate", "budget"])
+def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     out = tmp_path / "out"
-    done = process(command, scene, "--device", "cpu", "--out", out, stdout=subprocess.DEVNULL, preexec_fn=limit)
+    done = _limited(mebibytes, command, scene, "--device", "cpu", "--out", out)
     assert done.returncode in (0, 1)
     assert done.returncode == 0 or "not enough memory" in done.stderr or "OpenBLAS error: Memory" in done.stderr
     assert "Traceback" not in done.stderr and "bug" not in done.stderr

@@ -93,7 +93,8 @@ def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
         else:
             r.shuffle(words)
     named = [value for option, value in itertools.pairwise(words) if option in _NAMING]
-    initial = [f"{word.removesuffix('.toml')}.toml" for word in words] if path == ("init",) else []
+    written = [word for word in words if not word.startswith("-")] or ["scene"]
+    initial = [f"{word.removesuffix('.toml')}.toml" for word in written] if path == ("init",) else []
     return (*path, *words), (*OUTPUTS, *named, *initial)
 
 
