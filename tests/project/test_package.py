@@ -4,6 +4,7 @@ import ast
 import importlib.resources
 import importlib.util
 import inspect
+import os
 import pkgutil
 import re
 import subprocess
@@ -104,6 +105,70 @@ def test_every_public_name_is_there_whatever_was_imported():
 @pytest.mark.parametrize("package", [spadwarp, spadwarp_kernels], ids=lambda package: package.__name__)
 def test_type_hints_are_for_those_who_import_it(package):
     assert importlib.resources.files(package).joinpath("py.typed").is_file()
+
+
+_PLANTED = """
+import spadwarp
+from spadwarp_kernels.detection import nothing  # wrong
+
+scene = spadwarp.load_scene("plane_5m")
+result = spadwarp.simulate(scene, photons="many")  # wrong
+result.depht()  # wrong
+depth: str = result.depth()  # wrong
+frames = spadwarp.detect(result, pulses=1000, frames=[1], seed=1)  # wrong
+counts = spadwarp.detect(result, pulses=1000, frames=2, seed=1).counts
+reader = spadwarp.dataset.FrameReader("data", split=3)  # wrong
+plan: int = spadwarp.plan(scene)  # wrong
+"""
+
+
+@pytest.mark.slow
+def test_a_type_checker_finds_planted_errors(tmp_path):
+    """In a program of a user, outside the checkout: each wrong line, and no other."""
+    pytest.importorskip("mypy")
+    program = tmp_path / "program.py"
+    program.write_text(_PLANTED)
+    found = subprocess.run(
+        [sys.executable, "-m", "mypy", "--cache-dir", tmp_path / "cache", "--follow-imports=silent", program],
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))},
+        capture_output=True,
+        text=True,
+    ).stdout
+    wrong = {int(line.split(":")[1]) for line in found.splitlines() if ": error:" in line}
+    planted = {number for number, line in enumerate(_PLANTED.splitlines(), 1) if "# wrong" in line}
+    assert wrong == planted, found
+
+
+def test_readme_links_become_absolute_where_there_is_no_checkout():
+    for folder in ("", "kernels/"):
+        project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())
+        text = (ROOT / folder / "README.md").read_text()
+        hook = project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+        for change in hook["substitutions"]:
+            text = re.sub(change["pattern"], change["replacement"], text)
+        links = re.findall(r"\]\(([^)\s]+)[^)]*\)", text)
+        assert links and all(re.match("https?:|#", link) for link in links)
+        shown = {link for link in links if "raw.githubusercontent" in link}
+        assert all((ROOT / folder / link.split(f"/main/{folder}")[1]).is_file() for link in shown)
+        assert project["project"]["urls"]["Repository"] in text
+
+
+def test_every_table_of_others_has_its_terms():
+    notice = (ROOT / "NOTICE").read_text()
+    for path in (ROOT / "spadwarp" / "water" / "tables").iterdir():
+        assert f"spadwarp/water/tables/{path.name}\n" in notice
+
+
+def test_ci_covers_the_pythons_of_the_classifiers():
+    import yaml
+
+    matrix = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["tests"]["strategy"]["matrix"]
+    assert set(matrix["os"]) == {"ubuntu-latest", "windows-latest", "macos-latest"}
+    for folder in ("", "kernels"):
+        project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+        named = [text.removeprefix("Programming Language :: Python :: ") for text in project["classifiers"]]
+        assert matrix["python"] == [text for text in named if re.fullmatch(r"3\.\d+", text)]
 
 
 def tracked_texts():
