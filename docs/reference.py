@@ -127,7 +127,7 @@ def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> st
     if repeated:
         lines += [f"Written as `[[{name}]]`, once for each.", ""]
     lines.append(_table(model.model_fields))
-    presets = [one for one in spadwarp.scene.presets().values() if one.section == name]
+    presets = [one for one in spadwarp.scene.presets().values() if one.section == name.rpartition(".")[2]]
     if presets:
         lines += ['Presets (`preset = "…"`), with their sources:']
         source = None
@@ -140,7 +140,7 @@ def _section(name: str, model: type[BaseModel], *, repeated: bool = False) -> st
     for field, info in model.model_fields.items():
         inner = _model(info)
         if inner is not None and inner is not Distribution:
-            lines += ["", _section(f"{name}.{field}", inner, repeated=True)]
+            lines += ["", _section(f"{name}.{field}", inner, repeated=get_origin(info.annotation) is tuple)]
     return "\n".join(lines) + "\n"
 
 

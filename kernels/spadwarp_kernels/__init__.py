@@ -46,8 +46,9 @@ from .phase import (
     two_term_henyey_greenstein_density,
 )
 from .photon import BRUTE_FORCE_FACES, Records, TransportSpec, make_records
+from .port import DOME_PORT, FLAT_PORT, Port, PortKind, make_dome_port, make_flat_port
 from .random import philox4x32, random_block, u01, u01_fine, u01_tail
-from .ray_cast import truth_kernel
+from .ray_cast import truth_along_kernel, truth_kernel
 from .sensor import (
     C0,
     CALIBRATED,
@@ -118,7 +119,9 @@ __all__ = [
     "COMPONENTS",
     "COUNTERS",
     "COUNT_LAWS",
+    "DOME_PORT",
     "ESTIMATORS",
+    "FLAT_PORT",
     "HENYEY_GREENSTEIN",
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
@@ -142,6 +145,8 @@ __all__ = [
     "Model",
     "PhaseFunction",
     "PhaseGuide",
+    "Port",
+    "PortKind",
     "Records",
     "Scan",
     "Shapes",
@@ -180,6 +185,8 @@ __all__ = [
     "lens_point",
     "load_transport_kernel",
     "make_data",
+    "make_dome_port",
+    "make_flat_port",
     "make_layers",
     "make_phase_tables",
     "make_records",
@@ -216,6 +223,7 @@ __all__ = [
     "statistics_maps",
     "surface_choices",
     "to_fixed_point",
+    "truth_along_kernel",
     "truth_kernel",
     "two_term_henyey_greenstein_density",
     "u01",

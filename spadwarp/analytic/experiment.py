@@ -16,6 +16,7 @@ from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Method
 from spadwarp.limits import SEED, check_choice, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene.sight import refuse_ports
 from spadwarp.units import range_from_time
 
 __all__ = ["Proposal", "plan"]
@@ -130,6 +131,7 @@ def plan(
         ArgumentError: An argument out of range.
     """
     scene = as_scene(scene)
+    refuse_ports(scene, "`plan`")
     for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
         check_real(name, value, "[1e-9, 1e9]")
     photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)

@@ -19,6 +19,7 @@ from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import check_integer, check_real, shown
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import path_from_range
+from spadwarp.scene.sight import refuse_ports
 
 __all__ = ["LONGEST", "OUTLIERS", "TOLERANCE", "BudgetRow", "axis_rows", "budget"]
 
@@ -100,6 +101,7 @@ def budget(
         ArgumentError: Ranges or reflectance out of range.
     """
     scene = as_scene(scene)
+    refuse_ports(scene, "the photon budget")
     distances = _distances(RANGES if ranges is None else ranges)
     if reflectance is None:
         given = scene.targets[0].reflectance if scene.targets else 0.5

@@ -20,6 +20,7 @@ from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import refuse_ports
 from spadwarp.transport import truth_maps
 
 __all__ = ["simulate_analytic"]
@@ -53,6 +54,7 @@ def simulate_analytic(
         ArgumentError: A truth or profile of the wrong shape, or with impossible values.
     """
     scene = as_scene(scene)
+    refuse_ports(scene, "the analytic simulator")
     frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)
     truth = truth_maps(scene) if truth is None else truth
     _check_truth(truth, scene)

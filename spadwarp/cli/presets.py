@@ -16,14 +16,14 @@ from spadwarp.cli._app import app, say
 def presets(
     section: Annotated[
         str | None,
-        typer.Argument(metavar="SECTION", help="medium, laser, camera, detector or gate; all if left out."),
+        typer.Argument(metavar="SECTION", help="medium, laser, camera, port, detector or gate; all if left out."),
     ] = None,
     overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
     """Named waters, lasers and detectors with their sources.
 
-    Cameras and gates too. A scene selects one by `preset = "NAME"` in the section of that name.
+    Cameras, ports and gates too. A scene selects one by `preset = "NAME"` in the section of that name.
     The waters are for about 532 nm; `spadwarp water` computes other wavelengths.
 
     \b

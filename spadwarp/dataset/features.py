@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import depth_from_time
+from spadwarp.scene.sight import depth_from_time
 
 __all__ = ["FEATURE_NAMES", "histogram_features"]
 

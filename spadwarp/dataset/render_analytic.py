@@ -16,6 +16,7 @@ from spadwarp.errors import kernel_errors
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
+from spadwarp.scene.sight import refuse_ports
 from spadwarp.transport import truth_maps
 
 __all__ = ["render_analytic"]
@@ -27,6 +28,7 @@ _COARSE = 8  # every eighth pixel of every eighth row decides the exposure
 def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
     """Truth, bound and frames of a drawn scene. Raises `ConfigError` for one without a return."""
     scene, target = draw.scene, plan.targets[draw.target]
+    refuse_ports(scene, "datasets of the analytic model")
     truth = truth_maps(scene, device=device) if target.export is None else target.truth(scene.camera)
     view = pixel_directions(scene.camera)
     by_rates = math.isnan(draw.fractions[0])

@@ -16,7 +16,7 @@ from spadwarp.dataset.rendered import (
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames import Frames, crlb, detect
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
+from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import simulate
 
 __all__ = ["render_transport"]
@@ -39,9 +39,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     pulses = min(scene.pulses_per_depth_frame, _MOST_PULSES)
     frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
     time_bound = crlb(result, pulses=pulses, device=device)
-    view = pixel_directions(scene.camera)
-    distances = np.nan_to_num(result.truth.range.reshape(-1).astype(np.float64))
-    per_time = depth_per_time(scene, view.reshape(-1, 3), distances).reshape(seen.shape)
+    per_time = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
     profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
     return RenderedScene(
         draw=draw,

@@ -13,7 +13,7 @@ from spadwarp.dataset.sampling import SceneDraw
 from spadwarp.errors import ConfigError
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import range_from_path
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.units import path_from_time
 
 __all__ = ["PROFILE_BINS", "Histograms", "RenderedScene", "StoredFrames", "backscatter_profile", "intensity_step"]
@@ -88,11 +88,11 @@ def intensity_step(brightest: float) -> float:
 
 def backscatter_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> Profile:
     """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
-    axis = np.array([0.0, 0.0, 1.0])
+    axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
     gate = path_from_time(np.array([scene.gate.start, scene.gate.stop]), scene.medium.group_index)
-    ends = range_from_path(gate, axis, scene.beam.position)
+    ends = axis.depth_from_range(axis.range_from_path(gate))
     edges = np.linspace(ends[0], ends[1], PROFILE_BINS + 1)
-    below = np.interp(edges, range_from_path(paths, axis, scene.beam.position), cumulative)
+    below = np.interp(edges, axis.depth_from_range(axis.range_from_path(paths)), cumulative)
     return (np.diff(below) / np.diff(edges)).astype(np.float32), edges.astype(np.float32)
 
 

@@ -27,7 +27,7 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
-from spadwarp.scene.geometry import depth_from_time
+from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
 from spadwarp.units import range_from_time
 from spadwarp.viz import draw_denoised

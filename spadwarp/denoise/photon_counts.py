@@ -25,7 +25,7 @@ from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.estimators import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.limits import SEED, check_choice, check_integer, check_real
-from spadwarp.scene.geometry import depth_from_time
+from spadwarp.scene.sight import depth_from_time
 from spadwarp.units import range_from_time
 from spadwarp.viz import evaluation as drawing
 

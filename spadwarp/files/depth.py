@@ -8,7 +8,7 @@ from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
 from spadwarp.files.loader import Held
 from spadwarp.frames import Reduction
-from spadwarp.scene.geometry import pixel_directions, range_from_depth
+from spadwarp.scene.sight import lines_of_camera
 from spadwarp.units import range_from_time
 
 __all__ = ["gate_of", "stored_depth"]
@@ -30,13 +30,13 @@ def stored_depth(held: Held) -> Reduction | None:
         camera = held.scene(0).camera
     else:
         return None
-    view = pixel_directions(camera)
+    lines = lines_of_camera(camera)
     return Reduction(
         quantity="depth",
         values=depth,
-        range=range_from_depth(depth, view),
+        range=lines.range_from_depth(depth),
         intensity=intensity,
-        directions=view,
+        lines=lines,
         method="stored",
         camera=camera,
     )

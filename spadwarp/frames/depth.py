@@ -13,7 +13,7 @@ from spadwarp.frames.estimators import Method, arrival_time
 from spadwarp.frames.measured import Histograms
 from spadwarp.limits import check_choice, check_real
 from spadwarp.scene import Camera
-from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_path
+from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
 from spadwarp.units import path_from_time
 
 if TYPE_CHECKING:
@@ -36,9 +36,9 @@ def depth_frame(
     check_choice("quantity", quantity, ("depth", "range"))
     scene, gate = result.scene, result.scene.gate
     time = arrival_time(result.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
-    directions = pixel_directions(scene.camera)
-    distance = range_from_path(time * result.pulse_speed, directions, scene.beam.position)
-    return depth_from_range(distance, directions) if quantity == "depth" else distance
+    lines = lines_of_sight(scene)
+    distance = lines.range_from_path(time * result.pulse_speed)
+    return lines.depth_from_range(distance) if quantity == "depth" else distance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,7 +50,7 @@ class Reduction:
         values: float64 `[frames, H, W]` [m]; NaN where nothing returned.
         range: The same along the line of sight.
         intensity: Sum over the bins, `[frames, H, W]`.
-        directions: Lines of sight, unit vectors `[H, W, 3]`, or None.
+        lines: Lines of sight `[H, W]`, or None.
         method: Estimator of the arrival time, or "stored" for depth that was read.
         camera: That of a simulation, with its pose in the world; else None.
     """
@@ -59,7 +59,7 @@ class Reduction:
     values: NDArray[np.float64]
     range: NDArray[np.float64]
     intensity: NDArray[Any]
-    directions: NDArray[np.float64] | None
+    lines: LinesOfSight | None
     method: str
     camera: Camera | None = None
 
@@ -101,7 +101,7 @@ def depth_of(
     """
     if histograms.bin_width is None:
         raise ArgumentError("bin width is missing (--bin-width-ps): the file does not hold it")
-    index, directions, laser = _geometry(histograms, group_index, horizontal_fov_deg)
+    index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
     values = histograms.values
     height, width = values.shape[-3:-1]
     filtered = method in ("matched", "likelihood")
@@ -120,14 +120,14 @@ def depth_of(
         background=known,
         device=device,
     ).reshape(-1, height, width)
-    view = np.array([0.0, 0.0, 1.0]) if directions is None else directions
-    distance = range_from_path(path_from_time(time, index), view, laser)
+    path = path_from_time(time, index)
+    distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
-        quantity="range" if directions is None else "depth",
-        values=distance if directions is None else depth_from_range(distance, view),
+        quantity="range" if lines is None else "depth",
+        values=distance if lines is None else lines.depth_from_range(distance),
         range=distance,
         intensity=values.sum(axis=-1).reshape(-1, height, width),
-        directions=directions,
+        lines=lines,
         method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
     )
@@ -135,8 +135,8 @@ def depth_of(
 
 def _geometry(
     histograms: Histograms, group_index: float | None, horizontal_fov_deg: float | None
-) -> tuple[float, NDArray[np.float64] | None, tuple[float, float, float]]:
-    """Group index, lines of sight `[H, W, 3]` where they are known, and the laser's position [m]."""
+) -> tuple[float, LinesOfSight | None]:
+    """Group index, and lines of sight where they are known."""
     scene = histograms.scene
     if scene is None and group_index is None:
         raise ArgumentError(
@@ -146,13 +146,13 @@ def _geometry(
         raise ArgumentError("group index and field of view are those of the file's scene")
     index = check_real("group index", scene.medium.group_index if scene is not None else group_index, "[1, 3]")
     if scene is not None:
-        return index, pixel_directions(scene.camera), scene.beam.position
+        return index, lines_of_sight(scene)
     if horizontal_fov_deg is None:
-        return index, None, (0.0, 0.0, 0.0)
+        return index, None
     check_real("horizontal field of view", horizontal_fov_deg, "[1e-6, 180)")
     height, width = histograms.values.shape[-3:-1]
     camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
-    return index, pixel_directions(camera), (0.0, 0.0, 0.0)
+    return index, lines_of_camera(camera)
 
 
 def _median_background(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.units import time_from_path
 
 __all__ = ["FrameSequence", "SequenceFrame", "exr_metadata", "write_exr_frame", "write_mat", "write_npy", "write_ptu"]
@@ -61,9 +61,8 @@ class SequenceFrame:
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
         `[H, W]`; NaN where there is none."""
-        view = pixel_directions(scene.camera)
-        distance = range_from_depth(depth.astype(np.float64), view)
-        path = path_from_range(distance, view, scene.beam.position)
+        lines = lines_of_sight(scene)
+        path = lines.path_from_range(lines.range_from_depth(depth.astype(np.float64)))
         time = time_from_path(path, scene.medium.group_index) - self.gate_start
         if self.period is not None:
             time = np.mod(time, self.period)

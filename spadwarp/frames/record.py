@@ -18,7 +18,7 @@ from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.response import detector_response
 from spadwarp.frames.spad import detect
 from spadwarp.result.result import Result
-from spadwarp.scene.geometry import depth_from_time, depth_per_time, pixel_directions
+from spadwarp.scene.sight import depth_from_time, depth_per_time
 
 __all__ = ["FrameErrors", "Recording", "record_frames"]
 
@@ -147,9 +147,7 @@ def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map]:
     if detector_response(scene.detector, scene.laser).is_smooth:
         law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
         bound = crlb(result, pulses=pulses, law=law, device=device)
-    view = pixel_directions(scene.camera)
-    per_time = depth_per_time(scene, view.reshape(-1, 3), distance.reshape(-1)).reshape(distance.shape)
-    return bound, bound * per_time
+    return bound, bound * depth_per_time(scene, distance)
 
 
 def _errors(depth: Map, truth: NDArray[np.float32]) -> FrameErrors:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene.frustum import points_inside, view_planes
+from spadwarp.scene.port_rays import PortGeometry, camera_port
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
@@ -16,23 +17,29 @@ if TYPE_CHECKING:
 
 __all__ = ["focus_distance"]
 
+# Stands for infinity behind a port [m].
+_FAR = 1e6
+
 
 def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
     """Depth that the scene's camera images sharply [m]; None for a pinhole, which images all depths sharply.
 
     `camera.focus_distance`, or for "target" the depth of the first face on the optical axis; without one there, that of
     the point in view which is seen closest to the axis; without any, infinity. Nothing nearer than the focal length and
-    the aperture's radius counts: no lens can be focused there.
+    the aperture's radius counts: no lens can be focused there. Behind a port, it is the depth in air at which the lens
+    sees that point: 0.75 of it behind a flat one, some radii behind a dome.
 
     Args:
         scene: Whose camera.
         mesh: From `spadwarp.mesh.build_mesh`.
     """
-    camera = scene.camera
+    camera, port = scene.camera, camera_port(scene)
     if camera.pinhole:
         return None
     if camera.focus_distance != "target":
         return camera.focus_distance
+    if port is not None:
+        return _apparent_distance(scene, port, mesh)
     if mesh is None:
         return math.inf
     triangles = mesh.vertices[mesh.faces].astype(np.float64)
@@ -45,6 +52,25 @@ def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
     if not len(points):
         return math.inf
     return float(points[np.argmin(np.hypot(points[:, 0], points[:, 1]) / points[:, 2]), 2])
+
+
+def _apparent_distance(scene: Scene, port: PortGeometry, mesh: TriangleMesh | None) -> float:
+    """Depth in air at which the lens sees the first target on its axis, or what is seen closest to that."""
+    start, axis, _, _ = port.enter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    if mesh is None:
+        return port.apparent_distance(start + _FAR * axis)
+    frame = np.linalg.svd(axis[None])[2]
+    frame = np.stack([frame[1], frame[2], axis])
+    triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
+    met = _axis_depths(triangles)
+    if (met > 0.0).any():
+        return port.apparent_distance(start + met[met > 0.0].min() * axis)
+    points = triangles.reshape(-1, 3)
+    points = points[points[:, 2] > 0.0]
+    if not len(points):
+        return port.apparent_distance(start + _FAR * axis)
+    closest = points[np.argmin(np.hypot(points[:, 0], points[:, 1]) / points[:, 2])]
+    return port.apparent_distance(start + closest[2] * axis)
 
 
 def _axis_depths(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

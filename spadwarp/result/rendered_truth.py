@@ -100,6 +100,8 @@ def load_truth_exr(
         ArgumentError: An argument out of range.
     """
     check_choice("preset", preset, [*EXR_PRESETS])
+    if camera.port is not None:
+        raise ArgumentError("camera.port: rendered truth is of cameras that see along straight lines")
     how = EXR_PRESETS[preset]
     scale = how.depth_scale if depth_scale is None else depth_scale
     scale = check_real("depth_scale", scale, "[1e-9, 1e9]")

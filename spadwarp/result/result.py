@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.batch_moments import dominance_warnings
-from spadwarp.scene.geometry import path_from_range, pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -262,7 +262,7 @@ class Result:
     def true_path(self) -> NDArray[np.float64]:
         """Geometric path laser to target to lens by the truth maps [m], float64 `[H, W]`; NaN without a target."""
         scene = self.scene
-        return path_from_range(self.truth.range, pixel_directions(scene.camera), scene.beam.position)
+        return lines_of_sight(scene).path_from_range(self.truth.range)
 
     # Accounts
 

@@ -43,7 +43,7 @@ def write_depth(
     """
     from spadwarp.viz import draw_depth
 
-    if ply is not None and reduction.directions is None:
+    if ply is not None and reduction.lines is None:
         raise ArgumentError("a point cloud needs the horizontal field of view")
     check_choice("ply_frame", ply_frame, tuple(_FRAMES))
     if ply is not None and ply_frame == "world" and reduction.camera is None:
@@ -69,9 +69,11 @@ def write_depth(
         ),
     ]
     if ply is not None:
-        assert reduction.directions is not None
-        points, valid = point_cloud(reduction.range[0], reduction.directions)
-        normals = point_normals(reduction.range[0], reduction.directions)
+        assert reduction.lines is not None
+        distance = reduction.range[0]
+        view = reduction.lines.directions_to(distance)
+        points, valid = point_cloud(distance, view)
+        normals = point_normals(distance, view)
         if not len(points):
             raise FileError(f"{ply}: nothing returned in any pixel: there are no points to write")
         intensity = reduction.intensity[0][valid].astype(np.float32)

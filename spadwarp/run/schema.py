@@ -28,7 +28,9 @@ _QUANTITY = {
     "pattern": r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\s\d].*$",
 }
 _WITH_UNIT = {"$ref": "#/$defs/Quantity"}
-_SECTIONS = {name: name.lower() for name in ("Medium", "Laser", "Camera", "Detector", "Gate")} | {"Layer": "medium"}
+_SECTIONS = {name: name.lower() for name in ("Medium", "Laser", "Camera", "Port", "Detector", "Gate")} | {
+    "Layer": "medium"
+}
 _INDICES = ("seawater", "fresh")
 
 

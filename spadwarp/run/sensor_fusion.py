@@ -15,7 +15,7 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.text import write_text
 from spadwarp.limits import check_integer
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
 
 __all__ = ["write_sensor_fusion"]
@@ -73,7 +73,7 @@ def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
     truth = truth_maps(scene, device="cpu")
     found = frame.bins_of(scene, truth.depth)
     seen = (found >= 0) & (found < bins)
-    cosine = -np.einsum("hwi,hwi->hw", truth.normal, pixel_directions(scene.camera))
+    cosine = -np.einsum("hwi,hwi->hw", truth.normal, lines_of_sight(scene).direction)
     light = np.nan_to_num(truth.reflectance * np.clip(cosine, 0.0, 1.0))
     return {
         "bin_hr": np.where(seen, np.clip(found + 0.5, 1.0, bins), 0.0),

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from spadwarp.scene import intrinsics
 from spadwarp.scene.calibration import load_calibration
+from spadwarp.scene.port import Port
 from spadwarp.scene.sections import Brown, Coordinate, Section, Vector, Whole
 
 
@@ -66,6 +67,8 @@ class Camera(Section):
     """lens centre in the world [m]"""
     rotation_deg: Vector = (0.0, 0.0, 0.0)
     """rotations from the world's axes about x, then the new y, then the new z [°]"""
+    port: Port | None = None
+    """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""
 
     @model_validator(mode="before")
     @classmethod

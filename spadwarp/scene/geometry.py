@@ -1,7 +1,7 @@
 """Between time of flight, path, range and depth in the camera frame: the one place for all of these.
 
 The path of light is the geometric length from the laser by the target to the lens; the range runs along a pixel's line
-of sight, the depth along the optical axis (z).
+of sight, the depth along the optical axis (z). For cameras and lasers in the water; `spadwarp.scene.sight` is for all.
 """
 
 from __future__ import annotations
@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.units import path_from_time
-
 if TYPE_CHECKING:
     from spadwarp.scene import Camera, Scene
 
 __all__ = [
     "depth_from_range",
-    "depth_from_time",
     "depth_per_time",
     "gate_deviation",
     "path_from_range",
@@ -94,13 +91,6 @@ def depth_from_range(distance: Any, directions: Floats) -> Any:
 def range_from_depth(depth: Any, directions: Floats) -> Any:
     """Range [m] along unit vectors `[..., 3]` at planar depths."""
     return depth / directions[..., 2]
-
-
-def depth_from_time(time: Floats, *, scene: Scene) -> Floats:
-    """Planar depth [m] at which light of a time of flight [s] was reflected; both `[..., H, W]`."""
-    view = pixel_directions(scene.camera)
-    path = path_from_time(time, scene.medium.group_index)
-    return depth_from_range(range_from_path(path, view, scene.beam.position), view)
 
 
 def depth_per_time(scene: Scene, directions: Floats, distance: Floats) -> Floats:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from spadwarp.scene.load import ENERGIES
+from spadwarp.scene.port import Port
 from spadwarp.scene.sections import Section, Vector
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 
@@ -26,6 +27,8 @@ class Laser(Section):
     """axis of the beam; any length but 0; a scan sets it"""
     frame: Literal["camera", "world"] = "camera"
     """frame of position and direction: a laser moves with the camera, or is fixed in the world"""
+    port: Port | Literal["camera"] | None = None
+    """what it shines through: a port of its own, whose lengths start at `position`, or that of the camera"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
     profile_image: str | None = None

@@ -27,6 +27,9 @@ _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": 
 # How the energy of a pulse is given.
 ENERGIES = ("pulse_energy", "average_power", "peak_power")
 
+# Tables within sections: (section, field) -> whose fields they have.
+_TABLES = {("camera", "port"): "port", ("laser", "port"): "port"}
+
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
 # Setting a field in a later layer drops these fields of the earlier ones.
@@ -56,6 +59,11 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "filter_table": ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"),
     },
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
+    "port": {
+        "shape": ("distance", "normal", "radius", "offset"),
+        "material": ("index", "group_index"),
+        "index": ("material",),
+    },
 }
 
 
@@ -76,6 +84,10 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
         if value is not None:
             for displaced in displaces.get(name, ()):
                 merged.pop(displaced, None)
+    for (owner, name), inner in _TABLES.items():
+        if owner == section and isinstance(layer.get(name), Mapping):
+            within = base.get(name)
+            layer = {**layer, name: merge_section(inner, within if isinstance(within, Mapping) else {}, layer[name])}
     merged.update(layer)
     dropped = [name for name, value in layer.items() if value is None]
     for name in dropped:
@@ -227,7 +239,7 @@ def set_item(place: Any, key: Key, value: Any, *, done: Key = ()) -> Any:
 
 def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:
     """The fields of a value that may be a section, a target or all targets as nested mappings."""
-    if isinstance(value, Mapping) and len(key) < (3 if key[0] == "targets" else 2):
+    if isinstance(value, Mapping) and len(key) < (3 if key[0] == "targets" or key in _TABLES else 2):
         for name, inner in value.items():
             yield from _leaves((*key, int(name) if _is_index(name) else str(name)), inner)
     else:
@@ -248,6 +260,11 @@ def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
         fields.setdefault(key[1], {})[key[2]] = value
     elif shape == (str, str) and key[0] != "targets" and isinstance(fields, dict):
         fields[key[1]] = value
+    elif shape == (str, str, str) and key[:2] in _TABLES and isinstance(fields, dict):
+        inner = fields.setdefault(key[1], {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"override {shown(key_text(key))}: {key_text(key[:2])} = {shown(inner)} is not a table")
+        inner[key[2]] = value
     else:
         raise ConfigError(
             f"override {shown(key_text(key))} does not name a field; write section.field or targets[0].field"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -25,6 +26,7 @@ from spadwarp.scene.laser import Laser
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
 from spadwarp.scene.output import Output
+from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
 from spadwarp.scene.quantities import with_units
 from spadwarp.scene.scan import Scan
@@ -77,6 +79,27 @@ class Scene(BaseModel):
     def _daylight_in_one_water(self) -> Self:
         if self.daylight is not None and self.medium.layers:
             raise ValueError(f"medium.layers: {len(self.medium.layers)} given; daylight takes one water")
+        return self
+
+    @model_validator(mode="after")
+    def _ports_that_light_can_pass(self) -> Self:
+        camera, laser = self.camera.port, self.laser.port
+        if laser == "camera" and camera is None:
+            raise ValueError("laser.port = 'camera' needs a camera.port")
+        for section, port in (("camera", camera), ("laser", laser)):
+            if isinstance(port, Port):
+                try:
+                    port.indices(self.laser.wavelength_nm)
+                except ValueError as error:
+                    raise ValueError(f"{section}.port.{error}") from None
+        if self.scan.mode != "none" and (camera is not None or laser is not None):
+            if laser != "camera":
+                raise ValueError("scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both")
+            if math.isfinite(self.scan.distance):
+                raise ValueError(
+                    f"scan.distance = {self.scan.distance} does not go with a port, behind which beam and line of "
+                    "sight can be parallel alone: inf"
+                )
         return self
 
     @classmethod

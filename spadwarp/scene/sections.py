@@ -82,4 +82,6 @@ class Section(BaseModel):
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again, without those that are None."""
-        return {name: value for name, value in self if value is not None}
+        return {
+            name: value.to_dict() if isinstance(value, Section) else value for name, value in self if value is not None
+        }

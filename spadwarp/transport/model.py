@@ -18,6 +18,7 @@ from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
+from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix, to_world
 from spadwarp.transport.tally_unit import tally_scale
 
@@ -63,7 +64,9 @@ def build_model(
     lens, limits = _camera(scene, mesh), _limits(scene, camera)
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
-    device_mesh, surfaces = _surfaces(mesh, lens if camera else None, device)
+    # Behind a port, light bends: the map of what the lens sees for certain is of straight lines.
+    mapped = lens if camera and scene.camera.port is None else None
+    device_mesh, surfaces = _surfaces(mesh, mapped, device)
     model = sk.Model(
         device=device,
         medium=_medium(scene, device),
@@ -205,6 +208,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode == "confocal",
         rotated_domain=_has_rotated_domain(scene),
+        port=_port_kind(camera_port(scene)),
+        laser_port=_port_kind(laser_port(scene)),
     )
     return spec._replace(**choices)
 
@@ -214,6 +219,8 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     laser = sk.Laser()
     laser.position = wp.vec3(*beam.position)
     laser.axis = wp.vec3(*beam.axis)
+    if (port := laser_port(scene)) is not None:
+        laser.port = _port(scene, port, 0.0, 0.0)
     if beam.profile == "measured":
         rows, columns = sk.profile_tables(load_profile(beam))
         laser.rows = wp.array(rows, dtype=float, device=device)
@@ -242,7 +249,36 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
         lens.view = wp.vec4(*view_box(camera))
+    if (port := camera_port(scene)) is not None:
+        lens.port = _port(scene, port, lens.aperture_radius, lens.inverse_focus)
     return lens
+
+
+def _port_kind(port: PortGeometry | None) -> Any:
+    return None if port is None else sk.FLAT_PORT if port.shape == "flat" else sk.DOME_PORT
+
+
+def _port(scene: Scene, port: PortGeometry, aperture_radius: float, inverse_focus: float) -> Any:
+    """A port as the kernels take it."""
+    left, top, right, bottom = view_box(scene.camera)
+    corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
+    normal = np.array(port.normal if port.shape == "flat" else (0.0, 0.0, 1.0))
+    # Between the corners, cosines are larger; the lens sees the view by up to its radius over the focus aside.
+    cosine = float(((corners @ normal) / np.linalg.norm(corners, axis=1)).min())
+    angle = math.acos(min(max(cosine, -1.0), 1.0)) + math.atan(aperture_radius * inverse_focus) + 0.01
+    choices: dict[str, Any] = {
+        "thickness": port.thickness,
+        "index": port.index,
+        "group_index": port.group_index,
+        "aperture_radius": aperture_radius,
+        "largest_angle": min(angle, 1.55),
+    }
+    try:
+        if port.shape == "flat":
+            return sk.make_flat_port(distance=port.distance, normal=port.normal, **choices)
+        return sk.make_dome_port(radius=port.radius, centre=port.centre, **choices)
+    except sk.ArgumentError as error:
+        raise _config_error(scene, f"camera.port or laser.port: {error}") from None
 
 
 def _has_plain_lens(scene: Scene) -> bool:
@@ -266,12 +302,22 @@ def _has_rotated_domain(scene: Scene) -> bool:
 
 
 def _check_domain(scene: Scene, camera: bool) -> None:
-    points = {"laser.position": to_world(scene.camera, scene.beam.position)}
+    beam = scene.beam
+    ways = {"laser.position": (laser_port(scene), beam.position, beam.axis)}
     if camera:
-        points["camera.position"] = np.array(scene.camera.position)
-    for name, point in points.items():
-        for axis, value, low, high in zip("xyz", point.tolist(), *scene.domain.bounds, strict=True):
-            if not low <= value <= high:
+        ways["camera.position"] = (camera_port(scene), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    for name, (port, position, axis_of) in ways.items():
+        point, slack = np.asarray(position, np.float64), 0.0
+        if port is not None:
+            # The water begins behind the port, which may be a face of the domain.
+            name, slack = f"{name}, its axis behind the port", 1e-6
+            point = port.enter(position, axis_of)[0]
+            if not np.isfinite(point).all():
+                raise _config_error(scene, f"{name}: light along the axis does not get through the port")
+        for axis, value, low, high in zip(
+            "xyz", to_world(scene.camera, point).tolist(), *scene.domain.bounds, strict=True
+        ):
+            if not low - slack <= value <= high + slack:
                 raise _config_error(scene, f"{name}: {axis} = {value} is outside [{low}, {high}], the domain")
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from spadwarp.scene import Laser, Scene, phase_function
 from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.frustum import view_planes
+from spadwarp.scene.port_rays import camera_port
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
@@ -124,6 +125,8 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
 
     baseline = math.hypot(laser.position[0], laser.position[1])
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
+    if (port := camera_port(scene)) is not None:
+        nearest = max(nearest, port.nearest)
     scattering = max(water.scattering for water in medium.waters)
     absorption = _absorption(scene)
     reach = 0.5 * gate.bin_width * speed

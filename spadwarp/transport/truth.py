@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from spadwarp.mesh import build_mesh
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 
 if TYPE_CHECKING:
     from spadwarp_kernels import Model
@@ -19,7 +20,10 @@ __all__ = ["trace_truth", "truth_maps"]
 
 
 def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
-    """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes."""
+    """Depth, range, normal and reflectance at the pixel centres, by rays against the scene's meshes.
+
+    Behind a port rays bend: depth is z of the point that is hit, range the length of the bent ray from the lens.
+    """
     from spadwarp.transport.model import build_model
 
     scene = as_scene(scene)
@@ -39,13 +43,24 @@ def trace_truth(scene: Scene, model: Model) -> Truth:
     directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
     if not scene.camera.is_plain:
         directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
+    lines = lines_of_sight(scene)
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
+    inputs: list[Any] = [model.camera, model.surfaces, directions]
+    if scene.camera.port is not None:
+        # A ray that does not get through goes where nothing is.
+        passes = np.isfinite(lines.direction).all(axis=-1, keepdims=True)
+        rays = [np.where(passes, lines.start, 1e9), np.where(passes, lines.direction, [0.0, 0.0, 1.0])]
+        arrays: list[Any] = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in rays]
+        inputs = [model.surfaces, *arrays]
     wp.launch(
-        sk.truth_kernel,
+        sk.truth_kernel if scene.camera.port is None else sk.truth_along_kernel,
         dim=shape,
-        inputs=[model.camera, model.surfaces, directions],
+        inputs=inputs,
         outputs=[depth, distance, normal, reflectance],
         device=model.device,
     )
-    return Truth(depth=depth.numpy(), range=distance.numpy(), normal=normal.numpy(), reflectance=reflectance.numpy())
+    ranges = distance.numpy()
+    if scene.camera.port is not None:
+        ranges = (ranges + lines.lead).astype(np.float32)
+    return Truth(depth=depth.numpy(), range=ranges, normal=normal.numpy(), reflectance=reflectance.numpy())

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.frames import Method
 from spadwarp.result import COMPONENTS, Result
 from spadwarp.scene import Medium
-from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_path
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
 from spadwarp.viz.sparse import merged_edges, merged_means, typical_weight
 from spadwarp.viz.style import COMPONENTS as STYLES
@@ -196,15 +196,14 @@ def _plot_band(
 
 def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
     """A second axis above: range along the line of sight."""
-    speed, laser = 1e-9 * result.pulse_speed, result.scene.beam.position
-    direction = pixel_directions(result.scene.camera)[row, column]
+    speed, line = 1e-9 * result.pulse_speed, lines_of_sight(result.scene)[row, column]
 
     def to_range(at: ArrayLike) -> NDArray[np.float64]:
         # Range 0 before light can go from laser to lens: an axis cannot begin with NaN.
-        return np.nan_to_num(range_from_path(np.asarray(at) * speed, direction, laser))
+        return np.nan_to_num(line.range_from_path(np.asarray(at) * speed))
 
     def to_time(at: ArrayLike) -> NDArray[np.float64]:
-        return path_from_range(at, direction, laser) / speed
+        return line.path_from_range(at) / speed
 
     above = axis.secondary_xaxis("top", functions=(to_range, to_time))
     above.set_xlabel("range [m]")

@@ -18,7 +18,7 @@ from spadwarp.frames.export import FrameSequence
 from spadwarp.io.paths import check_apart
 from spadwarp.result import Result
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_depth
+from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 from spadwarp.viz import style
 from spadwarp.viz.pages import write_page
 from spadwarp.viz.panels import median_pixel
@@ -200,12 +200,11 @@ def reported_depths(frames: FrameSequence, frame: int) -> tuple[NDArray[np.int64
     assert scene is not None and frames.same_scene is not None
     bins = min(scene.gate.bins, _MOST_BINS)
     edges = np.linspace(scene.gate.start, scene.gate.stop, bins + 1)
-    view = pixel_directions(scene.camera)
+    lines = lines_of_sight(scene)
     cube = np.zeros((scene.camera.height * scene.camera.width, bins), np.int64)
     pixels = np.arange(len(cube))
     for number in frames.same_scene(frame):
-        distance = range_from_depth(frames.frame(number).images["Z"].astype(np.float64), view)
-        path = path_from_range(distance, view, scene.beam.position)
+        path = lines.path_from_range(lines.range_from_depth(frames.frame(number).images["Z"].astype(np.float64)))
         place = (path / scene.medium.pulse_speed - edges[0]) / (edges[1] - edges[0])
         known = np.isfinite(place.ravel())
         cube[pixels[known], np.clip(place.ravel()[known], 0, bins - 1).astype(np.intp)] += 1
@@ -219,13 +218,22 @@ def _name(scene: Scene) -> str:
 # The page's data
 
 
+def _port_shifts(lines: LinesOfSight) -> list[float]:
+    """Of the axis of ranges: what ports add to a path, and to a range [m]; for a laser close to the lens."""
+    if not lines.bent:
+        return [0.0, 0.0]
+    both = 2.0 if lines.laser_port is not None else 1.0
+    return [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
+
+
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
     scene = page.scene
-    directions, laser = pixel_directions(scene.camera), np.asarray(scene.beam.position, dtype=np.float64)
-    path = path_from_range(range_from_depth(page.truth, directions), directions, laser)
+    lines = lines_of_sight(scene)
+    laser = np.zeros(3) if lines.bent else lines.laser
+    path = lines.path_from_range(lines.range_from_depth(page.truth))
     arrival = path / scene.medium.pulse_speed
-    cloud = range_from_depth(page.depth, directions)[..., None] * directions
+    cloud = lines.points(lines.range_from_depth(page.depth))
     histograms, block, merged = _histograms(page.layers)
     edges = page.edges[::merged]
     if edges[-1] != page.edges[-1]:
@@ -238,8 +246,9 @@ def _data(page: _Page) -> dict[str, Any]:
         "images": {name: _packed(image, "<f4") for name, image in images.items()},
         "cloud": [_packed(cloud[..., axis], "<f4") for axis in range(3)],
         "arrival": _packed(1e9 * arrival, "<f4"),
-        "towards": _packed(directions @ laser, "<f4"),
+        "towards": _packed(lines.direction @ laser, "<f4"),
         "laser": float(laser @ laser),
+        "port": _port_shifts(lines),
         "speed": 1e-9 * scene.medium.pulse_speed,
         "method": page.method,
         "intensityLabel": page.intensity_label,

@@ -61,7 +61,7 @@ def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     assert found.pilot.target + found.pilot.backscatter == pytest.approx(detections, rel=0.1)
     frames = spadwarp.detect(result, pulses=2_000_000_000, seed=1, device="cpu")
     time = frames.arrival_time("likelihood", device="cpu")[0]
-    depth = spadwarp.scene.geometry.depth_from_time(time, scene=whole)
+    depth = spadwarp.scene.sight.depth_from_time(time, scene=whole)
     floor = np.nanmedian(np.abs(depth - result.truth.depth))
     assert found.pilot.floor["likelihood"] == pytest.approx(floor, rel=0.25)
     assert floor > 3 * found.pilot.unscattered_floor["likelihood"]

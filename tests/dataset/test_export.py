@@ -147,7 +147,7 @@ def test_features_find_the_return_and_a_second_one(folder):
     assert features["second_counts"][0, 0] == 4 and features["peak_counts"][0, 0] in (7, 9)
 
     def depth(bin):
-        return spadwarp.scene.geometry.depth_from_time(
+        return spadwarp.scene.sight.depth_from_time(
             np.full((8, 12), gate.start + (bin + 0.5) * gate.bin_width), scene=scene
         )
 

@@ -11,6 +11,7 @@ from spadwarp.run import write_depth
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.pose import rotation_matrix, to_camera
+from spadwarp.scene.sight import lines_of_camera
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
 
@@ -76,7 +77,7 @@ def test_open3d_reads_points_and_normals(frame, tmp_path):
         values=(distance * view[..., 2])[None],
         range=distance[None],
         intensity=np.ones((1, 9, 12)),
-        directions=view,
+        lines=lines_of_camera(camera),
         method="stored",
         camera=camera,
     )
@@ -105,7 +106,7 @@ def test_normals_at_steps_and_of_lone_pixels():
         values=distance[None],
         range=distance[None],
         intensity=distance[None],
-        directions=view,
+        lines=lines_of_camera(camera),
         method="a",
     )
     with pytest.raises(ValueError, match="need the pose of the camera"):

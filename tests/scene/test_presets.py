@@ -17,7 +17,7 @@ def test_every_preset_names_its_source():
 
 
 def test_sections_and_names():
-    assert set(PRESETS) == {"medium", "laser", "camera", "detector", "gate"}
+    assert set(PRESETS) == {"medium", "laser", "camera", "port", "detector", "gate"}
     assert len(presets()) == sum(map(len, PRESETS.values()))
     assert presets("laser").keys() == {"picoquant-visuv-532", "lu2024"}
     assert presets("detector").keys() == {"photon-force-pf32", "photon-force-pf32-microlens", "lu2024"}

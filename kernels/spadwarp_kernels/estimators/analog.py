@@ -5,6 +5,7 @@ import warp as wp
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.random.philox import u01
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -15,6 +16,8 @@ from .estimator import Estimator
 
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
+    if spec.port is not None:
+        return Estimator(cross=_make_cross_port(spec, spec.port))
     image_of = spec.lens.project
 
     @wp.func
@@ -29,12 +32,39 @@ def make_analog(spec: TransportSpec) -> Estimator:
             radius2 = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1]
             inside = radius2 <= camera.aperture_radius * camera.aperture_radius
             if pixel >= 0 and inside and crossing <= wp.min(s.flight.distance, limits.max_path - s.path):
-                component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
-                if s.surface_count == 1 and s.collisions == 1:
-                    component = BALLISTIC
                 found.value = s.weight.value
-                found.index = tally_index(camera, gate, pixel, s.path + crossing, component)
+                found.index = tally_index(camera, gate, pixel, s.path + crossing, _component(s))
                 found.rounding_sample = u01(s.flight.block[2])
         return found
 
     return Estimator(cross=cross)
+
+
+@wp.func
+def _component(s: PhotonState) -> int:
+    component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+    if s.surface_count == 1 and s.collisions == 1:
+        component = BALLISTIC
+    return component
+
+
+def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
+    """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
+    image_of, leave = spec.lens.project, port.leave
+
+    @wp.func
+    def cross_port(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:
+        found = Contribution()
+        found.index = -3
+        passage = leave(camera.port, s.x, s.u)
+        on_lens = passage.x
+        inside = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1] <= camera.aperture_radius * camera.aperture_radius
+        if s.collisions > 0 and inside and passage.water > 0.0 and passage.transmission > 0.0:
+            pixel = image_of(camera, s.view, s.target, on_lens - passage.u, on_lens)
+            if pixel >= 0 and passage.water <= wp.min(s.flight.distance, limits.max_path - s.path):
+                found.value = s.weight.value * passage.transmission
+                found.index = tally_index(camera, gate, pixel, s.path + passage.water + passage.path, _component(s))
+                found.rounding_sample = u01(s.flight.block[2])
+        return found
+
+    return cross_port

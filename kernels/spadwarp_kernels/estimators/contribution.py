@@ -12,8 +12,9 @@ from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import u01, u01_fine, u01_high, u01_low
-from spadwarp_kernels.sensor.camera import Camera, in_view, lens_point
+from spadwarp_kernels.sensor.camera import Camera, lens_point
 from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.sensor.port_view import port_view
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.ggx import ggx_brdf
 from spadwarp_kernels.surface.lambert import lambert_brdf
@@ -22,6 +23,7 @@ from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_refle
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
 
 from .flight_sampling import make_sample_flight
+from .link import make_apparent_lens, make_link
 
 
 @wp.struct
@@ -72,7 +74,7 @@ class Scored:
 
     Attributes:
         contribution: To the tally, if nothing stands between the scored point and the lens.
-        origin, lens: The scored point, and the point of the lens [m].
+        origin, lens: The scored point, and where its light leaves the water: the point of the lens, or of a port [m].
         seen: Whether nothing does; else a shadow ray must be traced.
         shadow_queries: Shadow rays that were traced.
     """
@@ -93,28 +95,16 @@ class ScoredPoint:
     path: float
 
 
-@wp.func
-def next_event_value(
-    camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
-) -> float:
-    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
-    unit vector."""
-    cos_lens = wp.max(-to_lens[2], 0.0)
-    return (
-        weight * scattering * wp.exp(-extinction * distance) * camera.aperture_area * cos_lens / (distance * distance)
-    )
-
-
 @functools.cache
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
-    view_of = spec.lens.view
+    view_of, shows = spec.lens.view, port_view(spec.port).shows
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
         q = Request()
         if wp.static(not flights) or s.hit.face >= 0:
-            if in_view(camera, view_of(camera, s.view), s.x):
+            if shows(camera, view_of(camera, s.view), s.x):
                 q.wanted = True
                 q.x = s.x
                 q.u = s.u
@@ -141,18 +131,21 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
 
 @functools.cache
 def make_flight_point(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(request, medium, layers) -> ScoredPoint`` that draws the point of a flight to be scored."""
+    """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
+    scored."""
     local_albedo = spec.layered and not spec.random_albedo
     _, water_extinction, water_at = LAYERED if spec.layered else HOMOGENEOUS
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE)
+    apparent_lens = make_apparent_lens(spec)
 
     @wp.func
-    def flight_point(request: Request, medium: Medium, layers: Layers) -> ScoredPoint:
+    def flight_point(request: Request, medium: Medium, layers: Layers, camera: Camera) -> ScoredPoint:
         point = ScoredPoint()
         # Layers: a density with the mean extinction; what is scored weighs with the exact one.
         s0 = request.interval[0]
+        middle = request.x + (0.5 * (s0 + request.interval[1])) * request.u
         flight = sample_flight(
-            request.x - request.lens,
+            request.x - apparent_lens(camera, middle, request.lens),
             request.u,
             request.interval,
             water_extinction(medium, layers, request.x + s0 * request.u, request.u, request.interval[1] - s0),
@@ -219,6 +212,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     water_extinction = (LAYERED if spec.layered else HOMOGENEOUS).extinction
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
+    link_to, value_of = make_link(spec)
 
     @wp.func
     def score(
@@ -239,23 +233,21 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         if wp.static(flights):
             if request.interval[0] < request.interval[1]:
                 found.lens = request.lens
-                point = flight_point(request, medium, layers)
+                point = flight_point(request, medium, layers, camera)
                 found.origin = point.x
                 weight = point.weight
                 path = point.path
         view = camera.view
         if wp.static(confocal):
             view = scan.view[request.target]
-        pixel = image_of(camera, view, request.target, found.origin, found.lens)
-        to_lens = found.lens - found.origin
-        r = wp.length(to_lens)
-        to_lens = to_lens / r
-        scattering = scattering_density(request, found.origin, to_lens, medium, layers, surfaces)
+        link = link_to(camera, found.origin, found.lens)
+        pixel = image_of(camera, view, request.target, link.image, found.lens)
+        scattering = scattering_density(request, found.origin, link.to_lens, medium, layers, surfaces)
         if pixel >= 0 and not scattering <= 0.0:
-            found.contribution.value = next_event_value(
-                camera, water_extinction(medium, layers, found.origin, to_lens, r), weight, scattering, to_lens, r
-            )
-            found.contribution.index = tally_index(camera, gate, pixel, path + r, request.component)
+            extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water)
+            found.contribution.value = value_of(camera, extinction, weight, scattering, link)
+            found.contribution.index = tally_index(camera, gate, pixel, path + link.path, request.component)
+        found.lens = link.end
         return found
 
     return score

@@ -11,6 +11,7 @@ from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.phase.phase_function import PhaseGuide
+from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.sensor.camera import Camera, lens_point
 
 
@@ -39,11 +40,16 @@ def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) 
     The score goes with 1/D, D its distance from the flight's line. Where this passes the lens, the point is drawn with
     that density, uniform in angle and distance about the place: even draws would have no finite variance.
     """
+    s = -x[2] / u[2]
+    return lens_about(camera, wp.vec2(x[0] + s * u[0], x[1] + s * u[1]), xi1, xi2)
+
+
+@wp.func
+def lens_about(camera: Camera, p: wp.vec2, xi1: float, xi2: float) -> LensSample:
+    """A point of the lens: about p with a density that falls with the distance from it, or even if p is outside."""
     sample = LensSample()
     sample.point = lens_point(camera, xi1, xi2)
     sample.weight = 1.0
-    s = -x[2] / u[2]
-    p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
     radius2 = camera.aperture_radius * camera.aperture_radius
     if wp.dot(p, p) < radius2:
         turn = cos_sin_turn(xi2)
@@ -53,6 +59,24 @@ def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) 
         sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
         sample.weight = 2.0 * to_rim * distance / radius2
     return sample
+
+
+@functools.cache
+def make_sample_lens(port: PortKind | None) -> wp.Function:
+    """`sample_lens` for a lens behind a port: it is where the flight's line, refracted, passes the lens."""
+    if port is None:
+        return sample_lens
+    leave = port.leave
+
+    @wp.func
+    def sample_lens_behind_port(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
+        passage = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
+        place = wp.vec2(1.0e30, 0.0)
+        if passage.transmission > 0.0:
+            place = wp.vec2(passage.x[0], passage.x[1])
+        return lens_about(camera, place, xi1, xi2)
+
+    return sample_lens_behind_port
 
 
 @wp.func

@@ -19,8 +19,9 @@ from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
-from spadwarp_kernels.sensor.camera import Camera, clip_to_view, in_view, lens_point, toward_axis
-from spadwarp_kernels.sensor.gate import Gate, clip_to_gate
+from spadwarp_kernels.sensor.camera import Camera, lens_point, toward_axis
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.sensor.port_view import port_view
 from spadwarp_kernels.surface.ggx import reflection_pdf
 from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -28,7 +29,8 @@ from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
 
 from .contribution import Request, make_event_request, make_score
 from .estimator import Direction, Estimator, FlightPlan
-from .flight_sampling import sample_lens
+from .flight_sampling import make_sample_lens
+from .link import make_toward
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
@@ -52,6 +54,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     view_of = spec.lens.view
     layered, bounded, has_phase_guide = spec.layered, spec.bounded, spec.phase.guide is not None
     to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
+    clip_to_view, _, clip_to_gate = port_view(spec.port)
+    sample_lens = make_sample_lens(spec.port)
 
     @wp.func
     def plan_flight(
@@ -71,7 +75,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         if wp.static(bounded):
             limit = wp.min(limit, to_exit(limits, s.x, s.u))
         plan.interval = clip_to_view(camera, view_of(camera, s.view), s.x, s.u, plan.lens, limit)
-        plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        plan.interval = clip_to_gate(camera, gate, s.x, s.u, s.path, plan.lens, plan.interval)
         if not (wp.static(layered) or medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
@@ -138,7 +142,8 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
     view_of = spec.lens.view
-    has_mesh, specular = spec.mesh, spec.specular
+    has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
+    toward, toward_centre = make_toward(spec)
 
     @wp.func
     def direct(
@@ -165,12 +170,12 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             # For what the water scatters on the way to the lens: where it is clear there is nothing to gain.
             to_lens_chance = guiding.surface_probability * wp.min(2.0 * here.extinction * wp.length(s.x), 1.0)
         snapped = snap_direction(s.u, medium.axis_threshold)
-        v = -wp.normalize(s.x)
+        v = toward_centre(camera, s.x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-            v = wp.normalize(lens_point(camera, u01(ahead[2]), u01(ahead[3])) - s.x)
+            v = toward(camera, s.x, lens_point(camera, u01(ahead[2]), u01(ahead[3])))
         view = view_of(camera, s.view)
         to_axis = toward_axis(view, s.x)
         to_view_chance = float(0.0)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import PhaseFunction
+from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.sensor.projection import PLAIN, Lens
 
 # Meshes of at most this many faces need no BVH.
@@ -32,6 +33,9 @@ class TransportSpec(NamedTuple):
         public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
+        port: What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
+            water.
+        laser_port: The same of the laser and `Laser.port`.
     """
 
     estimator: str = "next_event"
@@ -51,3 +55,5 @@ class TransportSpec(NamedTuple):
     rotated_domain: bool = False
     public_tree: bool = False
     stepped: bool = False
+    port: PortKind | None = None
+    laser_port: PortKind | None = None

@@ -111,7 +111,8 @@ def apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
 
 @wp.func
 def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
-    """What comes of a ray from x in the water along u, up to the plane z = 0 inside."""
+    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
+    ray as it goes straight on."""
     p = Passage()
     n = port.index
     inner = port.radius
@@ -119,7 +120,7 @@ def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
     y = x - port.centre
     to_middle = -wp.dot(y, u)
     b = wp.length(wp.cross(y, u))
-    if to_middle <= 0.0 or b >= outer or wp.dot(y, y) <= outer * outer:
+    if b >= outer:
         return p
     water = to_middle - _chord(outer, b)
     first = y + water * u

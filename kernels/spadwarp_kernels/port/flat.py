@@ -85,7 +85,8 @@ def apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
 
 @wp.func
 def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
-    """What comes of a ray from x in the water along u, up to the plane z = 0 inside."""
+    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
+    ray as it goes straight on."""
     p = Passage()
     n = port.index
     cosine = -wp.dot(u, port.normal)
@@ -93,7 +94,7 @@ def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
     across = n[2] * (u + cosine * port.normal)
     k2 = wp.dot(across, across)
     least = wp.min(n[0], n[1])
-    if cosine <= 0.0 or behind <= 0.0 or k2 >= least * least:
+    if cosine <= 0.0 or k2 >= least * least:
         return p
     q0 = wp.sqrt(n[0] * n[0] - k2)
     q1 = wp.sqrt(n[1] * n[1] - k2)

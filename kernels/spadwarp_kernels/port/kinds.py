@@ -132,6 +132,18 @@ def make_dome_port(
     return port
 
 
+def check_port(name: str, port: Port, kind: PortKind) -> None:
+    """Parameters of a port of that kind; raises `ArgumentError`."""
+    for k, value in enumerate(port.index):
+        check_number(f"{name}.index[{k}]", value, "[1, inf)")
+    if kind.name == FLAT_PORT.name:
+        check_number(f"{name}.distance", port.distance, "(-inf, inf)")
+        check_vector(f"{name}.normal", port.normal, unit=True)
+    else:
+        check_number(f"{name}.radius", port.radius, "(0, inf)")
+        check_vector(f"{name}.centre", port.centre)
+
+
 def _check_layers(
     thickness: float, index: Sequence[float], group_index: Sequence[float], aperture_radius: float
 ) -> None:

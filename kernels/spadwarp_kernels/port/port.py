@@ -74,7 +74,7 @@ class Passage:
     Attributes:
         x: Where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside.
         u: Its unit direction there.
-        water: Length of its way in the water up to the port [m].
+        water: Length of its way in the water up to the port [m]; negative if the ray began behind that.
         path: Length in water that takes as long as the way behind that [m].
         transmission: Fraction of unpolarised light that gets through; 0: none.
     """

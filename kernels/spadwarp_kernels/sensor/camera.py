@@ -9,6 +9,7 @@ import warp as wp
 
 from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
 from spadwarp_kernels.math.rotations import cos_sin_turn
+from spadwarp_kernels.port.port import Port
 
 
 @wp.struct
@@ -26,6 +27,8 @@ class Camera:
         radial: k1, k2, k3 of Brown's model.
         tangential: p1, p2 of Brown's model.
         view: Least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it.
+        port: What is between the lens and the water, see `make_flat_port`; read by specs with a port alone. View and
+            focus are those in the air behind it.
     """
 
     width: int
@@ -39,6 +42,7 @@ class Camera:
     radial: wp.vec3
     tangential: wp.vec2
     view: wp.vec4
+    port: Port
 
 
 @wp.func
@@ -128,14 +132,14 @@ def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.
     """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, between the side planes through the origin with the
     given tangents (left, top, right, bottom), which meet there: all of it has z > 0; empty where s0 >= s1."""
     interval = wp.vec2(0.0, limit)
-    interval = _clip(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
-    interval = _clip(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
-    interval = _clip(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
-    return _clip(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
+    interval = clip_half_space(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
+    interval = clip_half_space(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
+    interval = clip_half_space(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
+    return clip_half_space(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
 
 
 @wp.func
-def _clip(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
+def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
     # Selected rather than branched to: half the lanes of a warp go either way.
     crossing = -value / slope

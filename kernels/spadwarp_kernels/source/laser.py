@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.arguments import ArgumentError, check_numbers
 from spadwarp_kernels.math.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
+from spadwarp_kernels.port.port import Port
 from spadwarp_kernels.random.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 
 LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
@@ -25,6 +26,8 @@ class Laser:
         rows, columns: Distribution functions of a measured profile, see `profile_tables`; this and what follows is
             read by `emit_measured` alone.
         extent: Tangents of the profile's half width and half height.
+        port: What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs
+            with a port of the laser alone.
     """
 
     position: wp.vec3
@@ -36,6 +39,7 @@ class Laser:
     rows: wp.array(dtype=float)
     columns: wp.array2d(dtype=float)
     extent: wp.vec2
+    port: Port
 
 
 @wp.func

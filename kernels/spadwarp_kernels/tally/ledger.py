@@ -40,7 +40,10 @@ COUNTERS = (
     "below_unit_forward_scattered",
     "below_unit_backscatter",
 )
-LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS)
+# What a laser's port reflects; after all others, and reported where there is one.
+PORT_ENTRY = "laser_port"
+LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS) + 1
+LASER_PORT = wp.constant(LEDGER_WIDTH - 1)
 
 ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT, ROULETTE, DIRECTED = (
     wp.constant(LEDGER_ENTRIES.index(name))

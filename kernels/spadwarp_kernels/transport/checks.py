@@ -26,6 +26,7 @@ from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.phase.tabulated import TABULATED
 from spadwarp_kernels.photon.records import Records
 from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
+from spadwarp_kernels.port.kinds import PortKind, check_port
 from spadwarp_kernels.random.density_tables import TABLE_CELLS
 from spadwarp_kernels.sensor.camera import Camera, check_camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -70,6 +71,9 @@ def check_spec(spec: Any) -> None:
     for name, kind in (("phase", PhaseFunction), ("lens", Lens)):
         if not isinstance(getattr(spec, name), kind):
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a {kind.__name__}")
+    for name in ("port", "laser_port"):
+        if not isinstance(getattr(spec, name), PortKind | None):
+            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a PortKind or None")
     for name in _CHOICES:
         if not isinstance(getattr(spec, name), bool):
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
@@ -101,6 +105,10 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
         check_integer("model.gate.bins", model.gate.bins, 1)
         check_fields("model.gate", model.gate, {"start": "(-inf, inf)", "bins_per_metre": "(0, inf)"})
         check_number("model.gate.stop", model.gate.stop, f"({float(model.gate.start)}, inf)")
+        if spec.port is not None:
+            check_port("model.camera.port", model.camera.port, spec.port)
+    if spec.laser_port is not None:
+        check_port("model.laser.port", model.laser.port, spec.laser_port)
     if estimator.cross is not None:
         check_fields("model.camera", model.camera, {"aperture_radius": "(0, inf)"})
     if estimator.direct is not None:

@@ -5,8 +5,62 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, reweigh
+from spadwarp_kernels.port.kinds import PortKind
+from spadwarp_kernels.port.port import Passage, Port
 from spadwarp_kernels.source.laser import Laser, emit_along, emit_measured
 from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.tally.ledger import LASER_PORT, add_to_ledger
+
+
+@wp.struct
+class Start:
+    """A photon in the water.
+
+    Attributes:
+        x: Position [m].
+        u: Unit direction.
+        path: What it has behind it, as length in water that takes as long [m].
+        weight: Its weight, less what a port has reflected.
+    """
+
+    x: wp.vec3
+    u: wp.vec3
+    path: float
+    weight: Weight
+
+
+@functools.cache
+def make_enter(port: PortKind | None) -> wp.Function:
+    """The Warp function ``(laser, emitted, s, ledger, thread) -> Start`` of a photon that a laser has emitted,
+    behind a port or in the water."""
+    has_port = port is not None
+    enter_port = port.enter if port is not None else _no_passage
+
+    @wp.func
+    def enter(
+        laser: Laser, emitted: wp.spatial_vector, s: PhotonState, ledger: wp.array(dtype=wp.int64), thread: int
+    ) -> Start:
+        start = Start()
+        start.x = wp.spatial_top(emitted)
+        start.u = wp.spatial_bottom(emitted)
+        start.weight = full_weight(s.weight)
+        if wp.static(has_port):
+            passage = enter_port(laser.port, start.x, start.u)
+            start.weight = reweigh(start.weight, passage.transmission)
+            if passage.transmission > 0.0:
+                start.x = passage.x
+                start.u = passage.u
+                start.path = passage.path
+            add_to_ledger(ledger, thread, LASER_PORT, start.weight.taken)
+        return start
+
+    return enter
+
+
+@wp.func
+def _no_passage(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+    return Passage()
 
 
 @functools.cache

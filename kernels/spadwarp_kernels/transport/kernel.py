@@ -45,7 +45,6 @@ from spadwarp_kernels.photon.state import (
     START,
     SURFACE_RAY,
     first_state,
-    full_weight,
     is_planned,
     shorten,
 )
@@ -61,7 +60,7 @@ from spadwarp_kernels.tally.tally import deposit
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
-from .emit import make_emit, make_first_photon
+from .emit import make_emit, make_enter, make_first_photon
 from .finish import make_finish, make_flush
 from .flight import draw_albedo, make_fly
 from .scatter import make_flies, make_scatter
@@ -99,7 +98,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     has_bvh = has_mesh and not brute_force
     queues = scores and cuda and not has_bvh
     ray_lanes = RAY_LANES if has_bvh else 32
-    emit, fly, collide = make_emit(spec), make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
+    emit, enter = make_emit(spec), make_enter(spec.laser_port)
+    fly, collide = make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
@@ -268,14 +268,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.target = int(id % wp.uint64(scan.count))
                                 s.view = scan.view[s.target]
                             if wp.static(cuda):
-                                fresh = exchange(False, entry, wp.spatial_vector())
+                                start = enter(laser, exchange(False, entry, wp.spatial_vector()), s, ledger, thread)
                             else:
-                                fresh = emit(laser, scan, seed, id)
-                            s.x = wp.spatial_top(fresh)
-                            s.u = wp.spatial_bottom(fresh)
-                            s.weight = full_weight(s.weight)
-                            s.analog_weight = 1.0
-                            s.path = 0.0
+                                start = enter(laser, emit(laser, scan, seed, id), s, ledger, thread)
+                            s.x = start.x
+                            s.u = start.u
+                            s.weight = start.weight
+                            s.analog_weight = start.weight.value
+                            s.path = start.path
                             s.collisions = 0
                             s.surface_count = 0
 

@@ -18,7 +18,14 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.tally.ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_WIDTH, OUTSIDE_SHIFT
+from spadwarp_kernels.tally.ledger import (
+    COUNTERS,
+    LEDGER_ENTRIES,
+    LEDGER_SLOTS,
+    LEDGER_WIDTH,
+    OUTSIDE_SHIFT,
+    PORT_ENTRY,
+)
 from spadwarp_kernels.tally.tally import COMPONENTS
 
 from .checks import check_launch, check_model, check_spec
@@ -167,15 +174,22 @@ def launch_transport(
 
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
-    """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device."""
+    """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device.
+
+    Entries are LEDGER_ENTRIES and, behind a laser's port, what that reflects: `laser_port`.
+    """
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
     slots = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS)
     # In halves: light outside the gate may exceed 64 bits in all.
     high, low = (slots >> 32).sum(axis=1).tolist(), (slots & 0xFFFFFFFF).sum(axis=1).tolist()
     values = {
-        name: (upper << 32) + lower for name, upper, lower in zip(LEDGER_ENTRIES + COUNTERS, high, low, strict=True)
+        name: (upper << 32) + lower
+        for name, upper, lower in zip(LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,), high, low, strict=True)
     }
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
-    return {n: values[n] for n in LEDGER_ENTRIES}, {n: values[n] for n in COUNTERS}
+    entries = {n: values[n] for n in LEDGER_ENTRIES}
+    if values[PORT_ENTRY]:
+        entries[PORT_ENTRY] = values[PORT_ENTRY]
+    return entries, {n: values[n] for n in COUNTERS}
