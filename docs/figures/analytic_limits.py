@@ -1,9 +1,11 @@
 """Where multiple scattering makes the analytic model wrong: Monte Carlo over analytic, against optical depth.
 
-python docs/figures/analytic_limits.py
+python docs/figures/analytic_limits.py           # simulates, writes the numbers beside this file, draws
+python docs/figures/analytic_limits.py --redraw  # from the numbers
 """
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spadwarp
+from spadwarp.viz import style
 
 # One-way optical depths from laser to target.
 OPTICAL_DEPTHS = (0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
@@ -83,31 +86,29 @@ def ratios(optical_depth: float, *, photons: int) -> tuple[NDArray[np.float64], 
     return batches.mean(axis=0), batches.std(axis=0, ddof=1) / np.sqrt(RUNS)
 
 
+@style.paper()
 def draw(mean: NDArray[np.float64], error: NDArray[np.float64]) -> Any:
     """The figure from ratios and errors, `[optical depth, 5]`."""
-    from matplotlib.figure import Figure
-
-    # Okabe and Ito's colours, which the colour-blind tell apart.
     curves = (
         (
             "Target return",
             "Monte Carlo / signal S of eq 7",
             (
-                (BALLISTIC, "ballistic", "#000000", "o"),
-                (TARGET_SOON, "all that is less than 5 cm late", "#0072B2", "s"),
-                (TARGET, "all", "#D55E00", "^"),
+                (BALLISTIC, "ballistic", "black", "o"),
+                (TARGET_SOON, "all that is less than 5 cm late", style.BLUE, "s"),
+                (TARGET, "all", style.RED, "^"),
             ),
         ),
         (
             "Water backscatter",
             "Monte Carlo / single scattering",
             (
-                (BACKSCATTER, "gate from 0.5 m to 7.5 m of range", "#009E73", "o"),
-                (BACKSCATTER_GATED, "gate ±0.5 m about the target", "#CC79A7", "s"),
+                (BACKSCATTER, "gate from 0.5 m to 7.5 m of range", style.GREEN, "o"),
+                (BACKSCATTER_GATED, "gate ±0.5 m about the target", style.PURPLE, "s"),
             ),
         ),
     )
-    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    figure = style.new_figure(style.PAGE, 3.3)
     for axes, (title, label, rows) in zip(figure.subplots(1, 2, sharey=True), curves, strict=True):
         axes.axhline(1.0, color="0.6", lw=0.8)
         if rows[0][0] == BALLISTIC:
@@ -118,7 +119,6 @@ def draw(mean: NDArray[np.float64], error: NDArray[np.float64]) -> Any:
                 np.exp(2.0 * ALBEDO * depths),
                 color="0.5",
                 ls="--",
-                lw=1.0,
                 label="exp(2ωτ): no loss by scattering",
             )
         for k, name, colour, marker in rows:
@@ -129,13 +129,12 @@ def draw(mean: NDArray[np.float64], error: NDArray[np.float64]) -> Any:
                 label=name,
                 color=colour,
                 marker=marker,
-                ms=4,
-                lw=1.2,
-                capsize=2,
             )
         axes.set(title=title, xlabel="one-way optical depth τ of the target", ylabel=label, yscale="log")
-        axes.legend(frameon=False, fontsize=8, loc="upper left")
-        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(loc="upper left")
+        axes.xaxis.minorticks_on()
+        style.plain_axis(axes)
+    style.log_axis(figure.axes[0], "y")
     return figure
 
 
@@ -143,14 +142,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--photons", type=int, default=2_000_000, help="at an optical depth of 2")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images" / "analytic_limits.png")
+    parser.add_argument("--redraw", action="store_true", help="from the numbers of the last run")
     arguments = parser.parse_args()
-    points = [ratios(depth, photons=arguments.photons) for depth in OPTICAL_DEPTHS]
-    mean, error = (np.stack(part) for part in zip(*points, strict=True))
+    numbers = Path(__file__).with_suffix(".json")
+    if not arguments.redraw:
+        points = [ratios(depth, photons=arguments.photons) for depth in OPTICAL_DEPTHS]
+        kept = {name: np.stack(part) for name, part in zip(("mean", "error"), zip(*points, strict=True), strict=True)}
+        rounded = {name: [[float(f"{x:.5g}") for x in row] for row in values] for name, values in kept.items()}
+        numbers.write_text(json.dumps({"optical_depth": OPTICAL_DEPTHS, **rounded}) + "\n")
+    read = json.loads(numbers.read_text())
+    mean, error = np.array(read["mean"]), np.array(read["error"])
     print("depth  ballistic         target, on time   target            backscatter       gated")
     for depth, m, e in zip(OPTICAL_DEPTHS, mean, error, strict=True):
         columns = (BALLISTIC, TARGET_SOON, TARGET, BACKSCATTER, BACKSCATTER_GATED)
         print(f"{depth:5.1f}  " + "  ".join(f"{m[k]:8.4f} ±{e[k]:7.4f}" for k in columns))
-    draw(mean, error).savefig(arguments.out, dpi=200)
+    style.save(draw(mean, error), arguments.out)
 
 
 if __name__ == "__main__":

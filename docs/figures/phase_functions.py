@@ -10,6 +10,7 @@ import numpy as np
 
 import spadwarp
 from spadwarp.scene import Medium
+from spadwarp.viz import style
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 LAWS = {
@@ -17,7 +18,7 @@ LAWS = {
     "Fournier–Forand, n 1.10, µ 3.5835": {"phase_function": "fournier_forand"},
     "Henyey–Greenstein, g 0.924": {"anisotropy": 0.924},
 }
-COLOURS = ("#000000", "#D55E00", "#0072B2")  # of Okabe and Ito
+COLOURS = ("black", style.RED, style.BLUE)
 STYLES = ("-", "-", "--")
 
 
@@ -29,24 +30,26 @@ def densities(angles: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+@style.paper()
 def main() -> None:
-    from matplotlib.figure import Figure
-
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images" / "phase_functions.png")
-    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    figure = style.new_figure(style.PAGE, 3.1)
     for axis, angles in zip(
         figure.subplots(1, 2), (np.geomspace(0.01, 180.0, 2000), np.linspace(90.0, 180.0, 500)), strict=True
     ):
-        for (name, values), colour, style in zip(densities(angles).items(), COLOURS, STYLES, strict=True):
-            axis.plot(angles, values, style, color=colour, lw=1.6, label=name)
+        for (name, values), colour, line in zip(densities(angles).items(), COLOURS, STYLES, strict=True):
+            axis.plot(angles, values, line, color=colour, label=name)
         axis.set_xlabel("scattering angle [°]")
-        axis.grid(color="0.9")
+        style.plain_axis(axis)
     forward, backward = figure.axes
     forward.set(xscale="log", yscale="log", xlim=(0.01, 180.0), ylabel="phase function [1/sr]")
-    backward.set(xlim=(90.0, 180.0), ylim=(0.0, None), xticks=range(90, 181, 15))
-    forward.legend(fontsize=8, frameon=False)
-    figure.savefig(parser.parse_args().out, dpi=150)
+    backward.set(xlim=(90.0, 180.0), ylim=(0.0, None), xticks=range(90, 181, 15), ylabel="phase function [1/sr]")
+    backward.minorticks_on()
+    style.log_axis(forward, "x")
+    style.log_axis(forward, "y", most=9)
+    forward.legend()
+    style.save(figure, parser.parse_args().out)
 
 
 if __name__ == "__main__":

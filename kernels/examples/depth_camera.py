@@ -269,12 +269,16 @@ def main():
         from matplotlib import pyplot
 
         frames = {"depth": depth, "threshold and noise": ThresholdCamera().frame(depth, normal), "SPAD": noisy}
-        figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.6), layout="constrained")
+        pyplot.rcParams.update({"font.size": 8, "axes.titlesize": 8})
+        figure, axes = pyplot.subplots(1, 3, figsize=(7.2, 2.0), sharey=True, layout="constrained")
+        colours = pyplot.colormaps["viridis_r"].with_extremes(bad="0.85", under="black", over="#d55e00")
         for axis, (title, image) in zip(axes, frames.items(), strict=True):
-            shown = axis.imshow(image.numpy(), vmin=2.0, vmax=12.0, cmap="cividis")
-            axis.set(title=title, xlabel="column", ylabel="row")
-        figure.colorbar(shown, ax=axes, label="depth z [m]")
-        figure.savefig(options.picture, dpi=100)
+            shown = axis.imshow(image.numpy(), vmin=2.0, vmax=12.0, cmap=colours)
+            axis.set(title=title, xlabel="column [pixel]")
+        axes[0].set_ylabel("row [pixel]")
+        bar = figure.colorbar(shown, ax=axes, label="depth z [m]\ngrey: none", extend="both", shrink=0.8)
+        bar.minorticks_on()
+        figure.savefig(options.picture, dpi=200)
 
 
 if __name__ == "__main__":

@@ -78,27 +78,31 @@ def film(steps, photons, *, seed=1, device=None):
 
 
 def draw(video, path):
-    """The video as an animated GIF: light by row and time, and the path of the brightest bin."""
+    """The video as an animated GIF: light by column and path, and half the path of the brightest bin."""
     import matplotlib
 
     matplotlib.use("agg")
-    from matplotlib import animation, pyplot
+    from matplotlib import animation, colors, pyplot
 
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    pyplot.rcParams.update({"font.size": 8, "axes.titlesize": 8})
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(7.2, 3.0), layout="constrained", dpi=120)
     width = (GATE[1] - GATE[0]) / BINS
-    peak = GATE[0] + (video.argmax(axis=-1) + 0.5) * width
-    slices = np.log10(np.maximum(video.sum(axis=1), 1e-30)).transpose(0, 2, 1)  # [step, bin, column]
+    distance = 0.5 * (GATE[0] + (video.argmax(axis=-1) + 0.5) * width)
+    slices = video.sum(axis=1).transpose(0, 2, 1)  # [step, bin, column]
     top = slices.max()
-    transient = left.imshow(slices[0], origin="lower", aspect="auto", extent=(0, WIDTH, *GATE), vmin=top - 4, vmax=top)
-    depth = right.imshow(0.5 * peak[0], vmin=DISTANCE - 0.4, vmax=DISTANCE + 0.4, cmap="cividis")
-    left.set(xlabel="column", ylabel="path [m]", title="light by column and path")
-    right.set(xlabel="column", ylabel="row", title="half the path of the brightest bin")
-    figure.colorbar(transient, ax=left, label="log10 of the fraction of the emitted light")
-    figure.colorbar(depth, ax=right, label="m")
+    scale = colors.LogNorm(1e-4 * top, top)
+    light = pyplot.colormaps["inferno"].with_extremes(bad="black", under="black")
+    transient = left.imshow(slices[0], origin="lower", aspect="auto", extent=(0, WIDTH, *GATE), norm=scale, cmap=light)
+    image = right.imshow(distance[0], vmin=DISTANCE - 0.4, vmax=DISTANCE + 0.4, cmap="viridis_r")
+    left.set(xlabel="column [pixel]", ylabel="path [m]", title="light by column and path")
+    right.set(xlabel="column [pixel]", ylabel="row [pixel]", title="brightest bin")
+    left.minorticks_on()
+    figure.colorbar(transient, ax=left, label="part of the emitted light\nper column and bin", extend="min")
+    figure.colorbar(image, ax=right, label="half the path [m]", extend="both", shrink=0.8).minorticks_on()
 
     def show(step):
         transient.set_data(slices[step])
-        depth.set_data(0.5 * peak[step])
+        image.set_data(distance[step])
 
     animation.FuncAnimation(figure, show, len(video)).save(path, writer=animation.PillowWriter(fps=12))
     pyplot.close(figure)

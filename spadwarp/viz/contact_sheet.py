@@ -16,7 +16,7 @@ from spadwarp.dataset import FrameReader
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_integer
 from spadwarp.viz.panels import coloured_depth, strip_bar, strips
-from spadwarp.viz.style import DEPTH_MAP, INTENSITY_MAP, PAGE, paper, save
+from spadwarp.viz.style import DEPTH_MAP, INTENSITY_MAP, PAGE, paper, save, spaced
 
 __all__ = ["draw_dataset"]
 
@@ -67,9 +67,9 @@ def draw_dataset(
     strip_bar(bars[0], scale, DEPTH_MAP, "depth beyond the target's centre [m]", bars=2)
     strip_bar(bars[1], Normalize(0.0, 1.0), INTENSITY_MAP, "recorded photons, relative to the brightest", bars=2)
     note = (
-        "Each frame: true depth, measured depth, recorded photons. c r: attenuation lengths one way, c being the "
-        "water's extinction and r the range of the target. BS: backscatter fraction, the part of the pixels that "
-        "report backscatter."
+        "Each frame: true depth, measured depth (light: none), recorded photons (brightest: their 99.5th percentile). "
+        "c r: attenuation lengths one way, c being the water's extinction and r the range of the target. BS: "
+        "backscatter fraction, the part of the pixels that report backscatter."
     )
     return save(figure, path, note=note)
 
@@ -78,7 +78,7 @@ def _title(item: dict[str, Any], name: str, top: float) -> str:
     """Target, attenuation lengths, backscatter fraction where it is known, largest number of photons in colours."""
     fraction = float(item["backscatter_fraction"])
     level = "" if math.isnan(fraction) else f", BS = {fraction:.3g}"
-    return f"{name}\nc r = {item['attenuation_lengths']:.2g}{level}, brightest {top:.3g} photons"
+    return f"{name}\nc r = {item['attenuation_lengths']:.2g}{level}, brightest {spaced(round(top))} photons"
 
 
 def _depth_scale(items: Sequence[dict[str, Any]]) -> Normalize:
