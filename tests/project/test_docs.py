@@ -247,6 +247,27 @@ def test_ballistic_light_of_the_figure_is_the_analytic_signal():
     assert 1.2 < mean[target] < np.exp(2.0 * figure.ALBEDO * 0.4)
 
 
+@pytest.mark.physics
+def test_figure_of_a_capture_finds_its_own_model(tmp_path):
+    """Counts that the detector model drew: the response is found again, and the distributions of errors agree."""
+    from spadwarp.frames import InstrumentResponse
+
+    figure = load(ROOT / "docs" / "figures" / "measured.py")
+    height, bins, width = 40, 120, 1e-10
+    place = 6e-9 + 1e-9 * np.add.outer(np.arange(height), np.arange(height)) / height  # a slope
+    response = InstrumentResponse(sigma=2e-10, tail=1e-10)
+    edges = np.arange(bins + 1) * width
+    expected = 12.0 * np.diff(response.cumulative(edges - place[..., None]), axis=-1) + 0.02
+    counts = np.random.default_rng(3).poisson(expected)
+    measured, simulated, fitted = figure.compare(counts, width, bins=bins, fwhm=6e-10)
+    assert fitted.response.fwhm == pytest.approx(response.fwhm, rel=0.1)
+    assert fitted.background == pytest.approx(0.02, rel=0.2)
+    # Kolmogorov's distance of two samples of this size is below this in 999 of 1000 cases.
+    assert figure.largest_difference(measured.errors, simulated.errors) < 1.95 * np.sqrt(2.0 / measured.errors.size)
+    figure.draw(measured, simulated, tmp_path / "measured.png")
+    assert (tmp_path / "measured.png").stat().st_size > 10_000
+
+
 @pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # 2000 photons
 def test_formats_page_names_everything_in_the_files(tmp_path):
     """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
