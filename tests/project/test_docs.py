@@ -133,7 +133,7 @@ def test_tutorial_runs(checkout):
         elif language == "python":
             exec(compile(code, "tutorial.md", "exec"), names)
         else:
-            for line in code.splitlines():
+            for line in code.replace("\\\n", " ").splitlines():
                 if not line.startswith("pip "):
                     run_smaller(line)
 
