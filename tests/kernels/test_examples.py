@@ -12,6 +12,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.statistics_of_samples import chi2_p
 
+SIMULATORS = {"newton", "mujoco", "mujoco_warp"}  # each in its own example
 FOLDER = Path(__file__).parents[2] / "kernels" / "examples"
 
 
@@ -31,7 +32,7 @@ def test_examples_need_the_kernel_library_alone(path):
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             for name in [node.module] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names]:
                 top = name.split(".")[0]
-                assert top in {"numpy", "warp", "spadwarp_kernels", "matplotlib"} | sys.stdlib_module_names
+                assert top in {"numpy", "warp", "spadwarp_kernels", "matplotlib"} | sys.stdlib_module_names | SIMULATORS
 
 
 def test_moving_target(monkeypatch):
@@ -120,3 +121,17 @@ def test_own_phase_function():
     reflected, transmitted = module.slab(module.PURE_WATER, 200_000, albedo=1.0, device="cpu")
     assert reflected + transmitted == pytest.approx(1.0, abs=1e-3)  # nothing is absorbed
     assert transmitted > np.exp(-1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("simulator", ["newton", "mujoco_warp"])
+@pytest.mark.filterwarnings("default")  # those of the simulators
+def test_cameras_in_simulators(simulator):
+    """A stranger's program, short; the body that falls is in the middle of every world's image."""
+    pytest.importorskip(simulator)
+    path = FOLDER / f"{simulator}_camera.py"
+    assert len(path.read_text().splitlines()) <= 40
+    depth = example(path.stem).main(worlds=2, steps=60, device="cpu").numpy()
+    assert depth.shape == (2, 60, 80)
+    assert np.median(depth[:, 28:32, 38:42], axis=(1, 2)) == pytest.approx(2.85, abs=0.25)
+    assert np.nanmedian(depth[:, 50:]) < 2.0  # the floor

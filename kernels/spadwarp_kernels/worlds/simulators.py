@@ -72,7 +72,7 @@ def mujoco_shapes(
     """The geoms of a `mujoco.MjModel`, in as many worlds as MuJoCo Warp simulates.
 
     Cameras are updated with body poses that `write_poses` fills from `data.xpos` and `data.xquat` `[worlds, bodies]`,
-    and their poses, from `data.cam_xpos` and `data.cam_xmat`, are in the frame "opengl".
+    and their poses, from `data.cam_xpos` and `data.cam_xmat`, are in the frame "opengl". Height fields have no sides.
 
     Args:
         model: `mujoco.MjModel`, on the host.
@@ -96,9 +96,8 @@ def mujoco_shapes(
     size[(kind == _MESH) | (kind == _HEIGHT_FIELD)] = 1.0
     meshes = {key: _mujoco_mesh(model, *key, device) for key in _mujoco_mesh_keys(model)}
     mesh = [meshes.get((int(k), int(one))) for k, one in zip(kind, model.geom_dataid, strict=True)]
-    rgba = np.where(model.geom_matid[:, None] >= 0, model.mat_rgba[model.geom_matid], model.geom_rgba)
-    if model.nmat == 0:
-        rgba = np.asarray(model.geom_rgba)
+    rgba, material = np.array(model.geom_rgba), np.asarray(model.geom_matid)
+    rgba[material >= 0] = model.mat_rgba[material[material >= 0]]
     albedo = np.broadcast_to(srgb_to_linear(rgba[:, GREEN]) if albedo is None else albedo, (count,))
     quat = np.roll(np.asarray(model.geom_quat), -1, axis=1)
     body = np.arange(worlds)[:, None] * int(model.nbody) + np.asarray(model.geom_bodyid)
@@ -136,7 +135,7 @@ def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp
         points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         faces = np.stack(
-            [corner, corner + 1, corner + columns, corner + columns, corner + 1, corner + columns + 1], axis=1
+            [corner, corner + 1, corner + columns + 1, corner, corner + columns + 1, corner + columns], axis=1
         )
     points = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
     return wp.Mesh(points, wp.array(np.asarray(faces, np.int32).ravel(), dtype=int, device=device))
