@@ -134,5 +134,5 @@ def test_depth_of_mujocos_own_rays():
     theirs = np.where(theirs < 0.0, np.nan, theirs * view[:, 2]).reshape(60, 80)
     assert np.mean(np.isfinite(theirs) == np.isfinite(mine[0])) > 0.997
     assert np.nanquantile(abs(theirs - mine[0]), 0.99) < 1e-3
-    assert np.isfinite(theirs).mean() > 0.5
+    assert np.isfinite(theirs).mean() > 0.3
     assert shapes.table.albedo.numpy()[:3] == pytest.approx([0.2140, 0.2140, 0.3185], abs=1e-3)  # sRGB 0.5 and 0.6
