@@ -8,7 +8,7 @@ from typing import Any
 from spadwarp.checks.daylight import check_daylight
 from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
-from spadwarp.checks.optics import check_focus, check_scan
+from spadwarp.checks.optics import check_focus, check_ports, check_scan
 from spadwarp.checks.plausible import check_plausible
 from spadwarp.checks.spectrum import check_spectrum
 from spadwarp.checks.statistics import check_statistics
@@ -26,6 +26,7 @@ _CHECKS = (
     check_plausible,
     check_targets,
     check_focus,
+    check_ports,
     check_scan,
     check_timing,
     check_spectrum,

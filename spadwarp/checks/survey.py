@@ -13,6 +13,7 @@ from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.beam_profile import profile_extent
 from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
+from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.units import range_from_time, time_from_path
 
 __all__ = ["Survey"]
@@ -41,24 +42,52 @@ class Survey:
         self.reflectance = np.zeros(0) if mesh is None else mesh.reflectance
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         self.focus_distance = focus_distance(scene, mesh)
+        self.camera_port, self.laser_port = camera_port(scene), laser_port(scene)
         self.view = view_planes(scene.camera)
         # A scan brings its beam to all that is in view.
         self.beam = beam_planes(scene.beam) if scene.scan_positions == 1 else np.zeros((0, 4))
         self.illuminated = self.illuminated_part(self.triangles)
         self.target_range = self.target_path = self.optical_depth = None
         if len(self.illuminated):
-            ranges, paths = np.linalg.norm(self.illuminated, axis=1), self.paths(self.illuminated)
+            ranges, paths = self.ranges(self.illuminated), self.paths(self.illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_path = float(paths.min()), float(paths.max())
             self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), self.illuminated[ranges.argmin()].tolist())
 
     def illuminated_part(self, triangles: Points) -> Points:
-        """Points of triangles in the view and the beam, `[N, 3]`."""
-        return points_inside(triangles, np.concatenate([self.view, self.beam]))
+        """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
+        if self.camera_port is None and self.laser_port is None:
+            return points_inside(triangles, np.concatenate([self.view, self.beam]))
+        # Bent towards its normal, light stays within the planes in air about a port that is not tilted.
+        straight = [
+            planes for planes, port in ((self.view, self.camera_port), (self.beam, self.laser_port)) if not port
+        ]
+        points = points_inside(triangles, np.concatenate([np.array([[0.0, 0.0, 1.0, 0.0]]), *straight]))
+        laser = np.array(self.scene.beam.position)
+        for port, planes, origin in (
+            (self.camera_port, self.view, np.zeros(3)),
+            (self.laser_port, self.beam, laser),
+        ):
+            if port is not None and len(points):
+                ahead = origin + port.connect(points, origin)[0]
+                points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
+        return points
+
+    def ranges(self, points: Points) -> Points:
+        """Lengths of the ways of light [m] from points `[N, 3]` to the lens."""
+        if self.camera_port is not None:
+            return self.camera_port.connect(points, np.zeros(3))[2]
+        return np.linalg.norm(points, axis=1)
 
     def paths(self, points: Points) -> Points:
-        """Paths [m] from the laser by points `[N, 3]` to the lens."""
-        return np.linalg.norm(points - np.array(self.scene.beam.position), axis=1) + np.linalg.norm(points, axis=1)
+        """Paths [m] from the laser by points `[N, 3]` to the lens, as lengths in water."""
+        laser = np.array(self.scene.beam.position)
+        to_lens, to_laser = np.linalg.norm(points, axis=1), np.linalg.norm(points - laser, axis=1)
+        if self.camera_port is not None:
+            to_lens = self.camera_port.connect(points, np.zeros(3))[3]
+        if self.laser_port is not None:
+            to_laser = self.laser_port.connect(points, laser)[3]
+        return to_laser + to_lens
 
     def arrival_ns(self, path: float) -> float:
         """Time of flight [ns] along a path [m]."""
@@ -103,6 +132,8 @@ class Survey:
     def _pixel_share(self, distance: float) -> float:
         """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
         laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
+        footprint *= self._narrowed(self.camera_port) / self._narrowed(self.laser_port)
+        footprint *= self._transmission(self.laser_port)
         if laser.profile == "uniform_cone":
             area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
         elif laser.profile == "gaussian":
@@ -113,6 +144,19 @@ class Survey:
         else:
             area = math.pi * laser.beam_radius**2
         return min(1.0, footprint / area) if area > 0.0 else 1.0
+
+    @staticmethod
+    def _narrowed(port: PortGeometry | None) -> float:
+        """By which a flat port makes a small solid angle about its normal smaller."""
+        return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
+
+    @staticmethod
+    def _transmission(port: PortGeometry | None) -> float:
+        """Of light that falls on a port at right angles."""
+        if port is None:
+            return 1.0
+        first, second, third = port.index
+        return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)
 
     @property
     def samples_per_pixel(self) -> float | None:
@@ -128,6 +172,7 @@ class Survey:
             return None
         return (
             axis_fluence(self.scene.laser, self.distance)
+            * (self._transmission(self.laser_port) / self._narrowed(self.laser_port))
             * math.exp(-self.optical_depth)
             * self.scene.laser.average_power
         )
@@ -139,7 +184,9 @@ class Survey:
             return None
         # Lambertian, towards the lens
         collected = float(self.reflectance.max()) / math.pi * self.scene.camera.aperture_area / self.distance**2
-        share = self.ballistic_share * math.exp(-self.optical_depth)
+        share = self.ballistic_share * math.exp(-self.optical_depth) * self._transmission(self.camera_port)
+        if self.camera_port is not None and self.camera_port.shape == "dome":
+            share *= (self.camera_port.index[0] / self.camera_port.index[2]) ** 2
         return share * collected * self.scene.laser.photons_per_pulse
 
     @property

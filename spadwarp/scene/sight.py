@@ -88,7 +88,8 @@ class LinesOfSight:
         if not self.bent:
             return range_from_path(path, self.direction, self.laser)
         left = np.asarray(path, np.float64) - self.delay
-        least = self._path_to(self.start + _LEAST * self.direction)
+        # Lines that begin where the laser's port hides them have no first point.
+        least = np.nan_to_num(self._path_to(self.start + _LEAST * self.direction))
         along = np.maximum(0.5 * (left - least), _LEAST)
         for _ in range(_STEPS):
             points = self.start + along[..., None] * self.direction

@@ -220,7 +220,7 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     laser.position = wp.vec3(*beam.position)
     laser.axis = wp.vec3(*beam.axis)
     if (port := laser_port(scene)) is not None:
-        laser.port = _port(scene, port, 0.0, 0.0)
+        laser.port = _port(scene, port, beam.position, 0.0, 0.0)
     if beam.profile == "measured":
         rows, columns = sk.profile_tables(load_profile(beam))
         laser.rows = wp.array(rows, dtype=float, device=device)
@@ -250,7 +250,7 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
         lens.view = wp.vec4(*view_box(camera))
     if (port := camera_port(scene)) is not None:
-        lens.port = _port(scene, port, lens.aperture_radius, lens.inverse_focus)
+        lens.port = _port(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
     return lens
 
 
@@ -258,7 +258,9 @@ def _port_kind(port: PortGeometry | None) -> Any:
     return None if port is None else sk.FLAT_PORT if port.shape == "flat" else sk.DOME_PORT
 
 
-def _port(scene: Scene, port: PortGeometry, aperture_radius: float, inverse_focus: float) -> Any:
+def _port(
+    scene: Scene, port: PortGeometry, origin: tuple[float, float, float], aperture_radius: float, inverse_focus: float
+) -> Any:
     """A port as the kernels take it."""
     left, top, right, bottom = view_box(scene.camera)
     corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
@@ -270,6 +272,7 @@ def _port(scene: Scene, port: PortGeometry, aperture_radius: float, inverse_focu
         "thickness": port.thickness,
         "index": port.index,
         "group_index": port.group_index,
+        "origin": origin,
         "aperture_radius": aperture_radius,
         "largest_angle": min(angle, 1.55),
     }

@@ -49,29 +49,35 @@ def make_flat_port(
     normal: Sequence[float] = (0.0, 0.0, 1.0),
     index: Sequence[float],
     group_index: Sequence[float],
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
     aperture_radius: float = 0.0,
     largest_angle: float = 1.5,
 ) -> Port:
     """The parameters of a plane window.
 
     Args:
-        distance: From the origin, a camera's lens centre, along the normal to the inner face [m], > 0.
+        distance: From the camera's lens centre along the normal to the inner face [m].
         thickness: Of the window [m], >= 0.
         normal: Unit vector into the water.
         index, group_index: Of what is inside, of the window, of the water; >= 1.
-        aperture_radius: Of the camera [m]: the lens must be inside.
+        origin: The lens centre, or the position of a laser, which must be inside [m].
+        aperture_radius: Of the camera [m]: all of the lens must be inside.
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
 
     Raises:
         ArgumentError: A number out of its range.
     """
-    check_number("distance", distance, "(0, inf)")
+    check_number("distance", distance, "(-inf, inf)")
     check_vector("normal", normal, unit=True)
-    _check_layers(thickness, index, group_index, aperture_radius)
+    _check_layers(thickness, index, group_index, origin, aperture_radius)
     check_number("largest_angle", largest_angle, "[0, 1.5707963]")
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
-    if tilt >= distance:
-        raise ArgumentError(f"distance = {distance} m: a lens of radius {aperture_radius} m reaches through the port")
+    inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
+    if tilt >= inside:
+        raise ArgumentError(
+            f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
+            "through the port"
+        )
     port = _port(thickness, index, group_index)
     port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
@@ -79,7 +85,7 @@ def make_flat_port(
     port.glass_slope, port.water_slope = (wp.vec2(*bounds) for bounds in slopes)
     steepest = max(math.tan(largest_angle), slopes[0][1] * math.tan(largest_angle))
     longest = min(math.hypot(1.0, steepest), _FAR)
-    _set_times(port, ((distance - tilt, (distance + tilt) * longest), (thickness, thickness * longest)))
+    _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
     return port
 
 
@@ -90,6 +96,7 @@ def make_dome_port(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     index: Sequence[float],
     group_index: Sequence[float],
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
     aperture_radius: float = 0.0,
     largest_angle: float = 1.5,
 ) -> Port:
@@ -98,8 +105,9 @@ def make_dome_port(
     Args:
         radius: Of the inner sphere [m], > 0.
         thickness: Of the window [m], >= 0.
-        centre: Of the spheres, from a camera's lens centre [m]; the lens must be inside.
+        centre: Of the spheres, from the camera's lens centre [m].
         index, group_index: Of what is inside, of the window, of the water; >= 1.
+        origin: The lens centre, or the position of a laser, which must be inside [m].
         aperture_radius: Of the camera [m].
         largest_angle: Between the optical axis and any ray of the view, inside, in [0, pi/2) [rad].
 
@@ -109,16 +117,16 @@ def make_dome_port(
     """
     check_number("radius", radius, "(0, inf)")
     check_vector("centre", centre)
-    _check_layers(thickness, index, group_index, aperture_radius)
+    _check_layers(thickness, index, group_index, origin, aperture_radius)
     check_number("largest_angle", largest_angle, "[0, 1.5707963]")
     port = _port(thickness, index, group_index)
     port.radius, port.centre = radius, wp.vec3(*centre)
     n = tuple(port.index)
-    furthest = math.hypot(*centre) + aperture_radius
+    furthest = math.dist(centre, origin) + aperture_radius
     if not furthest < min(1.0, n[1] / n[0], n[2] / n[0] * (1.0 + thickness / radius)) * radius:
         raise ArgumentError(
-            f"centre = {tuple(centre)} m: a lens of radius {aperture_radius} m reaches {furthest:g} m from it, too far "
-            f"for a dome of radius {radius} m"
+            f"centre = {tuple(centre)} m: a lens or laser reaches {furthest:g} m from it, too far for a dome of radius "
+            f"{radius} m"
         )
     p, outer = np.linspace(0.0, n[0] * furthest, 257), radius + thickness
     angle = [np.arcsin(p / x) for x in (n[0] * radius, n[1] * radius, n[1] * outer, n[2] * outer)]
@@ -145,8 +153,13 @@ def check_port(name: str, port: Port, kind: PortKind) -> None:
 
 
 def _check_layers(
-    thickness: float, index: Sequence[float], group_index: Sequence[float], aperture_radius: float
+    thickness: float,
+    index: Sequence[float],
+    group_index: Sequence[float],
+    origin: Sequence[float],
+    aperture_radius: float,
 ) -> None:
+    check_vector("origin", origin)
     check_number("thickness", thickness, "[0, inf)")
     check_number("aperture_radius", aperture_radius, "[0, inf)")
     for name, values in (("index", index), ("group_index", group_index)):

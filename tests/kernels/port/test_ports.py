@@ -188,7 +188,7 @@ def test_what_lies_behind_the_port_has_no_way(device):
 @pytest.mark.parametrize(
     ("make", "changes", "text"),
     [
-        (make_flat_port, dict(distance=0.0), "distance = 0.0 is outside"),
+        (make_flat_port, dict(distance=0.0), "reaches through the port"),
         (make_flat_port, dict(distance=0.05, thickness=-1.0), "thickness = -1.0 is outside"),
         (make_flat_port, dict(distance=0.001, normal=TILT, aperture_radius=0.02), "reaches through the port"),
         (make_flat_port, dict(distance=0.05, index=(0.5, 1.5, 1.3)), r"index\[0\] = 0.5 is outside"),
