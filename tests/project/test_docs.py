@@ -1,9 +1,8 @@
-"""The documentation: links lead somewhere, its code runs, its references are current, figures can be drawn."""
+"""The documentation: links lead somewhere, its references are current, figures can be drawn."""
 
 import ast
 import importlib.util
 import re
-import runpy
 import shlex
 import tomllib
 import typing
@@ -16,14 +15,12 @@ import pytest
 from typer.testing import CliRunner
 
 import spadwarp
-from helpers.cli import run
 from helpers.scenes import scene as make_scene
 from spadwarp.cli import app
 from spadwarp.scene import Target
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8") and page.name != "tutorial.md"]
 FIGURES = sorted((ROOT / "docs" / "figures").glob("*.py"))
 
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -104,40 +101,6 @@ def test_python_in_the_text_uses_names_that_exist(page):
                     assert hasattr(spadwarp, node.attr) or importlib.util.find_spec(f"spadwarp.{node.attr}")
 
 
-@pytest.mark.parametrize("page", WITH_CODE, ids=by_name)
-def test_python_in_the_text_runs(page, checkout, tmp_path):
-    """The blocks of a page, one after the other, as one program in a checkout."""
-    blocks = [code for language, code in _FENCE.findall(page.read_text(encoding="utf-8")) if language == "python"]
-    program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
-    program.write_text("\n".join(blocks), encoding="utf-8")
-    runpy.run_path(str(program))
-
-
-# The same commands at a small size.
-SMALLER = {
-    r"--photons \S+": "--photons 5e3 --set camera.width=16 --set camera.height=12",
-    r"--pulses 20000": "--pulses 500",
-    r"(dataset make \S+small\.toml)": r"\1 --set scenes_per_target=1 --set scenes_per_shard=1 --set frames.per_scene=2",
-    r"(train \S+)": r"\1 --steps 2",
-    r"(evaluate \S+)": r"\1 --frames 1",
-}
-
-
-@pytest.mark.slow
-def test_tutorial_runs(checkout):
-    """From the first command to the last, block by block; pip aside."""
-    names = {}
-    for language, code in _FENCE.findall((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")):
-        if language == "toml":
-            Path(re.match(r"# (\S+)", code)[1]).write_text(code)
-        elif language == "python":
-            exec(compile(code, "tutorial.md", "exec"), names)
-        else:
-            for line in code.replace("\\\n", " ").splitlines():
-                if not line.startswith("pip "):
-                    run_smaller(line)
-
-
 def commands(text):
     """The words of every command line in a page's shell blocks, comments left out."""
     for language, code in _FENCE.findall(text):
@@ -149,7 +112,7 @@ def commands(text):
 
 @pytest.mark.parametrize("page", PAGES, ids=by_name)
 def test_commands_in_the_text_name_what_there_is(page):
-    """Commands, options, configurations and scripts; the tutorial runs most of them."""
+    """Commands, options, configurations and scripts."""
     printed = {}
     for words in commands(page.read_text(encoding="utf-8")):
         if words[:1] == ["python"] and words[1].startswith("kernels/examples/"):
@@ -171,15 +134,6 @@ def test_commands_in_the_text_name_what_there_is(page):
 def test_every_picture_of_the_gallery_has_its_commands():
     text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     assert len(re.findall(r"^!\[[^\]]+\]\([^)]+\)\n\n```sh\n", text, re.MULTILINE)) == text.count("![") > 5
-
-
-def run_smaller(line):
-    """A command, in this process."""
-    for pattern, smaller in SMALLER.items():
-        line = re.sub(pattern, smaller, line)
-    program, *arguments = shlex.split(line)
-    assert program == "spadwarp"
-    run(*arguments)
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "docs" / "reference" / "scene.md"], ids=by_name)

@@ -1,0 +1,143 @@
+"""Code in the documentation runs: Python as it stands, commands at a small size, or a reason why not."""
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import spadwarp
+from helpers.cli import run
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIAL = ROOT / "docs" / "tutorial.md"
+
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+# The same commands at a small size.
+SMALLER = {
+    r"--photons \S+": "--photons 5e3",
+    r"^(spadwarp simulate (?!.*--resume).*)": r"\1 --set camera.width=16 --set camera.height=12",
+    r"^(spadwarp simulate (?!.*(--photons|--resume)).*)": r"\1 --photons 5e3",
+    r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
+    r"--pulses 20000": "--pulses 500",
+    r"--steps 24": "--steps 9",
+    r"--size 320 240": "--size 64 48",
+    r"dataset make \S+": "dataset make small --set scenes_per_target=1 --set frames.per_scene=2",
+    r"dataset make small --set": "dataset make small --set scenes_per_shard=1 --set",
+    r"train (out/\S+)": r"train \1 --steps 2",
+    r"^spadwarp evaluate ": "spadwarp evaluate --frames 1 ",
+    r"--device cuda:\w+": "--device cpu",
+}
+
+# What does not run here, and why.
+LEFT_OUT = {
+    r"pip install|python3 -m venv|^\.venv/bin": "installs; .ci/run runs the README's two blocks",
+    r"^spadwarp doctor": "reports on this machine; tests/doctor",
+    r"--ray-address|out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
+    r"^sbatch|part\$id|out/part": "needs Slurm; tests/transport runs and merges shards",
+    r"^torchrun": "needs several GPUs",
+    r"train configs/|\bruns/": "recipes for a GPU; tests/denoise trains the networks for a few steps",
+    r"^python bench/peers": "needs networks of others",
+    r"evaluate --(histograms|report)": "take minutes; tests/denoise has them at a small size",
+    r"bm3d": "takes minutes; tests/denoise has it on a small frame",
+}
+
+
+def by_name(path):
+    return path.name
+
+
+def blocks(page):
+    return _FENCE.findall(page.read_text(encoding="utf-8"))
+
+
+def lines(code):
+    """Commands of a shell block, one each, without comments."""
+    for line in code.replace("\\\n", " ").splitlines():
+        yield re.sub(r"\s+#.*", "", line).strip()
+
+
+WITH_PYTHON = [
+    page for page in PAGES[1:] if page != TUTORIAL and any(language == "python" for language, _ in blocks(page))
+]
+WITH_COMMANDS = [
+    page for page in PAGES if page != TUTORIAL and any(language in ("sh", "bash") for language, _ in blocks(page))
+]
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder in which configurations and examples lie as in a checkout; afterwards, nothing that git would see."""
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    for name in ("configs", "kernels"):
+        (folder / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(folder)
+    yield folder
+    left = {path.name for path in folder.iterdir()} - {"configs", "kernels", "out", "data", "runs", "bust.stl"}
+    assert not left, f"{left} would be left in the checkout"
+
+
+def run_small(line):
+    """A command in this process, at a small size."""
+    if any(re.search(pattern, line) for pattern in LEFT_OUT):
+        return
+    for pattern, smaller in SMALLER.items():
+        line = re.sub(pattern, smaller, line)
+    program, *arguments = shlex.split(line)
+    if program == "python":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", arguments)
+            runpy.run_path(arguments[0], run_name="__main__")
+    else:
+        assert program == "spadwarp", line
+        run(*arguments)
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=by_name)
+def test_python_in_the_text_runs(page, checkout, tmp_path):
+    """The blocks of a page, one after the other, as one program in a checkout."""
+    program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
+    program.write_text("\n".join(code for language, code in blocks(page) if language == "python"), encoding="utf-8")
+    runpy.run_path(str(program))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=by_name)
+def test_commands_in_the_text_run(page, checkout):
+    """The commands of a page, one after the other. A mesh, a depth frame and a result are the reader's own."""
+    trimesh.creation.box().export("bust.stl")
+    if page.name == "denoising.md":
+        Path("out").mkdir()
+        np.save("out/depth.npy", np.full((24, 32), 15.0))
+        spadwarp.simulate("plane_5m", photons=100_000).save("out/result.h5")
+    for language, code in blocks(page):
+        for line in lines(code) if language in ("sh", "bash") else ():
+            run_small(line)
+
+
+@pytest.mark.slow
+def test_tutorial_runs(checkout):
+    """From the first command to the last, block by block; installing aside."""
+    names = {}
+    for language, code in blocks(TUTORIAL):
+        if language == "toml":
+            Path(re.match(r"# (\S+)", code)[1]).write_text(code)
+        elif language == "python":
+            exec(compile(code, "tutorial.md", "exec"), names)
+        else:
+            for line in lines(code):
+                run_small(line)
+
+
+def test_everything_that_is_left_out_stands_in_a_page():
+    text = [
+        line for page in PAGES for language, code in blocks(page) if language in ("sh", "bash") for line in lines(code)
+    ]
+    assert not [pattern for pattern in LEFT_OUT if not any(re.search(pattern, line) for line in text)]
