@@ -58,11 +58,15 @@ class Survey:
         """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
         if self.camera_port is None and self.laser_port is None:
             return points_inside(triangles, np.concatenate([self.view, self.beam]))
-        # Bent towards its normal, light stays within the planes in air about a port that is not tilted.
-        straight = [
-            planes for planes, port in ((self.view, self.camera_port), (self.beam, self.laser_port)) if not port
-        ]
-        points = points_inside(triangles, np.concatenate([np.array([[0.0, 0.0, 1.0, 0.0]]), *straight]))
+        # Bent towards its normal, light stays within the planes in air, but about a tilted port.
+        whole = [np.array([[0.0, 0.0, 1.0, 0.0]])]
+        for planes, port, axis in (
+            (self.view, self.camera_port, (0.0, 0.0, 1.0)),
+            (self.beam, self.laser_port, self.scene.beam.axis),
+        ):
+            if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
+                whole.append(planes)
+        points = points_inside(triangles, np.concatenate(whole))
         laser = np.array(self.scene.beam.position)
         for port, planes, origin in (
             (self.camera_port, self.view, np.zeros(3)),

@@ -198,6 +198,7 @@ def test_check_knows_the_port():
     assert all(m.level == "note" for m in spadwarp.check(surface) if m.field == "camera.port")
     open_water = ported({"distance": 1.0})
     assert any(m.level == "warning" and "calm surface" in m.text for m in spadwarp.check(open_water))
+    one = one.with_overrides({"laser.half_angle_deg": 60.0})
     lines = lines_of_sight(one)
     depth = np.full((10, 12), 2.2)
     low, high = spadwarp.checks.summary(one)["target_range"]
