@@ -9,8 +9,10 @@ C4 = 10^(0.002 (λ/nm − 700)) beyond 700 nm, else 1:
 
 A train of pulses must keep three limits (A.3): (1) each pulse the limit of its duration; (2) the mean over the exposure
 the limit of that duration; (3) each pulse, the pulses within T_i = 5 µs counted as one of duration T_i, C5 times its
-limit, C5 = max(0.4, 5·N^−0.25) for more than 600 pulses N in the exposure (10 s at most) if that is longer than 0.25 s,
-else 1. Exposures are means over a 7 mm aperture in the middle of the beam, in clear water.
+limit, C5 = max(0.4, 5·N^−0.25) for more than 600 pulses N of T_i at most in the exposure (10 s at most, T_2 of a small
+source) if that is longer than 0.25 s, else 1; C5 is 1 also for longer pulses of a small source. An extended source may
+have up to α/1.5 mrad times the thermal limits (C6), which is left out: these limits are on the safe side of it.
+Exposures are means over a 7 mm aperture in the middle of the beam, in clear water.
 """
 
 from __future__ import annotations
@@ -126,7 +128,8 @@ def _pulse_limit(laser: Laser, exposure: float) -> tuple[float, str]:
     pulse = max(laser.pulse_fwhm_ps * 1e-12, 1e-13)
     together = max(1.0, rate * _GROUP)  # pulses that count as one
     groups = rate / together * min(exposure, 10.0)
-    c5 = max(0.4, 5.0 * groups**-0.25) if exposure > 0.25 and groups > 600.0 else 1.0
+    counted = exposure > 0.25 and groups > 600.0 and pulse <= _GROUP
+    c5 = max(0.4, 5.0 * groups**-0.25) if counted else 1.0
     limits = {
         "single pulse": permissible_exposure(pulse, nm),
         "average": permissible_exposure(exposure, nm) / max(rate * exposure, 1.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import re
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -61,16 +62,23 @@ def in_unit(unit: str) -> Callable[[str | float], float]:
 length, duration = in_unit("m"), in_unit("s")
 
 
-def two_lengths(text: str, option: str) -> tuple[float, float]:
-    """Metres from `2:3` or `80cm:1.2m`."""
-    first, colon, second = text.partition(":")
-    if not colon:
-        raise typer.BadParameter(f"{text!r} is not FROM:TO, two lengths", param_hint=option)
+def from_to(text: str, unit: str, option: str) -> tuple[float, float]:
+    """Two numbers of the unit from `2:3`, `2,3` or `80cm:1.2m`; both have a unit of their own, or none of them."""
+    parts = [part.strip() for part in re.split("[:,]", text)]
     try:
-        return length(first), length(second)
+        if len(parts) != 2 or "" in parts:
+            raise typer.BadParameter(f"{shown(text)} is not FROM:TO, two numbers such as 2:3 or 2{unit}:3{unit}")
+        first, second = map(in_unit(unit), parts)
+        bare = [part[-1] in "0123456789." for part in parts]
+        if bare[0] != bare[1]:
+            with_unit, without = parts[bare.index(False)], parts[bare.index(True)]
+            raise typer.BadParameter(
+                f"{shown(text)} is ambiguous: {with_unit} has a unit and {without} has none; write the unit of both"
+            )
     except typer.BadParameter as error:
         error.param_hint = option
         raise
+    return first, second
 
 
 ScenePath = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (TOML).", show_default=False)]

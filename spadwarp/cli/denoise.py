@@ -12,6 +12,7 @@ from spadwarp.cli import _measured as measured
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, say
 from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.units import range_from_time
 
 _ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
 
@@ -37,9 +38,11 @@ def denoise(
         ),
     ] = "pyramid",
     gate: Annotated[
-        tuple[float, float] | None,
+        str | None,
         typer.Option(
-            metavar="START STOP", help="Gate in depth [m]. By default that of the file, or the range of its depths."
+            metavar="FROM:TO",
+            help="Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --group-index. By default "
+            "that of the file, or the range of its depths.",
         ),
     ] = None,
     profile: Annotated[
@@ -89,13 +92,14 @@ def denoise(
     \b
     Examples:
       spadwarp denoise out/result.h5 --out denoised/
-      spadwarp denoise depth.npy --gate 13.5 16 --model dncnn --out denoised/
-      spadwarp denoise engine/ --channel A --scale 0.01 --gate 13.5 16 --out denoised/
+      spadwarp denoise depth.npy --gate 13.5:16 --model dncnn --out denoised/
+      spadwarp denoise engine/ --channel A --scale 0.01 --gate 13.5:16 --out denoised/
     """
     import numpy as np
 
     from spadwarp.denoise import denoise_file, depth_files
 
+    depths = _gate(gate, group_index)
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
@@ -109,7 +113,7 @@ def denoise(
         dataset, axes, image_size, tag_unit_ps, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf, sum_frames
     )
     settings: dict[str, Any] = {
-        "model": model, "gate": gate, "profile": given, "weights": weights, "device": device, "mask": mask,
+        "model": model, "gate": depths, "profile": given, "weights": weights, "device": device, "mask": mask,
         "as_depth": depth, "channel": channel, "scale": scale, "group_index": group_index, **facts,
     }  # fmt: skip
     lines, summary, failed, written = {}, [], 0, 0
@@ -148,3 +152,20 @@ def denoise(
     outputs.write_json({"model": model, "files": summary})
     if failed:
         raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")
+
+
+def _gate(text: str | None, group_index: float | None) -> tuple[float, float] | None:
+    """Depths [m] of a gate in depth, or in time of flight."""
+    if text is None:
+        return None
+    try:
+        return opt.from_to(text, "m", "--gate")
+    except typer.BadParameter as error:
+        if " is a time" not in error.message:
+            raise
+    if group_index is None:
+        raise typer.BadParameter(
+            f"{text!r} is in time of flight: --group-index makes depth of it; or give two lengths", param_hint="--gate"
+        )
+    start, stop = opt.from_to(text, "s", "--gate")
+    return range_from_time(start, group_index), range_from_time(stop, group_index)

@@ -47,8 +47,11 @@ def detect(
     ] = False,
     tags: Annotated[bool, typer.Option("--tags", help="Also keep the time tag of every detection.")] = False,
     window: Annotated[
-        tuple[float, int] | None,
-        typer.Option(metavar="NS BINS", help="Start and bins of the detector's window. By default the run's gate."),
+        tuple[str, str] | None,
+        typer.Option(
+            metavar="NS BINS",
+            help="Start [ns] and bins of the detector's window, such as 10 512 or 10ns 512. By default the run's gate.",
+        ),
     ] = None,
     overrides: opt.Overrides = None,
     device: opt.Device = None,
@@ -70,10 +73,11 @@ def detect(
     from spadwarp.frames import record_frames
     from spadwarp.viz import draw_recording
 
+    recorded = _window(window)
     result = _with_detector(opt.load_run(run), overrides)
     chosen: Any = [one.value for one in method or opt.Estimator]
     width, height = result.scene.camera.width, result.scene.camera.height
-    pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if window is None else window[1]
+    pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if recorded is None else recorded[1]
     shots = result.scene.detector.pulses_per_frame if pulses is None else pulses
     counted = min(shots, bins) if result.scene.detector.mode == "first_photon" else bins
     outputs = opt.check_outputs(
@@ -94,7 +98,7 @@ def detect(
             methods=list(dict.fromkeys(chosen)),
             undo_pile_up=coates,
             tags=tags,
-            window=None if window is None else (window[0] * 1e-9, window[1]),
+            window=recorded,
             device=device,
             progress=report,
         )
@@ -107,6 +111,17 @@ def detect(
         lines["written"] = ", ".join(path.name for path in written) + f" in {out}"
         say(opt.rows(lines))
     outputs.write_json({**summary, "files": written})
+
+
+def _window(window: tuple[str, str] | None) -> tuple[float, int] | None:
+    """Start [s] and bins."""
+    if window is None:
+        return None
+    try:
+        return 1e-9 * opt.in_unit("ns")(window[0]), opt.whole_number(window[1])
+    except typer.BadParameter as error:
+        error.param_hint = "--window"
+        raise
 
 
 def _with_detector(result: Result, overrides: list[str] | None) -> Result:

@@ -34,7 +34,8 @@ def plan(
         typer.Option(
             "--range",
             metavar="FROM:TO",
-            help="Where the target may be [m]; a plane at TO then stands for it. By default the scene's targets.",
+            help="Where the target may be, such as 80cm:1.2m [m]; a plane at TO then stands for it. By default the "
+            "scene's targets.",
         ),
     ] = None,
     margin: Annotated[
@@ -90,7 +91,7 @@ def plan(
             scene,
             depth_error=depth_error,
             time=time,
-            ranges=None if ranges is None else opt.two_lengths(ranges, "--range"),
+            ranges=None if ranges is None else opt.from_to(ranges, "m", "--range"),
             margin=margin,
             method=method.value,
             full_power=full_power,

@@ -10,7 +10,6 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
-from spadwarp.limits import parse_number
 
 
 @app.command()
@@ -20,7 +19,8 @@ def video(
         Path, typer.Option(metavar="FILE", help="Name of the video, .gif or .mp4; .mp4 needs ffmpeg.")
     ] = Path("light.gif"),
     window: Annotated[
-        str | None, typer.Option(metavar="FROM,TO", help="Times of flight [ns]; by default those with light.")
+        str | None,
+        typer.Option(metavar="FROM:TO", help="Times of flight, such as 40:55 [ns]; by default those with light."),
     ] = None,
     pictures: Annotated[
         int, typer.Option(parser=opt.whole_number, metavar="N", help="Largest number of pictures; bins are merged.")
@@ -38,20 +38,11 @@ def video(
     \b
     Examples:
       spadwarp video out/
-      spadwarp video out/ --out light.mp4 --window 40,55 --fps 20
+      spadwarp video out/ --out light.mp4 --window 40:55 --fps 20
     """
     opt.check_outputs(files={"--out": out}, inputs=(run,), overwrite=overwrite)
     scale: Literal["log", "linear"] = "linear" if linear else "log"
-    path = spadwarp.viz.video(run, out, window_ns=_window(window), pictures=pictures, fps=fps, scale=scale, frame=frame)
+    times = None if window is None else opt.from_to(window, "ns", "--window")
+    path = spadwarp.viz.video(run, out, window_ns=times, pictures=pictures, fps=fps, scale=scale, frame=frame)
     if not quiet:
         say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")
-
-
-def _window(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        start, stop = map(parse_number, text.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not FROM,TO, two numbers", param_hint="--window") from None
-    return start, stop

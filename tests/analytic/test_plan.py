@@ -170,6 +170,15 @@ PENCIL = {"profile": "collimated", "wavelength_nm": 532.0}
         ({"repetition_rate": 1e8}, 0.25, None, 1.0e-3, "average"),  # class 2: 1 mW
         ({"repetition_rate": 1e8, "wavelength_nm": 450.0}, 100.0, None, 3.9e-5, "average"),  # photochemical, 39 µW
         ({"repetition_rate": 1e3}, 10.0, 0.5 * 77e-9, None, "pulse train"),  # C5 = 5·10⁴^-0.25 = 0.5
+        ({"repetition_rate": 1e3}, 0.25, 77e-9, None, "single pulse"),  # C5 = 1 up to 0.25 s
+        ({"repetition_rate": 59.0}, 10.0, 77e-9, None, "single pulse"),  # and up to 600 pulses
+        ({"repetition_rate": 1e5}, 10.0, 3.9e-9, 0.39e-3, "average"),  # 0.4·77 nJ is more
+        # Longer than T_i = 5 µs: C5 = 1 for a small source, 7e-4·t^0.75 J.
+        ({"repetition_rate": 70.0, "pulse_fwhm_ps": 1e7}, 10.0, 7e-4 * 1e-5**0.75, None, "single pulse"),
+        ({"repetition_rate": 1e8, "wavelength_nm": 905.0}, 100.0, None, 0.39e-3 * 10**0.41, "average"),  # C4
+        ({"repetition_rate": 1.0, "wavelength_nm": 905.0}, 0.25, 77e-9 * 10**0.41, None, "single pulse"),
+        ({"repetition_rate": 1e8, "wavelength_nm": 480.0}, 100.0, None, 3.9e-5 * 10**0.6, "average"),  # C3
+        ({"repetition_rate": 1e8, "wavelength_nm": 640.0}, 30_000.0, None, 0.39e-3, "average"),
     ],
 )
 def test_eye_limits_are_those_of_the_classes(laser, exposure, energy, power, criterion):
@@ -177,6 +186,15 @@ def test_eye_limits_are_those_of_the_classes(laser, exposure, energy, power, cri
     assert found.criterion == criterion
     assert energy is None or found.pulse_energy == pytest.approx(energy, rel=0.03)
     assert power is None or found.average_power == pytest.approx(power, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("duration", "nm", "energy"),
+    [(1.0, 532.0, 7e-4), (1e-3, 640.0, 7e-4 * 1e-3**0.75), (50.0, 440.0, 3.9e-3), (50.0, 480.0, 3.9e-3 * 10**0.6)],
+)
+def test_single_exposures_are_those_of_class_1(duration, nm, energy):
+    """Table 3 of IEC 60825-1:2014, energy through 7 mm [J]."""
+    assert permissible_exposure(duration, nm) * np.pi * 3.5e-3**2 == pytest.approx(energy, rel=0.02)
 
 
 def test_mpe_is_continuous():

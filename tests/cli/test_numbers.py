@@ -1,5 +1,6 @@
 """Numbers on the command line: finite, or refused with the name of the option."""
 
+import numpy as np
 import pytest
 import typer
 
@@ -49,3 +50,41 @@ def test_a_real_option_is_finite(path, command, one, value):
 @pytest.mark.parametrize("text", ["nan:5", "1:inf", "1e999:2", "1:²", "1e308 km:2"])
 def test_a_range_is_finite(text, scene):
     assert "range" in run("plan", scene, "--range", text, code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "values"),
+    [
+        ("2:3", "m", (2.0, 3.0)),
+        ("1m:10m", "m", (1.0, 10.0)),
+        ("80cm,1.2m", "m", (0.8, 1.2)),
+        ("10ns,60ns", "ns", (10.0, 60.0)),
+        ("0.04 us : 55 ns", "ns", (40.0, 55.0)),
+    ],
+)
+def test_two_numbers_take_units(text, unit, values):
+    from spadwarp.cli import _options
+
+    assert _options.from_to(text, unit, "--range") == pytest.approx(values)
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "text", "words"),
+    [
+        ("plan", "--range", "1:10m", "'1:10m' is ambiguous: 10m has a unit and 1 has none"),
+        ("plan", "--range", "10cm:1", "is ambiguous"),
+        ("plan", "--range", "10ns:60ns", "is a time; a length is needed"),
+        ("plan", "--range", "1:2:3", "FROM:TO"),
+        ("budget", "--range", "1:10cm:5", "is ambiguous"),
+        ("budget", "--range", "1,10cm", "is ambiguous"),
+    ],
+)
+def test_ambiguous_ranges_are_refused(command, option, text, words, scene):
+    assert words in " ".join(run(command, scene, option, text, code=2).stderr.split())
+
+
+def test_a_gate_in_time_needs_the_index(tmp_path):
+    np.save(tmp_path / "depth.npy", np.full((8, 8), 14.0))
+    common = ("denoise", tmp_path / "depth.npy", "--model", "median", "--out", tmp_path / "out")
+    assert "--group-index" in run(*common, "--gate", "90ns:110ns", code=2).stderr
+    assert "ambiguous" in run(*common, "--gate", "9:11m", code=2).stderr
