@@ -144,14 +144,12 @@ def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
             values = [parse_override(f"a.b={value}")[1] if value.strip() else "" for value in text.split(",")]
         if not values or "" in values:
             raise ArgumentError(f"{name} = {shown(text)} lacks a value")
-        _same_units(text.split(","), unit, text, name)
         return [_number(value, unit, name) for value in values]
     parts = text.split(":")
     geometric = len(parts) == 4 and parts[3] == "log"
     try:
         low, high = (float(_number(_bare(part), unit, name)) for part in parts[:2])
         count = parse_number(parts[2])
-        _same_units(parts[:2], unit, text, name)
         if len(parts) > 3 + geometric or not math.isfinite(high - low) or (geometric and not min(low, high) > 0):
             raise ValueError
     except ArgumentError:
@@ -164,13 +162,6 @@ def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
     fewest = 1 if low == high else 2
     count = check_integer(f"{name} = {shown(text)}: the number of values", whole, f"[{fewest}, {LONGEST}]")
     return [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
-
-
-def _same_units(parts: list[str], unit: str | None, text: str, name: str) -> None:
-    """Refuses numbers of which some have a unit and some have none: `1:10cm` may mean 1 m or 1 cm."""
-    kinds = {part.strip().strip("\"'")[-1:] in "0123456789." for part in parts}
-    if unit not in (None, "1") and len(kinds) > 1:
-        raise ArgumentError(f"{name} = {shown(text)} is ambiguous: write the unit of all values, or of none")
 
 
 def _bare(text: str) -> Any:

@@ -83,6 +83,9 @@ def _numbers(text: str | None) -> list[float] | None:
 
     if text is None:
         return None
+    lengths = [part.strip() for part in (text.split(":")[:2] if ":" in text else text.split(","))]
+    if len({part[-1:] in "0123456789." for part in lengths}) > 1:
+        raise ArgumentError(f"--range = {shown(text)} is ambiguous: write the unit of all lengths, or of none")
     values = parse_values(text, "m", name="--range")
     if not all(isinstance(value, (int, float)) for value in values):
         raise ArgumentError(f"--range = {shown(text)} is not of the form from:to:count or a,b,c")
