@@ -19,16 +19,20 @@ from .estimators import ESTIMATORS, Estimator, next_event_value
 from .intersect import segment_meets_box
 from .math import one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 from .medium import (
+    Boundary,
     Layers,
     Limits,
     Medium,
     exit_distance,
     free_path,
+    fresnel_reflectance,
     layer_index,
     layered_extinction,
     layered_free_path,
     layered_water,
+    make_boundary,
     make_layers,
+    reflection_images,
 )
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -131,6 +135,7 @@ __all__ = [
     "TABULATED",
     "ArgumentError",
     "Batches",
+    "Boundary",
     "Camera",
     "Data",
     "Estimator",
@@ -166,6 +171,7 @@ __all__ = [
     "first_photon_counts",
     "fournier_forand_density",
     "free_path",
+    "fresnel_reflectance",
     "gate_bin",
     "ggx_brdf",
     "ggx_normals",
@@ -184,6 +190,7 @@ __all__ = [
     "layered_water",
     "lens_point",
     "load_transport_kernel",
+    "make_boundary",
     "make_data",
     "make_dome_port",
     "make_flat_port",
@@ -210,6 +217,7 @@ __all__ = [
     "random_block",
     "read_ledger",
     "reflectance_at",
+    "reflection_images",
     "rotate_direction",
     "sample_frames",
     "sample_ggx",

@@ -76,6 +76,15 @@ class Scene(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _faces_within_reach(self) -> Self:
+        if self.domain.reflecting and math.isfinite(self.transport.lateral_limit):
+            raise ValueError(
+                f"transport.lateral_limit = {self.transport.lateral_limit} does not go with domain.outside_index: faces "
+                "reflect light from beyond it"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _daylight_in_one_water(self) -> Self:
         if self.daylight is not None and self.medium.layers:
             raise ValueError(f"medium.layers: {len(self.medium.layers)} given; daylight takes one water")

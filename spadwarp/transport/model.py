@@ -62,6 +62,8 @@ def build_model(
     if camera:
         _check_gate(scene)
     lens, limits = _camera(scene, mesh), _limits(scene, camera)
+    if scene.domain.reflecting:
+        limits.boundary = _boundary(scene, device)
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines.
@@ -128,6 +130,13 @@ def _limits(scene: Scene, camera: bool) -> Any:
     limits.weight_cutoff = scene.transport.weight_cutoff
     limits.max_collisions = scene.transport.max_collisions
     return limits
+
+
+def _boundary(scene: Scene, device: wp.Device) -> Any:
+    """What the faces of the domain reflect."""
+    behind, water = scene.domain.reflecting, scene.medium.phase_index
+    low, high = ([behind.get(f"{axis}_{side}", 0.0) / water for axis in "xyz"] for side in ("low", "high"))
+    return sk.make_boundary(low, high, max_reflections=scene.domain.max_reflections, device=device)
 
 
 def _guiding(scene: Scene, max_path: float) -> Any:
@@ -210,6 +219,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         rotated_domain=_has_rotated_domain(scene),
         port=_port_kind(camera_port(scene)),
         laser_port=_port_kind(laser_port(scene)),
+        reflecting=bool(scene.domain.reflecting),
     )
     return spec._replace(**choices)
 

@@ -18,14 +18,14 @@ def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     if spec.port is not None:
         return Estimator(cross=_make_cross_port(spec, spec.port))
-    image_of = spec.lens.project
+    image_of, scatterings = spec.lens.project, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:
         """The photon's weight, if its flight passes through the aperture before anything else happens to it."""
         found = Contribution()
         found.index = -3
-        if s.u[2] < 0.0 and s.collisions > 0:
+        if s.u[2] < 0.0 and scatterings(s) > 0:
             crossing = -s.x[2] / s.u[2]
             on_lens = s.x + crossing * s.u
             pixel = image_of(camera, s.view, s.target, s.x, on_lens)
@@ -40,6 +40,16 @@ def make_analog(spec: TransportSpec) -> Estimator:
     return Estimator(cross=cross)
 
 
+def _make_scatterings(reflecting: bool) -> wp.Function:
+    """The Warp function ``s -> int``: events but reflections, which alone bring no light that next events could."""
+
+    @wp.func
+    def scatterings(s: PhotonState) -> int:
+        return s.collisions - (s.reflections if wp.static(reflecting) else 0)
+
+    return scatterings
+
+
 @wp.func
 def _component(s: PhotonState) -> int:
     component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
@@ -50,7 +60,7 @@ def _component(s: PhotonState) -> int:
 
 def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
     """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
-    image_of, leave = spec.lens.project, port.leave
+    image_of, leave, scatterings = spec.lens.project, port.leave, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross_port(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:
@@ -59,7 +69,7 @@ def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
         passage = leave(camera.port, s.x, s.u)
         on_lens = passage.x
         inside = on_lens[0] * on_lens[0] + on_lens[1] * on_lens[1] <= camera.aperture_radius * camera.aperture_radius
-        if s.collisions > 0 and inside and passage.water > 0.0 and passage.transmission > 0.0:
+        if scatterings(s) > 0 and inside and passage.water > 0.0 and passage.transmission > 0.0:
             pixel = image_of(camera, s.view, s.target, on_lens - passage.u, on_lens)
             if pixel >= 0 and passage.water <= wp.min(s.flight.distance, limits.max_path - s.path):
                 found.value = s.weight.value * passage.transmission

@@ -99,12 +99,14 @@ class ScoredPoint:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
+    reflecting = spec.reflecting
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
         q = Request()
-        if wp.static(not flights) or s.hit.face >= 0:
-            if shows(camera, view_of(camera, s.view), s.x):
+        # Mirrored, any point may be seen.
+        if wp.static(not flights or reflecting) or s.hit.face >= 0:
+            if wp.static(reflecting) or shows(camera, view_of(camera, s.view), s.x):
                 q.wanted = True
                 q.x = s.x
                 q.u = s.u
@@ -208,7 +210,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    confocal = spec.confocal
+    confocal, reflecting = spec.confocal, spec.reflecting
     water_extinction = (LAYERED if spec.layered else HOMOGENEOUS).extinction
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
@@ -231,6 +233,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         path = float(request.path)
         found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
         if wp.static(flights):
+            if wp.static(reflecting):
+                if request.interval[0] >= request.interval[1] and request.slot < 0:
+                    return found  # an event in the water, for its reflections alone
             if request.interval[0] < request.interval[1]:
                 found.lens = request.lens
                 point = flight_point(request, medium, layers, camera)

@@ -1,5 +1,6 @@
 """The water: one, or plane layers of several; its box and the limits that end a history."""
 
+from .boundary import Boundary, fresnel_reflectance, make_boundary, reflection_images
 from .layers import (
     HOMOGENEOUS,
     LAYERED,
@@ -18,15 +19,19 @@ __all__ = [
     "EXIT_FACES",
     "HOMOGENEOUS",
     "LAYERED",
+    "Boundary",
     "Layers",
     "Limits",
     "Medium",
     "Water",
     "exit_distance",
     "free_path",
+    "fresnel_reflectance",
     "layer_index",
     "layered_extinction",
     "layered_free_path",
     "layered_water",
+    "make_boundary",
     "make_layers",
+    "reflection_images",
 ]

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .boundary import Boundary
+
 # Where a history may leave, in the order of `exit_face`.
 EXIT_FACES = (
     "lateral_limit",
@@ -19,7 +21,7 @@ class Limits:
     """Limits of a history; 1e30 stands for none.
 
     Attributes:
-        lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face.
+        lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face, or is reflected.
         rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read by `..._rotated` alone, the
             others take lower and upper as they stand in the frame of the flight.
         lateral: A history ends where |x| or |y| reaches this [m].
@@ -27,6 +29,7 @@ class Limits:
         weight_cutoff: A history ends after an event that leaves its analog weight below this.
         max_collisions: A history has at most this many events, surfaces included. Every estimator scores the light of
             the last event, also of one below the cut-off.
+        boundary: Of a reflecting spec: what the faces reflect.
     """
 
     lower: wp.vec3
@@ -37,6 +40,7 @@ class Limits:
     max_path: float
     weight_cutoff: float
     max_collisions: int
+    boundary: Boundary
 
 
 @wp.func
@@ -99,6 +103,18 @@ def is_outside(limits: Limits, x: wp.vec3) -> bool:
 def is_outside_rotated(limits: Limits, x: wp.vec3) -> bool:
     """As `is_outside`, for a domain with axes of its own."""
     return _outside_sides(limits, x) or _outside_faces(limits, limits.rotation * x + limits.origin)
+
+
+@wp.func
+def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance [m] from x along u to a face of the domain; both in its own axes."""
+    return _to_faces(limits, x, u)
+
+
+@wp.func
+def next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """Index into EXIT_FACES of the face of `to_next_face`; 0: there is none."""
+    return _first_face(limits, 9.0e29, x, u)
 
 
 @wp.func

@@ -30,6 +30,7 @@ class TransportSpec(NamedTuple):
         measured_beam: Emit from the laser's measured profile.
         confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
         rotated_domain: The domain has axes of its own.
+        reflecting: Faces of the domain reflect, as `Limits.boundary` says; needs `bounded`.
         public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
@@ -53,6 +54,7 @@ class TransportSpec(NamedTuple):
     measured_beam: bool = False
     confocal: bool = False
     rotated_domain: bool = False
+    reflecting: bool = False
     public_tree: bool = False
     stepped: bool = False
     port: PortKind | None = None

@@ -110,6 +110,8 @@ class PhotonState:
         path: Geometric path [m].
         collisions, surface_count: Events so far, and those at surfaces.
         reason: Ledger entry of the history's end; -1 after an event that is not the last.
+        mirror, reflections, leg: Face of the domain that the photon has come to, else 0; reflections so far, which
+            `collisions` counts too, and those since the last other event.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.
@@ -121,7 +123,7 @@ class PhotonState:
         pending: The contribution that waits for the shadow ray.
         pending_add: On the CPU the voxel and value that are still to be added, see `add_pending`.
         absorbed_surface, directed: Sums for the ledger, in its units.
-        water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
+        water_collisions, surface_events, surface_queries, shadow_queries, contributions, reflected, dropped: Counters.
     """
 
     stage: int
@@ -137,6 +139,9 @@ class PhotonState:
     collisions: int
     surface_count: int
     reason: int
+    mirror: int
+    reflections: int
+    leg: int
     target: int
     view: wp.vec4
     # Its next event:
@@ -157,6 +162,8 @@ class PhotonState:
     surface_queries: int
     shadow_queries: int
     contributions: int
+    reflected: int
+    dropped: int
 
 
 @wp.func

@@ -40,10 +40,11 @@ COUNTERS = (
     "below_unit_forward_scattered",
     "below_unit_backscatter",
 )
-# What a laser's port reflects; after all others, and reported where there is one.
+# After all others: what a laser's port reflects, reported where there is one, and counters of faces that reflect.
 PORT_ENTRY = "laser_port"
-LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS) + 1
-LASER_PORT = wp.constant(LEDGER_WIDTH - 1)
+BOUNDARY_COUNTERS = ("reflections", "beyond_max_reflections")
+LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS) + 1 + len(BOUNDARY_COUNTERS)
+LASER_PORT, REFLECTIONS, BEYOND_MAX_REFLECTIONS = (wp.constant(LEDGER_WIDTH - 3 + i) for i in range(3))
 
 ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT, ROULETTE, DIRECTED = (
     wp.constant(LEDGER_ENTRIES.index(name))

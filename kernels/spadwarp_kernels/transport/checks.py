@@ -79,6 +79,8 @@ def check_spec(spec: Any) -> None:
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
     if spec.confocal and spec.lens.name == PLAIN.name:
         raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
+    if spec.reflecting and not spec.bounded:
+        raise ArgumentError("spec.reflecting = True needs spec.bounded = True")
 
 
 def check_model(model: Any) -> None:
@@ -159,6 +161,13 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
         for low, high in zip(limits.lower, limits.upper, strict=True):
             check_number("model.limits.lower", low)
             check_number("model.limits.upper", high, f"({float(low)}, inf)")
+    if spec.reflecting:
+        boundary = limits.boundary
+        for name, indices in (("low", boundary.low), ("high", boundary.high)):
+            for axis in range(3):
+                check_number(f"model.limits.boundary.{name}[{axis}]", indices[axis], "[0, 1e9]")
+        check_integer("model.limits.boundary.max_reflections", boundary.max_reflections, 0)
+        check_array("model.limits.boundary.images", boundary.images, wp.vec3i, (None,), model.device)
     if spec.rotated_domain:
         check_vector("model.limits.origin", limits.origin)
         rows = [[limits.rotation[i, j] for j in range(3)] for i in range(3)]

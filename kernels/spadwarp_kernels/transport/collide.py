@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.medium.boundary import face_index
 from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
 from spadwarp_kernels.medium.limits import (
     Limits,
@@ -30,18 +31,21 @@ class Collision:
         distance: Length of the flight [m].
         albedo: Of the water there.
         reason: Ledger entry of the limit that ended the history, or of its last event; else -1.
+        mirror: Face of the domain that reflects the photon there; else 0.
     """
 
     x: wp.vec3
     distance: float
     albedo: float
     reason: int
+    mirror: int
 
 
 @functools.cache
 def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
-    has_mesh, bounded = spec.mesh, spec.bounded
+    has_mesh, reflecting = spec.mesh, spec.reflecting
+    bounded = spec.bounded and not reflecting
     local_albedo = spec.layered and not spec.random_albedo
     water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
     to_exit, face_of_exit, outside = (
@@ -64,15 +68,29 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
             if outside(limits, s.x + c.distance * s.u):
                 c.reason = EXIT + face_of_exit(limits, s.x, s.u)
                 c.distance = wp.min(c.distance, to_exit(limits, s.x, s.u))
+        if wp.static(reflecting):
+            # By distance: a photon that has been reflected may be outside by a rounding error.
+            exit = to_exit(limits, s.x, s.u)
+            if exit < c.distance:
+                c.distance = exit
+                c.reason = -1
+                face = face_of_exit(limits, s.x, s.u)
+                if face_index(limits.boundary, face) > 0.0:
+                    c.mirror = face
+                else:
+                    c.reason = EXIT + face
         c.x = s.x + c.distance * s.u
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
+                if wp.static(reflecting):
+                    # The light of the last event ends at the next, or with the longest leg that may be scored.
+                    c.mirror = wp.where(s.leg < limits.boundary.max_reflections, c.mirror, 0)
         if c.reason < 0:
             if wp.static(local_albedo):
                 c.albedo = water_at(medium, layers, c.x).albedo
             if wp.static(has_mesh):
-                if s.hit.face >= 0:
+                if s.hit.face >= 0 and c.mirror == 0:
                     c.x = offset_from_surface(c.x, s.hit.normal, c.distance)
         return c
 

@@ -10,8 +10,10 @@ from spadwarp_kernels.photon.state import PhotonState, Weight
 from spadwarp_kernels.tally.ledger import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,
+    BEYOND_MAX_REFLECTIONS,
     CONTRIBUTIONS,
     DIRECTED,
+    REFLECTIONS,
     SHADOW_QUERIES,
     SURFACE_EVENTS,
     SURFACE_QUERIES,
@@ -47,7 +49,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
 
 
 @functools.cache
-def make_flush(adds: bool) -> wp.Function:
+def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     """The Warp function ``(s, tally, ledger, thread)``: adds what a thread has summed up to the ledger, and with `adds`
     to the tally what `add_pending` has left."""
 
@@ -63,5 +65,8 @@ def make_flush(adds: bool) -> wp.Function:
         add_to_ledger(ledger, thread, SURFACE_QUERIES, wp.int64(s.surface_queries))
         add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(s.shadow_queries))
         add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(s.contributions))
+        if wp.static(reflecting):
+            add_to_ledger(ledger, thread, REFLECTIONS, wp.int64(s.reflected))
+            add_to_ledger(ledger, thread, BEYOND_MAX_REFLECTIONS, wp.int64(s.dropped))
 
     return flush

@@ -15,6 +15,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.estimators.contribution import Asked
+from spadwarp_kernels.estimators.mirrored import make_score_image
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box
@@ -92,6 +93,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = cross is not None, request_flight is not None, score is not None
     has_mesh, random_albedo, confocal = spec.mesh, spec.random_albedo, spec.confocal
+    reflecting = spec.reflecting
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
@@ -104,8 +106,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues)
+    score_image = make_score_image(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
-    finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores))
+    finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
 
     @wp.kernel(
         module="unique",
@@ -183,6 +186,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if round == 1 and arrives(s):
                         if wp.static(crosses):
                             crossing = cross(s, camera, gate, limits)
+                            if wp.static(reflecting):
+                                if crossing.value > 0.0 and s.leg > limits.boundary.max_reflections:
+                                    crossing.value = 0.0
+                                    s.dropped += 1
                             if not crossing.value <= 0.0:
                                 s.contributions += 1
                                 s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, crossing)
@@ -191,11 +198,20 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.path += end.distance
                         s.reason = end.reason
                         s.stage = END
+                        if wp.static(reflecting):
+                            s.mirror = end.mirror
+                            s.leg += 1
+                            if end.mirror > 0:
+                                s.stage = SCATTER
+                                s.collisions += 1
+                                s.reflections += 1
+                                s.hit.face = -1
                         # A branch, since after a select a core waits for the flight before it draws the next words.
-                        if s.reason < 0:
+                        if s.reason < 0 and s.mirror == 0:
                             s.stage = SCATTER
                             s.collisions += 1
                             s.albedo = end.albedo
+                            s.leg = 0
                             if wp.static(scores):
                                 asked.request = request_event(s, camera)
                                 push(asked.request)
@@ -226,6 +242,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.origin = found.origin
                                     s.flight.lens = found.lens
                                     s.pending = found.contribution
+                            if wp.static(reflecting):
+                                for k in range(limits.boundary.images.shape[0]):
+                                    mirrored = score_image(
+                                        asked.request, k, medium, layers, camera, gate, limits, surfaces, scan
+                                    )
+                                    s.shadow_queries += mirrored.shadow_queries
+                                    c = mirrored.contribution
+                                    if asked.request.wanted and not c.value <= 0.0:
+                                        s.contributions += 1
+                                        s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, c)
 
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
@@ -244,7 +270,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 if count_lanes(s.stage >= START) >= START_LANES:
                     if s.stage == END and s.ray == NO_RAY:
                         s.weight = finish(s, out, ledger, thread)
-                        s.water_collisions += s.collisions - s.surface_count
+                        s.water_collisions += s.collisions - s.surface_count - s.reflections
+                        s.reflected += s.reflections
                         s.surface_events += s.surface_count
                         s.stage = START
                     wanting = s.stage == START
@@ -278,6 +305,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.path = start.path
                             s.collisions = 0
                             s.surface_count = 0
+                            s.reflections = 0
+                            s.leg = 0
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)

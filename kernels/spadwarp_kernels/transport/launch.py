@@ -19,6 +19,7 @@ from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.ledger import (
+    BOUNDARY_COUNTERS,
     COUNTERS,
     LEDGER_ENTRIES,
     LEDGER_SLOTS,
@@ -82,6 +83,7 @@ class Data:
         cursor: int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
             stream.
         offset: uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on.
+        reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
     """
 
     tally: wp.array
@@ -89,6 +91,7 @@ class Data:
     records: Records
     cursor: wp.array
     offset: wp.array | None = None
+    reflecting: bool = False
 
 
 def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
@@ -109,6 +112,7 @@ def make_data(model: Model, *, tally: wp.array | None = None, record_count: int 
         records=make_records(record_count, device=model.device),
         cursor=wp.zeros(1, dtype=int, device=model.device),
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
+        reflecting=any((*model.limits.boundary.low, *model.limits.boundary.high)),
     )
 
 
@@ -176,7 +180,8 @@ def launch_transport(
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device.
 
-    Entries are LEDGER_ENTRIES and, behind a laser's port, what that reflects: `laser_port`.
+    Entries are LEDGER_ENTRIES and, behind a laser's port, what that reflects: `laser_port`. Counters are COUNTERS and,
+    where faces of the domain reflect, BOUNDARY_COUNTERS.
     """
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
@@ -185,11 +190,14 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     high, low = (slots >> 32).sum(axis=1).tolist(), (slots & 0xFFFFFFFF).sum(axis=1).tolist()
     values = {
         name: (upper << 32) + lower
-        for name, upper, lower in zip(LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,), high, low, strict=True)
+        for name, upper, lower in zip(
+            LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,) + BOUNDARY_COUNTERS, high, low, strict=True
+        )
     }
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
     entries = {n: values[n] for n in LEDGER_ENTRIES}
     if values[PORT_ENTRY]:
         entries[PORT_ENTRY] = values[PORT_ENTRY]
-    return entries, {n: values[n] for n in COUNTERS}
+    counters = COUNTERS + BOUNDARY_COUNTERS if data.reflecting else COUNTERS
+    return entries, {n: values[n] for n in counters}

@@ -6,6 +6,7 @@ import warp as wp
 
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
+from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
 from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -18,7 +19,7 @@ from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
 from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
-from spadwarp_kernels.tally.ledger import DIRECTED, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
+from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
 
 
 @wp.struct
@@ -50,14 +51,44 @@ class Scattering:
     reason: int
 
 
+@wp.struct
+class Mirrored:
+    """What a face of the domain reflects: the part of the weight, and into which unit direction."""
+
+    part: float
+    u: wp.vec3
+
+
 @functools.cache
-def make_survive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
-    has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+def make_reflected(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, limits) -> Mirrored``, for a photon that has come to such a face."""
+    rotated = spec.rotated_domain
 
     @wp.func
-    def survive(s: PhotonState, surfaces: Surfaces) -> Survival:
+    def reflected(s: PhotonState, limits: Limits) -> Mirrored:
+        axis = (s.mirror - 1) // 2
+        u = s.u
+        if wp.static(rotated):
+            u = limits.rotation * u
+        mirrored = Mirrored()
+        mirrored.part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), face_index(limits.boundary, s.mirror))
+        mirrored.u = flipped(u, axis)
+        if wp.static(rotated):
+            mirrored.u = wp.normalize(wp.transpose(limits.rotation) * mirrored.u)
+        return mirrored
+
+    return reflected
+
+
+@functools.cache
+def make_survive(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, surfaces, limits) -> Survival``: albedo of the water, or reflectance of the face."""
+    has_mesh, specular, reflecting = spec.mesh, spec.specular, spec.reflecting
+    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflected = make_reflected(spec)
+
+    @wp.func
+    def survive(s: PhotonState, surfaces: Surfaces, limits: Limits) -> Survival:
         survival = Survival()
         survival.part = s.albedo
         if wp.static(has_mesh):
@@ -66,6 +97,9 @@ def make_survive(spec: TransportSpec) -> wp.Function:
                 if wp.static(specular):
                     survival.part += surfaces.specular[s.hit.face]
                     survival.lobe = surfaces.specular[s.hit.face] / wp.max(survival.part, 1.0e-30)
+        if wp.static(reflecting):
+            if s.mirror > 0:
+                survival.part = reflected(s, limits).part
         return survival
 
     return survive
@@ -136,7 +170,9 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     `flies_on`: see `make_flies`.
     """
     has_mesh, specular, roulette, directed = spec.mesh, spec.specular, spec.roulette, direct is not None
+    reflecting = spec.reflecting
     survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
+    reflected_at = make_reflected(spec)
 
     @wp.func
     def scatter(
@@ -158,15 +194,30 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         new.surface_count = s.surface_count
         new.reason = -1
         on_surface = False
-        survival = survive(s, surfaces)
+        survival = survive(s, surfaces, limits)
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
+        if wp.static(reflecting):
+            if s.mirror > 0 and s.reason >= 0:
+                # The light of an event that was the last.
+                new.reason = s.reason
+                new.weight = reweigh(s.weight, survival.part)
+                add_to_ledger(ledger, thread, s.reason, new.weight.taken)
+                new.u = reflected_at(s, limits).u
+                return new
         if on_surface:
             new.weight = reweigh(s.weight, survival.part)
             new.absorbed_surface = new.weight.taken
             new.surface_count += 1
         else:
-            new.weight.value *= survival.part
+            leaves = False
+            if wp.static(reflecting):
+                leaves = s.mirror > 0
+                if leaves:
+                    new.weight = reweigh(s.weight, survival.part)
+                    add_to_ledger(ledger, thread, EXIT + s.mirror, new.weight.taken)
+            if not leaves:
+                new.weight.value *= survival.part
         new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
         if new.analog_weight < limits.weight_cutoff or new.analog_weight <= 0.0:
             new.reason = WEIGHT_CUTOFF
@@ -182,6 +233,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             new.reason = MAX_COLLISIONS
         if not flies(new.reason):
             return new
+        if wp.static(reflecting):
+            if s.mirror > 0:
+                new.u = reflected_at(s, limits).u
+                return new
         reflected = s.u
         if wp.static(specular):
             if on_surface:

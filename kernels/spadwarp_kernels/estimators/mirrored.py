@@ -1,0 +1,173 @@
+"""Next events by way of the faces of the domain: the light of an event that reaches the lens after reflections."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.intersect.box import segment_meets_box
+from spadwarp_kernels.medium.boundary import (
+    flipped,
+    image_direction,
+    image_point,
+    image_reflectance,
+    reflections_of,
+)
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.limits import Limits, next_face, to_next_face
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.random.philox import u01, u01_high, u01_low
+from spadwarp_kernels.sensor.camera import Camera, lens_point
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, tally_index
+
+from .contribution import Request, Scored, make_scattering
+from .link import make_link
+
+
+@wp.struct
+class Way:
+    """What is on the way of an image: the optical depth, whether nothing is in between, and rays traced for that."""
+
+    depth: float
+    clear: bool
+    shadow_queries: int
+
+
+@wp.func
+def _to_domain(limits: Limits, v: wp.vec3) -> wp.vec3:
+    return limits.rotation * v
+
+
+@wp.func
+def _from_domain(limits: Limits, v: wp.vec3) -> wp.vec3:
+    return wp.transpose(limits.rotation) * v
+
+
+@wp.func
+def _same(limits: Limits, v: wp.vec3) -> wp.vec3:
+    return v
+
+
+@wp.func
+def _origin(limits: Limits) -> wp.vec3:
+    return limits.origin
+
+
+@wp.func
+def _no_origin(limits: Limits) -> wp.vec3:
+    return wp.vec3(0.0)
+
+
+@functools.cache
+def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
+    """The Warp function ``(x, v, length, reflections, medium, layers, limits, surfaces) -> Way`` of the light that
+    leaves x along v, in the domain's axes, and is reflected so many times within that length."""
+    has_mesh, brute_force = spec.mesh, brute_force
+    water_extinction = (LAYERED if spec.layered else HOMOGENEOUS).extinction
+    turn_back, origin = (_from_domain, _origin) if spec.rotated_domain else (_same, _no_origin)
+
+    @wp.func
+    def way_of(
+        x: wp.vec3,
+        v: wp.vec3,
+        length: float,
+        reflections: int,
+        medium: Medium,
+        layers: Layers,
+        limits: Limits,
+        surfaces: Surfaces,
+    ) -> Way:
+        way = Way()
+        way.clear = True
+        begin = wp.vec3(x)
+        along = wp.vec3(v)
+        rest = float(length)
+        for k in range(reflections + 1):
+            part = float(rest)
+            face = int(0)
+            if k < reflections:
+                part = wp.min(rest, to_next_face(limits, begin, along))
+                face = next_face(limits, begin, along)
+            start = turn_back(limits, begin - origin(limits))
+            heading = turn_back(limits, along)
+            way.depth += part * water_extinction(medium, layers, start, heading, part)
+            if wp.static(has_mesh):
+                if way.clear and segment_meets_box(start, heading, part, surfaces.lower, surfaces.upper):
+                    way.shadow_queries += 1
+                    if wp.static(brute_force):
+                        way.clear = intersect_faces(surfaces, start, heading, part).face < 0
+                    else:
+                        way.clear = intersect_surfaces(surfaces, start, heading, part, True).face < 0
+            begin += part * along
+            rest -= part
+            if face > 0:
+                along = flipped(along, (face - 1) // 2)
+        return way
+
+    return way_of
+
+
+@functools.cache
+def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
+    """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan) -> Scored`` of an
+    event by way of one of `Boundary.images`; what stands in between has been looked for.
+
+    `flights`: whether requests may ask for a point of a flight, which is not scored by way of reflections: events are.
+    """
+    confocal, needs_way = spec.confocal, spec.mesh or spec.layered
+    image_of = spec.lens.project
+    scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
+    link_to, value_of = make_link(spec)
+    turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)
+
+    @wp.func
+    def score_image(
+        request: Request,
+        number: int,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        gate: Gate,
+        limits: Limits,
+        surfaces: Surfaces,
+        scan: Scan,
+    ) -> Scored:
+        found = Scored()
+        if wp.static(flights):
+            if request.interval[0] < request.interval[1]:
+                return found
+        image = limits.boundary.images[number]
+        x = turn(limits, request.x) + origin(limits)
+        seen = turn_back(limits, image_point(limits.lower, limits.upper, image, x) - origin(limits))
+        lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
+        view = camera.view
+        if wp.static(confocal):
+            view = scan.view[request.target]
+        # The lens, or a port, sees the image as it would see a point in water without an end.
+        link = link_to(camera, seen, lens)
+        pixel = image_of(camera, view, request.target, link.image, lens)
+        if pixel < 0:
+            return found
+        along = turn(limits, link.to_lens)
+        heading = image_direction(image, along)
+        scattering = scattering_density(request, request.x, turn_back(limits, heading), medium, layers, surfaces)
+        scattering *= image_reflectance(limits.boundary, image, along)
+        extinction = float(medium.extinction)
+        if wp.static(needs_way):
+            if not scattering <= 0.0:
+                way = way_of(x, heading, link.water, reflections_of(image), medium, layers, limits, surfaces)
+                found.shadow_queries = way.shadow_queries
+                extinction = way.depth / link.water
+                scattering = wp.where(way.clear, scattering, 0.0)
+        if not scattering <= 0.0:
+            component = wp.where(request.component == BALLISTIC, FORWARD_SCATTERED, request.component)
+            found.contribution.rounding_sample = u01(request.rounding_sample)
+            found.contribution.value = value_of(camera, extinction, request.weight, scattering, link)
+            found.contribution.index = tally_index(camera, gate, pixel, request.path + link.path, component)
+        return found
+
+    return score_image
