@@ -79,8 +79,8 @@ class Scene(BaseModel):
     def _faces_within_reach(self) -> Self:
         if self.domain.reflecting and math.isfinite(self.transport.lateral_limit):
             raise ValueError(
-                f"transport.lateral_limit = {self.transport.lateral_limit} does not go with domain.outside_index: faces "
-                "reflect light from beyond it"
+                f"transport.lateral_limit = {self.transport.lateral_limit} does not go with domain.outside_index: the "
+                "faces reflect light from beyond it"
             )
         return self
 
