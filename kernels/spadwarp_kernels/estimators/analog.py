@@ -9,7 +9,7 @@ from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.random.philox import u01
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, TOO_LONG, Contribution, tally_index
 
 from .estimator import Estimator
 
@@ -18,6 +18,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     if spec.port is not None:
         return Estimator(cross=_make_cross_port(spec, spec.port))
+    reflecting = spec.reflecting
     image_of, scatterings = spec.lens.project, _make_scatterings(spec.reflecting)
 
     @wp.func
@@ -35,6 +36,8 @@ def make_analog(spec: TransportSpec) -> Estimator:
                 found.value = s.weight.value
                 found.index = tally_index(camera, gate, pixel, s.path + crossing, _component(s))
                 found.rounding_sample = u01(s.flight.block[2])
+        if wp.static(reflecting):
+            found = _drop_long_leg(found, s, limits)
         return found
 
     return Estimator(cross=cross)
@@ -45,9 +48,21 @@ def _make_scatterings(reflecting: bool) -> wp.Function:
 
     @wp.func
     def scatterings(s: PhotonState) -> int:
-        return s.collisions - (s.reflections if wp.static(reflecting) else 0)
+        count = s.collisions
+        if wp.static(reflecting):
+            count -= s.bounces.count
+        return count
 
     return scatterings
+
+
+@wp.func
+def _drop_long_leg(found: Contribution, s: PhotonState, limits: Limits) -> Contribution:
+    """Nothing, marked to be counted, by more reflections than next events take."""
+    if found.value > 0.0 and s.bounces.leg > limits.boundary.max_reflections:
+        found.value = 0.0
+        found.index = TOO_LONG
+    return found
 
 
 @wp.func
@@ -60,6 +75,7 @@ def _component(s: PhotonState) -> int:
 
 def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
     """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
+    reflecting = spec.reflecting
     image_of, leave, scatterings = spec.lens.project, port.leave, _make_scatterings(spec.reflecting)
 
     @wp.func
@@ -75,6 +91,8 @@ def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
                 found.value = s.weight.value * passage.transmission
                 found.index = tally_index(camera, gate, pixel, s.path + passage.water + passage.path, _component(s))
                 found.rounding_sample = u01(s.flight.block[2])
+        if wp.static(reflecting):
+            found = _drop_long_leg(found, s, limits)
         return found
 
     return cross_port

@@ -108,6 +108,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
         if wp.static(not flights or reflecting) or s.hit.face >= 0:
             if wp.static(reflecting) or shows(camera, view_of(camera, s.view), s.x):
                 q.wanted = True
+                if wp.static(reflecting):
+                    q.wanted = s.bounces.face == 0
                 q.x = s.x
                 q.u = s.u
                 q.weight = s.weight.value

@@ -22,7 +22,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, tally_index
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, deposit, tally_index
 
 from .contribution import Request, Scored, make_scattering
 from .link import make_link
@@ -171,3 +171,48 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         return found
 
     return score_image
+
+
+@wp.struct
+class MirroredScores:
+    """What the images of an event have added: see `add_pending`, and counters of `PhotonState`."""
+
+    pending_add: wp.vec2l
+    contributions: int
+    shadow_queries: int
+
+
+@functools.cache
+def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
+    """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, tally, ledger, pending_add,
+    thread, scale) -> MirroredScores`` that scores an event by way of all images; arguments as of `make_score_image`."""
+    score_image = make_score_image(spec, flights, brute_force)
+
+    @wp.func
+    def score_images(
+        request: Request,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        gate: Gate,
+        limits: Limits,
+        surfaces: Surfaces,
+        scan: Scan,
+        tally: wp.array(dtype=wp.int64),
+        ledger: wp.array(dtype=wp.int64),
+        pending_add: wp.vec2l,
+        thread: int,
+        scale: float,
+    ) -> MirroredScores:
+        scores = MirroredScores()
+        scores.pending_add = pending_add
+        if request.wanted:
+            for number in range(limits.boundary.images.shape[0]):
+                found = score_image(request, number, medium, layers, camera, gate, limits, surfaces, scan)
+                scores.shadow_queries += found.shadow_queries
+                if not found.contribution.value <= 0.0:  # NaN is counted as such
+                    scores.contributions += 1
+                    scores.pending_add = deposit(tally, ledger, scores.pending_add, thread, scale, found.contribution)
+        return scores
+
+    return score_images

@@ -94,6 +94,43 @@ def shorten(flight: Flight, distance: float) -> Flight:
 
 
 @wp.struct
+class Bounces:
+    """Reflections of a photon by faces of the domain, and the account of the thread.
+
+    Attributes:
+        face: That the photon has come to, see EXIT_FACES; 0 at any other event.
+        count: Reflections of the photon.
+        leg: Those since the last other event.
+        total: Reflections of all photons that have ended.
+        dropped: Photons that came to the lens by too long a leg.
+    """
+
+    face: int
+    count: int
+    leg: int
+    total: int
+    dropped: int
+
+
+@wp.func
+def next_bounce(b: Bounces, face: int) -> Bounces:
+    """After the photon has come to a face, or to another event (0)."""
+    b.face = face
+    b.leg = wp.where(face > 0, b.leg + 1, 0)
+    b.count += wp.where(face > 0, 1, 0)
+    return b
+
+
+@wp.func
+def sum_bounces(b: Bounces) -> Bounces:
+    """After the photon has ended, for the next."""
+    b.total += b.count
+    b.count = 0
+    b.leg = 0
+    return b
+
+
+@wp.struct
 class PhotonState:
     """State of a thread between the stages.
 
@@ -110,8 +147,7 @@ class PhotonState:
         path: Geometric path [m].
         collisions, surface_count: Events so far, and those at surfaces.
         reason: Ledger entry of the history's end; -1 after an event that is not the last.
-        mirror, reflections, leg: Face of the domain that the photon has come to, else 0; reflections so far, which
-            `collisions` counts too, and those since the last other event.
+        bounces: Reflections by faces of the domain, which `collisions` counts too.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.
@@ -123,7 +159,7 @@ class PhotonState:
         pending: The contribution that waits for the shadow ray.
         pending_add: On the CPU the voxel and value that are still to be added, see `add_pending`.
         absorbed_surface, directed: Sums for the ledger, in its units.
-        water_collisions, surface_events, surface_queries, shadow_queries, contributions, reflected, dropped: Counters.
+        water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
     """
 
     stage: int
@@ -139,9 +175,7 @@ class PhotonState:
     collisions: int
     surface_count: int
     reason: int
-    mirror: int
-    reflections: int
-    leg: int
+    bounces: Bounces
     target: int
     view: wp.vec4
     # Its next event:
@@ -162,8 +196,6 @@ class PhotonState:
     surface_queries: int
     shadow_queries: int
     contributions: int
-    reflected: int
-    dropped: int
 
 
 @wp.func

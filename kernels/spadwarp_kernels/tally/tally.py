@@ -28,6 +28,9 @@ class Contribution:
     rounding_sample: float
 
 
+# Index of light that has come to the lens by more reflections than count.
+TOO_LONG = wp.constant(-4)
+
 # Largest single contribution, in tally units, 2^58: what is above it is clipped and counted.
 _DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
 

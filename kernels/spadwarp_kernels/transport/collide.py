@@ -85,7 +85,7 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
                 c.reason = s.reason
                 if wp.static(reflecting):
                     # The light of the last event ends at the next, or with the longest leg that may be scored.
-                    c.mirror = wp.where(s.leg < limits.boundary.max_reflections, c.mirror, 0)
+                    c.mirror = wp.where(s.bounces.leg < limits.boundary.max_reflections, c.mirror, 0)
         if c.reason < 0:
             if wp.static(local_albedo):
                 c.albedo = water_at(medium, layers, c.x).albedo

@@ -66,7 +66,7 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
         add_to_ledger(ledger, thread, SHADOW_QUERIES, wp.int64(s.shadow_queries))
         add_to_ledger(ledger, thread, CONTRIBUTIONS, wp.int64(s.contributions))
         if wp.static(reflecting):
-            add_to_ledger(ledger, thread, REFLECTIONS, wp.int64(s.reflected))
-            add_to_ledger(ledger, thread, BEYOND_MAX_REFLECTIONS, wp.int64(s.dropped))
+            add_to_ledger(ledger, thread, REFLECTIONS, wp.int64(s.bounces.total))
+            add_to_ledger(ledger, thread, BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
 
     return flush

@@ -15,7 +15,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.estimators.contribution import Asked
-from spadwarp_kernels.estimators.mirrored import make_score_image
+from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box
@@ -47,7 +47,9 @@ from spadwarp_kernels.photon.state import (
     SURFACE_RAY,
     first_state,
     is_planned,
+    next_bounce,
     shorten,
+    sum_bounces,
 )
 from spadwarp_kernels.random.philox import RoundKeys
 from spadwarp_kernels.sensor.camera import Camera
@@ -57,7 +59,7 @@ from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
-from spadwarp_kernels.tally.tally import deposit
+from spadwarp_kernels.tally.tally import TOO_LONG, deposit
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
@@ -106,7 +108,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues)
-    score_image = make_score_image(spec, flights, brute_force)
+    score_images = make_score_images(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
 
@@ -187,9 +189,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(crosses):
                             crossing = cross(s, camera, gate, limits)
                             if wp.static(reflecting):
-                                if crossing.value > 0.0 and s.leg > limits.boundary.max_reflections:
-                                    crossing.value = 0.0
-                                    s.dropped += 1
+                                s.bounces.dropped += wp.where(crossing.index == TOO_LONG, 1, 0)
                             if not crossing.value <= 0.0:
                                 s.contributions += 1
                                 s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, crossing)
@@ -199,19 +199,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.reason = end.reason
                         s.stage = END
                         if wp.static(reflecting):
-                            s.mirror = end.mirror
-                            s.leg += 1
-                            if end.mirror > 0:
-                                s.stage = SCATTER
-                                s.collisions += 1
-                                s.reflections += 1
-                                s.hit.face = -1
+                            s.bounces = next_bounce(s.bounces, end.mirror)
                         # A branch, since after a select a core waits for the flight before it draws the next words.
-                        if s.reason < 0 and s.mirror == 0:
+                        if s.reason < 0 or end.mirror > 0:
                             s.stage = SCATTER
                             s.collisions += 1
                             s.albedo = end.albedo
-                            s.leg = 0
                             if wp.static(scores):
                                 asked.request = request_event(s, camera)
                                 push(asked.request)
@@ -243,15 +236,24 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.flight.lens = found.lens
                                     s.pending = found.contribution
                             if wp.static(reflecting):
-                                for k in range(limits.boundary.images.shape[0]):
-                                    mirrored = score_image(
-                                        asked.request, k, medium, layers, camera, gate, limits, surfaces, scan
-                                    )
-                                    s.shadow_queries += mirrored.shadow_queries
-                                    c = mirrored.contribution
-                                    if asked.request.wanted and not c.value <= 0.0:
-                                        s.contributions += 1
-                                        s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, c)
+                                more = score_images(
+                                    asked.request,
+                                    medium,
+                                    layers,
+                                    camera,
+                                    gate,
+                                    limits,
+                                    surfaces,
+                                    scan,
+                                    tally,
+                                    ledger,
+                                    s.pending_add,
+                                    thread,
+                                    scale,
+                                )
+                                s.contributions += more.contributions
+                                s.shadow_queries += more.shadow_queries
+                                s.pending_add = more.pending_add
 
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
@@ -270,8 +272,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 if count_lanes(s.stage >= START) >= START_LANES:
                     if s.stage == END and s.ray == NO_RAY:
                         s.weight = finish(s, out, ledger, thread)
-                        s.water_collisions += s.collisions - s.surface_count - s.reflections
-                        s.reflected += s.reflections
+                        s.water_collisions += s.collisions - s.surface_count - s.bounces.count
+                        s.bounces = sum_bounces(s.bounces)
                         s.surface_events += s.surface_count
                         s.stage = START
                     wanting = s.stage == START
@@ -305,8 +307,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.path = start.path
                             s.collisions = 0
                             s.surface_count = 0
-                            s.reflections = 0
-                            s.leg = 0
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)

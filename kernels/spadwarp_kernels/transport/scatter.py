@@ -51,44 +51,14 @@ class Scattering:
     reason: int
 
 
-@wp.struct
-class Mirrored:
-    """What a face of the domain reflects: the part of the weight, and into which unit direction."""
-
-    part: float
-    u: wp.vec3
-
-
-@functools.cache
-def make_reflected(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, limits) -> Mirrored``, for a photon that has come to such a face."""
-    rotated = spec.rotated_domain
-
-    @wp.func
-    def reflected(s: PhotonState, limits: Limits) -> Mirrored:
-        axis = (s.mirror - 1) // 2
-        u = s.u
-        if wp.static(rotated):
-            u = limits.rotation * u
-        mirrored = Mirrored()
-        mirrored.part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), face_index(limits.boundary, s.mirror))
-        mirrored.u = flipped(u, axis)
-        if wp.static(rotated):
-            mirrored.u = wp.normalize(wp.transpose(limits.rotation) * mirrored.u)
-        return mirrored
-
-    return reflected
-
-
 @functools.cache
 def make_survive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, surfaces, limits) -> Survival``: albedo of the water, or reflectance of the face."""
-    has_mesh, specular, reflecting = spec.mesh, spec.specular, spec.reflecting
+    """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
+    has_mesh, specular = spec.mesh, spec.specular
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
-    reflected = make_reflected(spec)
 
     @wp.func
-    def survive(s: PhotonState, surfaces: Surfaces, limits: Limits) -> Survival:
+    def survive(s: PhotonState, surfaces: Surfaces) -> Survival:
         survival = Survival()
         survival.part = s.albedo
         if wp.static(has_mesh):
@@ -97,9 +67,6 @@ def make_survive(spec: TransportSpec) -> wp.Function:
                 if wp.static(specular):
                     survival.part += surfaces.specular[s.hit.face]
                     survival.lobe = surfaces.specular[s.hit.face] / wp.max(survival.part, 1.0e-30)
-        if wp.static(reflecting):
-            if s.mirror > 0:
-                survival.part = reflected(s, limits).part
         return survival
 
     return survive
@@ -163,16 +130,87 @@ def make_flies(flies_on: bool) -> wp.Function:
 
 
 @functools.cache
+def make_terminate(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(new, collisions, limits, keys, id, ledger, thread) -> Scattering``: the end of a history for
+    its analog weight or its events."""
+    roulette = spec.roulette
+
+    @wp.func
+    def terminate(
+        new: Scattering,
+        collisions: int,
+        limits: Limits,
+        keys: RoundKeys,
+        id: wp.uint64,
+        ledger: wp.array(dtype=wp.int64),
+        thread: int,
+    ) -> Scattering:
+        if new.analog_weight < limits.weight_cutoff or new.analog_weight <= 0.0:
+            new.reason = WEIGHT_CUTOFF
+            if wp.static(roulette):
+                chance = u01(random_block_keyed(keys, id, wp.uint32(collisions), STREAM_ROULETTE)[0])
+                new.reason = ROULETTE
+                if chance < 0.1 and new.analog_weight > 0.0:
+                    new.reason = -1
+                    new.weight = reweigh(new.weight, 10.0)
+                    new.analog_weight *= 10.0
+                    add_to_ledger(ledger, thread, ROULETTE, new.weight.taken)
+        if new.reason < 0 and collisions >= limits.max_collisions:
+            new.reason = MAX_COLLISIONS
+        return new
+
+    return terminate
+
+
+@functools.cache
+def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, limits, keys, id, ledger, thread) -> Scattering`` of a photon that a face of the domain
+    reflects; what is not reflected leaves by the face.
+
+    `directed`: weight and analog weight differ; `flies_on`: see `make_flies`.
+    """
+    rotated, terminate, flies = spec.rotated_domain, make_terminate(spec), make_flies(flies_on)
+
+    @wp.func
+    def bounce(
+        s: PhotonState, limits: Limits, keys: RoundKeys, id: wp.uint64, ledger: wp.array(dtype=wp.int64), thread: int
+    ) -> Scattering:
+        face = s.bounces.face
+        axis = (face - 1) // 2
+        u = s.u
+        if wp.static(rotated):
+            u = limits.rotation * u
+        part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), face_index(limits.boundary, face))
+        u = flipped(u, axis)
+        if wp.static(rotated):
+            u = wp.normalize(wp.transpose(limits.rotation) * u)
+        new = Scattering()
+        new.u = s.u
+        new.weight = reweigh(s.weight, part)
+        new.surface_count = s.surface_count
+        new.reason = s.reason
+        # The light of an event that was the last is accounted for by what has ended the history.
+        add_to_ledger(ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason), new.weight.taken)
+        if s.reason < 0:
+            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
+            new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
+        if flies(new.reason):
+            new.u = u
+        return new
+
+    return bounce
+
+
+@functools.cache
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread) ->
     Scattering``.
 
     `flies_on`: see `make_flies`.
     """
-    has_mesh, specular, roulette, directed = spec.mesh, spec.specular, spec.roulette, direct is not None
-    reflecting = spec.reflecting
+    has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
     survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
-    reflected_at = make_reflected(spec)
+    terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
 
     @wp.func
     def scatter(
@@ -188,55 +226,28 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         ledger: wp.array(dtype=wp.int64),
         thread: int,
     ) -> Scattering:
+        if wp.static(reflecting):
+            if s.bounces.face > 0:
+                return bounce(s, limits, keys, id, ledger, thread)
         new = Scattering()
         new.u = s.u
         new.weight = s.weight
         new.surface_count = s.surface_count
         new.reason = -1
         on_surface = False
-        survival = survive(s, surfaces, limits)
+        survival = survive(s, surfaces)
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
-        if wp.static(reflecting):
-            if s.mirror > 0 and s.reason >= 0:
-                # The light of an event that was the last.
-                new.reason = s.reason
-                new.weight = reweigh(s.weight, survival.part)
-                add_to_ledger(ledger, thread, s.reason, new.weight.taken)
-                new.u = reflected_at(s, limits).u
-                return new
         if on_surface:
             new.weight = reweigh(s.weight, survival.part)
             new.absorbed_surface = new.weight.taken
             new.surface_count += 1
         else:
-            leaves = False
-            if wp.static(reflecting):
-                leaves = s.mirror > 0
-                if leaves:
-                    new.weight = reweigh(s.weight, survival.part)
-                    add_to_ledger(ledger, thread, EXIT + s.mirror, new.weight.taken)
-            if not leaves:
-                new.weight.value *= survival.part
+            new.weight.value *= survival.part
         new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
-        if new.analog_weight < limits.weight_cutoff or new.analog_weight <= 0.0:
-            new.reason = WEIGHT_CUTOFF
-            if wp.static(roulette):
-                chance = u01(random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
-                new.reason = ROULETTE
-                if chance < 0.1 and new.analog_weight > 0.0:
-                    new.reason = -1
-                    new.weight = reweigh(new.weight, 10.0)
-                    new.analog_weight *= 10.0
-                    add_to_ledger(ledger, thread, ROULETTE, new.weight.taken)
-        if new.reason < 0 and s.collisions >= limits.max_collisions:
-            new.reason = MAX_COLLISIONS
+        new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
         if not flies(new.reason):
             return new
-        if wp.static(reflecting):
-            if s.mirror > 0:
-                new.u = reflected_at(s, limits).u
-                return new
         reflected = s.u
         if wp.static(specular):
             if on_surface:
