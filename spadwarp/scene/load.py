@@ -28,7 +28,7 @@ _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": 
 ENERGIES = ("pulse_energy", "average_power", "peak_power")
 
 # Tables within sections: (section, field) -> whose fields they have.
-_TABLES = {("camera", "port"): "port", ("laser", "port"): "port"}
+_TABLES = {("camera", "port"): "port", ("laser", "port"): "port", ("domain", "outside_index"): "outside_index"}
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 

@@ -118,3 +118,6 @@ def test_faces_that_reflect_survive_a_scene_file():
     again = type(one).from_toml(one.to_toml())
     assert again == one and hash(again) == hash(one)
     assert again.domain.reflecting == {"x_high": 1.52, "y_low": 1.0}
+    changed = one.with_overrides(["domain.outside_index.y_low=1.1", "domain.outside_index.z_high=1.0"])
+    assert changed.domain.reflecting == {"x_high": 1.52, "y_low": 1.1, "z_high": 1.0}
+    assert one.with_overrides({"domain.outside_index": None}).domain.reflecting == {}
