@@ -167,7 +167,7 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
     signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
     bound, shot = _bounds(both, device)
-    noise = float(np.median(noise_rate(scene, both.truth))) * (scene.gate.stop - scene.gate.start)
+    noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
         unscattered=median(both.component("ballistic").sum(axis=-1) * scale),

@@ -150,6 +150,17 @@ def test_wrong_arguments_are_named(options, words):
         proposal(**options)
 
 
+def test_daylight_is_noise(found):
+    """Counts of daylight in the gate, from a window of the image; the return stays as it is."""
+    scene = make(daylight={"sun_elevation_deg": 40.0, "depth": 40.0}, detector={"filter_fwhm_nm": 1.0})
+    lit = proposal(scene, photons=400_000)
+    window = lit.scene.gate.stop - lit.scene.gate.start
+    rate = np.median(spadwarp.scene.noise_rate(scene, spadwarp.truth_maps(scene, device="cpu")))
+    assert lit.pilot.noise == pytest.approx(rate * window, rel=0.1)
+    assert lit.pilot.target == pytest.approx(found.pilot.target, rel=1e-6)
+    assert lit.pilot.bound > found.pilot.bound
+
+
 def test_a_scene_without_a_target_says_what_it_needs():
     scene = Scene.from_dict({name: fields for name, fields in SCENE.items() if name != "targets"})
     with pytest.raises(spadwarp.ConfigError, match="no target is in view"):

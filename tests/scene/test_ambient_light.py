@@ -182,6 +182,18 @@ def test_detect_and_the_analytic_simulator_count_the_same():
     assert np.ndim(noise_rate(spadwarp.load_scene("staircase_5m"))) == 0
 
 
+def test_bound_and_noise_of_a_simulation_know_daylight():
+    scene = lit({"depth": 30.0}, detector__filter_fwhm_nm=1.0)
+    result = spadwarp.simulate(scene, photons=20_000, seed=1, device="cpu", uncertainty=True)
+    dark = replace(result, scene=scene.with_overrides({"daylight.cloud_factor": 0.0}))
+    bound, without = (spadwarp.crlb(one, device="cpu") for one in (result, dark))
+    informed = np.isfinite(without)
+    assert (bound[informed] > without[informed]).all()
+    # Shot noise of daylight hides that of the simulation.
+    noise = [spadwarp.frames.monte_carlo_noise(one, pulses=1000).ratio for one in (result, dark)]
+    assert noise[0] < noise[1]
+
+
 def test_ambient_of_the_caller():
     cube = np.zeros((2, 3, 8), np.float32)
     light = np.arange(6.0).reshape(2, 3) * 1e6
