@@ -65,7 +65,7 @@ class Frames:
 
     def __repr__(self) -> str:
         height, width, bins = self.counts.shape[-3:]
-        frames = f"{self.frames} frames" + (" added up" if self.summed else "")
+        frames = f"{self.frames} frame" + "s" * (self.frames != 1) + (" added up" if self.summed else "")
         return f"Frames({frames} of {self.pulses} pulses, seed {self.seed}, {width} x {height} pixels x {bins} bins)"
 
     def plot(self, frame: int = 0, **options: Any) -> Any:

@@ -6,6 +6,7 @@ from spadwarp.viz.depth import draw_denoised, draw_depth
 from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.learning_curves import draw_learning_curves
 from spadwarp.viz.notebook import html, plot
+from spadwarp.viz.progress import progress_bar
 from spadwarp.viz.result import draw_result
 from spadwarp.viz.targets import describe_targets, draw_mesh, draw_targets
 from spadwarp.viz.transient_video import video
@@ -22,4 +23,4 @@ __all__ += [
     "draw_targets",
     "draw_validation",
 ]
-__all__ += ["html", "plot", "video", "view"]
+__all__ += ["html", "plot", "progress_bar", "video", "view"]

@@ -83,6 +83,39 @@ def test_a_proposal_is_a_table():
     assert "gate.start_ns" in page and "forward scattering" in page and proposal.limit in page
 
 
+def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
+    spadwarp.simulate(SCENE, photons=20_000, device="cpu", progress=spadwarp.viz.progress_bar())
+    text = capsys.readouterr().err
+    assert "loading kernels" in text and "100 %, 20000 of 20000 photons" in text and text.endswith("\n")
+
+
+def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
+    display = pytest.importorskip("IPython.display")
+    from spadwarp.viz import progress
+
+    shown = []
+
+    class Handle:
+        def update(self, html):
+            shown.append(html.data)
+
+    def first(html, display_id):
+        assert display_id
+        shown.append(html.data)
+        return Handle()
+
+    monkeypatch.setattr(display, "display", first)
+    monkeypatch.setattr(progress, "_in_notebook", lambda: True)
+    bar = spadwarp.viz.progress_bar("frames")
+    for stage, done, total in (("compile", 0, 0), ("<note>", 0, 0), ("frames", 1, 4), ("frames", 4, 4)):
+        bar(stage, done, total)
+    assert [text.split("</progress> ")[1] for text in shown][1:] == [
+        "&lt;note&gt;",
+        "25 %, 1 of 4 frames",
+        "100 %, 4 of 4 frames",
+    ]
+
+
 # xarray
 
 
