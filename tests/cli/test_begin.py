@@ -1,6 +1,7 @@
 """First steps: a scene to start from, examples by name, JSON Schema for editors, help by stage of work."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -31,10 +32,13 @@ def test_init_writes_a_scene_that_works(tmp_path, monkeypatch):
 
 
 def test_every_choice_in_the_template_is_valid():
-    """A commented field, taken alone, makes a valid scene or displaces the ones that it stands for."""
+    """A commented field, taken alone, makes a valid scene or displaces the ones that it stands for; so does a commented
+    section with all its fields."""
     text = spadwarp.scene.template()
     section, taken = "", 0
-    for line in text.splitlines():
+    whole = re.sub(r"^# (?=\[|sun_|depth )", "", text, flags=re.MULTILINE)
+    assert spadwarp.Scene.from_dict(tomllib.loads(whole)).daylight.depth == 20.0
+    for line in re.sub(r"^# \[(?:.*\n)+?\n", "", text, flags=re.MULTILINE).splitlines():
         section = line.split("]")[0].strip("[") if line.startswith("[") else section
         if line.startswith("# ") and " = " in line and section:
             fields = tomllib.loads(line[2:])
