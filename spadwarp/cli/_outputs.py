@@ -28,7 +28,12 @@ Overwrite = Annotated[
 ]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the output as JSON.")]
 
-_READ_IN_DIRECTORIES = ("result.h5", "frames.h5", "analytic.h5")  # where an input is the directory of one of them
+_READ_IN_DIRECTORIES = (
+    "result.h5",
+    "frames.h5",
+    "sequence.h5",
+    "analytic.h5",
+)  # where an input is the directory of one of them
 
 
 @dataclass(frozen=True)

@@ -264,6 +264,10 @@ class Recipe(_Table):
     vary: dict[str, Annotated[Distribution, BeforeValidator(_distribution)]] = Field(
         default_factory=dict, description='further fields of the scene: "laser.preset" = ["lu2024", ...]'
     )
+    trajectory: str = Field(
+        "",
+        description="table of fields of the scene by time (CSV), relative to the recipe: scene n of a target has row n",
+    )
     scene: dict[str, Any] = Field(..., description="the scene without targets and gate, as in a scene file")
     _source: Path | None = PrivateAttr(None)
 
@@ -359,10 +363,15 @@ def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
 
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
     """The tables with the paths of targets made absolute."""
-    targets = tables.get("targets")
-    if source is None or not isinstance(targets, Mapping):
+    if source is None:
         return dict(tables)
-    folder, changed = Path(source).absolute().parent, dict(targets)
+    folder = Path(source).absolute().parent
+    if isinstance(moves := tables.get("trajectory"), str) and moves:
+        tables = {**tables, "trajectory": str(folder / os.path.expanduser(moves))}
+    targets = tables.get("targets")
+    if not isinstance(targets, Mapping):
+        return dict(tables)
+    changed = dict(targets)
     for name in ("meshes", "exports"):
         if isinstance(given := targets.get(name), (list, tuple)):
             changed[name] = [

@@ -17,7 +17,8 @@ import numpy as np
 
 from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
 from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
-from spadwarp.scene import Camera, Scene
+from spadwarp.errors import ConfigError
+from spadwarp.scene import Camera, Scene, Trajectory, load_trajectory
 from spadwarp.scene.renamed import former_path
 from spadwarp.units import time_from_range
 
@@ -103,6 +104,9 @@ class Plan:
         self._template = recipe.template()
         self._tables = self._template.to_dict()
         self.shape = (self._template.camera.height, self._template.camera.width)
+        self._moves = load_trajectory(recipe.trajectory) if recipe.trajectory else None
+        if self._moves is not None:
+            self._check_moves(self._moves)
         self.depth_offset, self.depth_step = self._depth_code()
 
     def check_targets(self) -> None:
@@ -146,11 +150,14 @@ class Plan:
             "targets": [] if source.export else self._targets(draw, source, distance, scene.camera),
             "analytic": analytic,
         }
+        scene = Scene.from_dict({**scene.to_dict(), **drawn})
+        if self._moves is not None:
+            scene = self._moves.scene(scene, index % recipe.scenes_per_target)
         first = index * self.frames_per_scene
         return SceneDraw(
             index=index,
             target=number,
-            scene=Scene.from_dict({**scene.to_dict(), **drawn}),
+            scene=scene,
             distance=distance,
             attenuation_lengths=float(lengths),
             signal_photons=draw("exposure.signal", recipe.exposure.signal_photons),
@@ -158,6 +165,19 @@ class Plan:
             photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
             seed=int(self.generator(split, "photons", index).integers(2**63)),
         )
+
+    def _check_moves(self, moves: Trajectory) -> None:
+        """Raises `ConfigError` for a trajectory that is too short, or that moves what a recipe draws."""
+        own = ("camera.width", "camera.height", "gate.", "analytic.")
+        problems = [
+            f"{name} is not for a trajectory: the recipe draws it" for name in moves.fields if name.startswith(own)
+        ]
+        if len(moves) < self.recipe.scenes_per_target:
+            problems.append(f"{len(moves)} rows are fewer than scenes_per_target = {self.recipe.scenes_per_target}")
+        if any(target.export for target in self.targets):
+            problems.append("targets.exports are depth maps, which do not move")
+        if problems:
+            raise ConfigError(problems, source=moves.source)
 
     def _targets(self, draw: _Draw, source: TargetSource, distance: float, camera: Camera) -> list[dict[str, Any]]:
         """The target and, in part of the scenes, the wall behind it."""

@@ -10,6 +10,7 @@ from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
 from spadwarp.files.loader import Held
 from spadwarp.frames import FramesFile
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.result import Result
 from spadwarp.scene import Scene
 
@@ -22,6 +23,8 @@ def summary(held: Held) -> dict[str, Any]:
         return {"kind": "result", **held.summary()}
     if isinstance(held, FramesFile):
         return {"kind": "frames", **_frames(held)}
+    if isinstance(held, SequenceFile):
+        return {"kind": "sequence", **_sequence(held)}
     if isinstance(held, AnalyticFile):
         return {"kind": "analytic", **_analytic(held)}
     if isinstance(held, FrameReader):
@@ -48,6 +51,20 @@ def _frames(file: FramesFile) -> dict[str, Any]:
         "counts_per_pixel": float(np.mean(mean)) if mean else None,
         "depth_by": list(file.methods),
         "response_fwhm_ps": 1e12 * file.irf.fwhm,
+    }
+
+
+def _sequence(file: SequenceFile) -> dict[str, Any]:
+    times = file.trajectory.times
+    return {
+        "scene": _source(file.base),
+        "frames": file.frames,
+        "times_s": [float(times[0]), float(times[-1])],
+        "moving": list(file.trajectory.fields),
+        "pulses": file.pulses,
+        "seed": file.seed,
+        **_axes(file.base, file.bins),
+        "depth_by": list(file.methods),
     }
 
 

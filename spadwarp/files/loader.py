@@ -10,6 +10,7 @@ from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
 from spadwarp.errors import FileError
 from spadwarp.frames import FramesFile
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
@@ -17,16 +18,17 @@ from spadwarp.transport import PhotonRecords, load_records
 
 __all__ = ["Held", "holds_own_file", "is_own_file", "load", "locate"]
 
-Held = Result | FramesFile | AnalyticFile | FrameReader | PhotonRecords
+Held = Result | FramesFile | SequenceFile | AnalyticFile | FrameReader | PhotonRecords
 """What a file of ours holds."""
 
-_NAMES = ("frames.h5", "result.h5", "analytic.h5")
+_NAMES = ("frames.h5", "sequence.h5", "result.h5", "analytic.h5")
 _DATASET, _CHECKPOINT = "manifest.json", "checkpoint.h5"
 _LOADERS: dict[str, Callable[[Path], Held]] = {
     "spadwarp result": load_result,
     "spadwarp frames": FramesFile.load,
     "spadwarp analytic": AnalyticFile.load,
     "spadwarp records": load_records,
+    "spadwarp sequence": SequenceFile.load,
 }
 
 
@@ -38,6 +40,7 @@ def load(path: str | os.PathLike[str]) -> Held:
     - `analytic.h5`: an `AnalyticFile`, likewise.
     - A dataset's folder or one of its shards: a `FrameReader` of all its frames.
     - `records.h5`: `PhotonRecords`.
+    - `sequence.h5` of `video --trajectory`: a `SequenceFile`, which reads the frames of a scene that moves when asked.
     - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
 
     Raises:

@@ -18,6 +18,7 @@ from spadwarp.files.loader import load, locate
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
 
@@ -47,9 +48,14 @@ def open_source(source: Any, *, result: Result | None = None, split: str = "all"
 
 
 def sequence(held: Any) -> FrameSequence:
-    """The frames of a `FramesFile`, an `AnalyticFile` or a `FrameReader`. Raises `ArgumentError` for others."""
+    """The frames of a `FramesFile`, a `SequenceFile`, an `AnalyticFile` or a `FrameReader`.
+
+    Raises `ArgumentError` for others.
+    """
     if isinstance(held, FramesFile):
         return _of_file(held)
+    if isinstance(held, SequenceFile):
+        return _of_moving(held)
     if isinstance(held, AnalyticFile):
         return _of_analytic(held)
     if isinstance(held, FrameReader):
@@ -109,6 +115,34 @@ def _of_file(file: FramesFile) -> FrameSequence:
 
     most = max(int(file.intensity(number).max()) for number in range(file.frames))
     return FrameSequence(name=str(file.path), count=file.frames, frame=frame, largest_count=most)
+
+
+def _of_moving(file: SequenceFile) -> FrameSequence:
+    best = file.best_method
+
+    def frame(number: int) -> SequenceFrame:
+        scene, truth, counts = file.scene(number), file.truth(number), file.counts(number)
+        depths = {f"{method}.Z": file.depth(method, number) for method in file.methods}
+        return SequenceFrame(
+            images={
+                **({"Z": depths[f"{best}.Z"]} if best else {}),
+                "intensity": counts.sum(axis=-1, dtype=np.int64),
+                **depths,
+                "truth.Z": truth.depth,
+            },
+            counts=counts,
+            expected=file.expected(number) * np.float32(file.pulses),
+            background=file.background(number) * file.bins * file.pulses,
+            pulses=file.pulses,
+            gate_start=file.gate_start,
+            bin_width=file.bin_width,
+            period=file.period,
+            scene=scene,
+            depth=truth.depth,
+            content=f"Z by {best}, {file.trajectory.times[number]:g} s",
+        )
+
+    return FrameSequence(name=str(file.path), count=file.frames, frame=frame)
 
 
 def _of_analytic(file: AnalyticFile) -> FrameSequence:

@@ -12,6 +12,7 @@ from spadwarp.run.directory import (
 )
 from spadwarp.run.formats import FORMATS, export, export_sensor_fusion
 from spadwarp.run.schema import SCHEMAS, json_schema
+from spadwarp.run.sequence import simulate_sequence
 
 __all__ = [
     "CHECKPOINT",
@@ -25,6 +26,7 @@ __all__ = [
     "json_schema",
     "load_resumable",
     "remove_checkpoint",
+    "simulate_sequence",
     "write_depth",
     "write_run",
 ]

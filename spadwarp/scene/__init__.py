@@ -31,6 +31,7 @@ from spadwarp.scene.spectrum import (
     water_lines,
 )
 from spadwarp.scene.targets import Target
+from spadwarp.scene.trajectory import Trajectory, load_trajectory
 from spadwarp.scene.transport import Transport
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
     "SceneLike",
     "SpectralLine",
     "Target",
+    "Trajectory",
     "Transport",
     "WaterLine",
     "as_scene",
@@ -61,6 +63,7 @@ __all__ = [
     "filter_transmission",
     "load_calibration",
     "load_scene",
+    "load_trajectory",
     "look_at",
     "noise_rate",
     "opencv_pose",

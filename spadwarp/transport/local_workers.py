@@ -32,6 +32,7 @@ class LocalWorkers:
         devices: From `spadwarp.device.pick_devices`.
         threads: CPU threads in all; by default one a core. A GPU takes one.
         tallies: The caller's own, for one device.
+        kept: Meshes of earlier runs, as `build_model` takes them.
 
     Raises:
         ConfigError: CPU and GPU together, caller's tallies with several devices, or a number out of range.
@@ -41,7 +42,13 @@ class LocalWorkers:
     must_rest = True
 
     def __init__(
-        self, plan: Plan, devices: Sequence[wp.Device], *, threads: int | None = None, tallies: Any = None
+        self,
+        plan: Plan,
+        devices: Sequence[wp.Device],
+        *,
+        threads: int | None = None,
+        tallies: Any = None,
+        kept: Any = None,
     ) -> None:
         kind = "cuda" if devices[0].is_cuda else "cpu"
         if any(device.is_cuda != devices[0].is_cuda for device in devices):
@@ -58,7 +65,7 @@ class LocalWorkers:
         models = []
         for device in devices:
             with device_errors(device):
-                models.append(build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale))
+                models.append(build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale, kept=kept))
         built = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh)
         settings: dict[str, Any] = {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory
@@ -32,6 +33,9 @@ _LU2024_ALBEDO = 0.97
 
 _UNLIMITED = 1.0e30
 
+KeptMeshes = dict[str, tuple[wp.Mesh, NDArray[np.int32]]]
+"""Device → its mesh, and the faces of that."""
+
 
 def build_model(
     scene: Scene,
@@ -41,6 +45,7 @@ def build_model(
     camera: bool = True,
     copies: float = 1,
     scale: float | None = None,
+    kept: KeptMeshes | None = None,
 ) -> sk.Model:
     """The scene on a device.
 
@@ -50,6 +55,7 @@ def build_model(
         mesh: From `spadwarp.mesh.build_mesh`.
         copies: Histograms that the run will hold on the device, for the check of its memory.
         scale: Tally units per emitted photon; None: `tally_scale(scene, mesh)`.
+        kept: Meshes of earlier scenes on their devices; one of the same faces is refitted and not built anew.
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
 
     Raises:
@@ -68,7 +74,7 @@ def build_model(
         scale = tally_scale(scene, mesh) if camera else 1.0
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines.
     mapped = lens if camera and scene.camera.port is None else None
-    device_mesh, surfaces = _surfaces(mesh, mapped, device)
+    device_mesh, surfaces = _surfaces(mesh, mapped, device, kept)
     model = sk.Model(
         device=device,
         medium=_medium(scene, device),
@@ -160,17 +166,32 @@ def _guiding(scene: Scene, max_path: float) -> Any:
     return guiding
 
 
-def _surfaces(mesh: TriangleMesh | None, lens: Any, device: wp.Device) -> tuple[wp.Mesh | None, Any]:
-    """The mesh with its BVH, and its surfaces as the kernels take them."""
-    if mesh is None:
-        return None, sk.make_surfaces(None, device=device)
-    device_mesh = wp.Mesh(
+def _device_mesh(mesh: TriangleMesh, device: wp.Device, kept: KeptMeshes | None) -> wp.Mesh:
+    """The mesh with its BVH; where only its vertices differ from those of the mesh that is kept, that one, refitted."""
+    earlier = None if kept is None else kept.get(str(device))
+    if earlier is not None and np.array_equal(earlier[1], mesh.faces) and earlier[0].points.size == len(mesh.vertices):
+        earlier[0].points.assign(mesh.vertices)
+        earlier[0].refit()
+        return earlier[0]
+    built = wp.Mesh(
         wp.array(mesh.vertices, dtype=wp.vec3, device=device),
         wp.array(mesh.faces.ravel(), dtype=int, device=device),
         # The fastest to traverse, by measurement.
         bvh_constructor="cubql" if device.is_cuda else None,
         bvh_leaf_size=1 if device.is_cuda else 2,
     )
+    if kept is not None:
+        kept[str(device)] = built, mesh.faces
+    return built
+
+
+def _surfaces(
+    mesh: TriangleMesh | None, lens: Any, device: wp.Device, kept: KeptMeshes | None
+) -> tuple[wp.Mesh | None, Any]:
+    """The mesh with its BVH, and its surfaces as the kernels take them."""
+    if mesh is None:
+        return None, sk.make_surfaces(None, device=device)
+    device_mesh = _device_mesh(mesh, device, kept)
     arrays: dict[str, Any] = {}
     if mesh.specular is not None and mesh.roughness is not None:
         arrays["specular"] = wp.array(mesh.specular, dtype=float, device=device)

@@ -56,6 +56,7 @@ def simulate(
     checkpoint: str | Path | None = None,
     checkpoint_every: float = 60.0,
     tallies: Any = None,
+    kept: dict[str, Any] | None = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
@@ -89,6 +90,8 @@ def simulate(
             the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
             memory; `spadwarp.result.to_torch(result, tallies=…)` makes histograms of it where it lies. For one
             device, without `resume`.
+        kept: A dict, empty at first, for runs of a scene that moves: it keeps the mesh on its devices, and where only
+            vertices moved its tree is refitted and not built anew. Without `engine`.
 
     Returns:
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
@@ -122,7 +125,7 @@ def simulate(
         if engine is None:
             from spadwarp.transport.local_workers import LocalWorkers
 
-            workers = LocalWorkers(plan, pick_devices(device), threads=threads, tallies=tallies)
+            workers = LocalWorkers(plan, pick_devices(device), threads=threads, tallies=tallies, kept=kept)
         else:
             from spadwarp.transport.ray_workers import ClusterWorkers
 
@@ -132,8 +135,8 @@ def simulate(
             result = _Run(plan, workers, resume, progress, writer).result(stopped, relative_error)
         except DeviceError as error:
             if writer.photons:
-                kept = f"{writer.path}: the {writer.photons} photons that were done are here; resume it"
-                raise DeviceError(f"{error}\n{kept}") from error
+                saved = f"{writer.path}: the {writer.photons} photons that were done are here; resume it"
+                raise DeviceError(f"{error}\n{saved}") from error
             raise
     _warn_of_rounding(result)
     for text in result.warnings:

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.paths import check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
+from spadwarp.viz.moving_pictures import moving_pictures
 from spadwarp.viz.style import LIGHT_MAP, colour_map, new_figure, paper
 from spadwarp.viz.viewer import reported_depths
 
@@ -49,7 +51,7 @@ def video(
 
     Args:
         source: What `spadwarp.load` returns, or a path that it takes. Of an analytic file or a dataset, the frames of
-            one scene that report a time.
+            one scene that report a time. Of a scene that moves, true depth, measured depth and counts, frame by frame.
         path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install 'spadwarp[video]'`.
         window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
         pictures: Largest number of pictures; bins are merged where there are more.
@@ -67,6 +69,10 @@ def video(
     pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
     check_choice("scale", scale, ("log", "linear"))
     check_apart(path, source)
+    source = source if isinstance(source, Held) else load(source)
+    if isinstance(source, SequenceFile):
+        _write(moving_pictures(source, pictures), path, fps)
+        return path
     cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
     cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
@@ -75,11 +81,14 @@ def video(
     cube = np.add.reduceat(cube, starts, axis=2)
     edges = np.append(edges[starts], edges[-1])
     label += " and picture" if merged > 1 else " and bin"
-    drawn = _pictures(cube, edges, label, metres_per_ns, scale)
+    _write(_pictures(cube, edges, label, metres_per_ns, scale), path, fps)
+    return path
+
+
+def _write(drawn: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_path(path) as temporary:
         write(drawn, temporary, fps)
-    return path
 
 
 def _light(source: Held | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:

@@ -15,6 +15,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.paths import check_apart
 from spadwarp.result import Result
 from spadwarp.scene import Scene
@@ -98,6 +99,8 @@ def view(
         raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
     check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)
+    if isinstance(held, SequenceFile):
+        raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp video` shows it, frame by frame")
     if isinstance(held, Result):
         page = _of_result(held, method, device)
     else:

@@ -351,6 +351,23 @@ def test_a_torch_loader_gives_the_same_items_from_any_kind_of_worker(folder, sta
                 assert torch.equal(batch[name].nan_to_num(-1.0), values.nan_to_num(-1.0)), name
 
 
+def test_scenes_follow_a_trajectory(tmp_path):
+    rows = "".join(f"{0.1 * n},{0.2 * n},{-n}\n" for n in range(3))
+    (tmp_path / "poses.csv").write_text("time,camera.position[0],targets[0].rotation_deg[1]\n" + rows)
+    still = recipe(**{"scenes_per_target": 3, "frames.per_scene": 1, "trajectory": "poses.csv"})
+    path = written(still, tmp_path)
+    make(path, tmp_path / "data")
+    reader = FrameReader(tmp_path / "data", "test", fields=("clean",))
+    assert len(reader) == 3
+    for number in range(3):
+        scene = reader.scene(number)
+        assert scene.camera.position[0] == pytest.approx(0.2 * number) and scene.targets[0].rotation_deg[1] == -number
+        truth = spadwarp.truth_maps(scene, device="cpu").depth
+        np.testing.assert_array_equal(reader[number]["clean"][0], truth)
+    with pytest.raises(spadwarp.ConfigError, match=r"3 rows are fewer than scenes_per_target = 4"):
+        Plan(load_recipe(path).with_overrides({"scenes_per_target": 4}))
+
+
 def test_a_split_without_frames_is_named_at_once(folder, tmp_path):
     make(recipe(**{"targets.validation": [], "frames.per_scene": 1}), tmp_path / "data")
     for reader in (FrameReader, SpadDataset, iterate_dataset):
