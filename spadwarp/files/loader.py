@@ -21,7 +21,7 @@ __all__ = ["Held", "holds_own_file", "is_own_file", "load", "locate"]
 Held = Result | FramesFile | SequenceFile | AnalyticFile | FrameReader | PhotonRecords
 """What a file of ours holds."""
 
-_NAMES = ("frames.h5", "sequence.h5", "result.h5", "analytic.h5")
+_NAMES = ("frames.h5", "result.h5", "analytic.h5", "sequence.h5")
 _DATASET, _CHECKPOINT = "manifest.json", "checkpoint.h5"
 _LOADERS: dict[str, Callable[[Path], Held]] = {
     "spadwarp result": load_result,
