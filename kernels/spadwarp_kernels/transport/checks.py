@@ -222,7 +222,7 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
     check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)
-    if spec.stepped:
+    if spec.stepped or data.offset is not None:
         check_array("data.offset", data.offset, wp.uint64, (1,), device)
     check_struct("data.records", data.records, Records)
     if spec.records:
