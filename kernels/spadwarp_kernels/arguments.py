@@ -114,6 +114,13 @@ def check_kind(name: str, value: Any, kind: type) -> None:
         raise ArgumentError(f"{name} is {_kind(value)}; a {kind.__name__} is needed")
 
 
+def check_items(name: str, value: Any) -> list[Any]:
+    """A list of what has items, such as a list, a tuple or an array."""
+    if isinstance(value, str | bytes) or not (isinstance(value, Iterable) and getattr(value, "ndim", 1)):
+        raise ArgumentError(f"{name} is {_kind(value)}; a list is needed")
+    return list(value)
+
+
 def check_array(
     name: str, array: Any, dtypes: Any, shape: Sequence[int | None], device: Any = None, *, contiguous: bool = False
 ) -> Any:

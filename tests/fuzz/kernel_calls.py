@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
+from fuzz import world_calls
 from fuzz.isolation import run_isolated
 from spadwarp_kernels import analytic, detection
 
@@ -205,7 +206,7 @@ def _valid_calls():
     }
     for method in ("peak", "centroid", "matched", "likelihood"):
         calls[f"arrival_{method}"] = (sk.arrival_bins, {"histogram": counts, "method": method, **bins, "half_width": 2})
-    return calls
+    return calls | world_calls.valid_calls(mesh)
 
 
 _DTYPES = (float, int, wp.float64, wp.int64, wp.vec3, wp.vec3d, wp.vec4, wp.uint8, wp.bool)
@@ -234,7 +235,7 @@ def _changed(r, value):
         return value._replace(**{name: r.choice(others.get(name, (not getattr(value, name), "yes", None)))})
     if isinstance(value, (list, tuple)):
         items = list(value)
-        if r.random() < 0.7:
+        if items and r.random() < 0.7:
             items[r.randrange(len(items))] = r.choice(NUMBERS + JUNK)
         else:
             items = items[:-1] if r.random() < 0.5 else [*items, 1.0]

@@ -190,11 +190,18 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
     check_kind("mesh", mesh, wp.Mesh)
     if surfaces.mesh != mesh.id:
         raise ArgumentError("surfaces are not those of mesh")
+    for name in ("near_depth", "nodes", "faces", "order", "depth", "levels"):
+        if getattr(surfaces, name) is None:
+            raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
     if surfaces.near_depth.size:
         raise ArgumentError("surfaces know what the camera cannot miss; for moving points, make them without camera")
     if surfaces.nodes.size:
         if not surfaces.depth.size:
             raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
+        count, device = mesh.indices.size // 3, mesh.device
+        check_array("surfaces.order", surfaces.order, wp.int32, (count,), device)
+        check_array("surfaces.faces", surfaces.faces, wp.vec4, (3 * count,), device)
+        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), device)
         tree = (surfaces.nodes, surfaces.faces, surfaces.order, surfaces.depth, surfaces.levels)
         refit_bvh(mesh, surfaces.extent, *tree)
     else:

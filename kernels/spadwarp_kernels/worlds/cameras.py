@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_kind
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_items, check_kind
 
 from .config import SpadConfig, check_config
 from .detect import Detection
@@ -57,6 +57,7 @@ class WorldCameras:
         self.cameras = check_integer("cameras", cameras, 1)
         self._optical = optical_to(frame)
         self._world = camera_worlds(world, self.cameras, self.device)
+        self._most_worlds = 0 if isinstance(world, wp.array) else int(self._world.numpy().max()) + 1
         image = (self.cameras, self.config.height, self.config.width)
         self._detection = Detection(self.config, self.cameras, self.device)
         self.rates, self.histogram = self._detection.rates, self._detection.histogram
@@ -69,6 +70,8 @@ class WorldCameras:
         """Moves the shapes and casts a ray a pixel."""
         check_kind("shapes", shapes, Shapes)
         check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+        if self._most_worlds > shapes.worlds:
+            raise ArgumentError(f"world = {self._most_worlds - 1} is none of the {shapes.worlds} worlds of the shapes")
         move_shapes(shapes, body_q)
         inputs = [shapes.table, camera_q, self._optical, self._world, self._detection.view]
         outputs = [self.true_depth, self.normal, self.albedo]
@@ -84,7 +87,11 @@ def camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device: 
     """World of each camera on the device."""
     if isinstance(world, wp.array):
         return check_array("world", world, wp.int32, (cameras,), device)
-    world = list(range(cameras)) if world is None else [check_integer("world", one, 0) for one in world]
+    world = (
+        list(range(cameras))
+        if world is None
+        else [check_integer("world", one, 0) for one in check_items("world", world)]
+    )
     if len(world) != cameras:
         raise ArgumentError(f"world has {len(world)} entries; one for each of {cameras} cameras is needed")
     return wp.array(world, dtype=int, device=device)

@@ -6,7 +6,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_struct
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_array,
+    check_device,
+    check_integer,
+    check_items,
+    check_kind,
+    check_struct,
+)
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
@@ -58,12 +66,14 @@ class Shapes:
         worlds: Number of worlds.
         device: Warp device of the arrays.
         meshes: Meshes that are kept alive with the shapes.
+        bodies: Number of poses that `move_shapes` needs.
     """
 
     table: ShapeTable
     worlds: int
     device: wp.Device
     meshes: tuple[wp.Mesh, ...] = ()
+    bodies: int = 0
 
     def __len__(self) -> int:
         return int(self.table.kind.size)
@@ -107,7 +117,7 @@ def make_shapes(
     worlds = check_integer("worlds", worlds, 1)
     table = ShapeTable()
     if not isinstance(kind, wp.array):
-        kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in kind])
+        kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
         if kind.dtype.kind not in "iu" or kind.size == 0:
             raise ArgumentError(
                 f"kind = {kind.tolist()} is not a list of {', '.join(SHAPE_KINDS)}, or of their indices"
@@ -123,14 +133,18 @@ def make_shapes(
             width = wp.types.type_size(dtype)
             shape = (count, width) if width > 1 else (count,)
             rows = np.broadcast_to(np.asarray(value, np.uint64 if dtype == wp.uint64 else np.float64), shape)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ArgumentError(f"{name} does not fit {count} shapes, [shapes] of {dtype.__name__}") from None
         scalar = {wp.int32: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
+        if not (np.isfinite(rows).all() and (np.abs(rows) <= np.finfo(np.float32).max).all()):
+            raise ArgumentError(f"{name} is not finite for some of {count} shapes")
         return wp.array(rows.astype(scalar), dtype=dtype, device=device)
 
-    meshes = () if mesh is None or isinstance(mesh, wp.array) else tuple(m for m in mesh if isinstance(m, wp.Mesh))
+    meshes: tuple[wp.Mesh, ...] = ()
     if mesh is not None and not isinstance(mesh, wp.array):
-        mesh = [one.id if isinstance(one, wp.Mesh) else int(one or 0) for one in mesh]
+        mesh = check_items("mesh", mesh)
+        meshes = tuple(one for one in mesh if isinstance(one, wp.Mesh))
+        mesh = [one.id if isinstance(one, wp.Mesh) else check_integer("mesh", one or 0, 0, 2**64 - 1) for one in mesh]
     table.kind = on_device("kind", kind, wp.int32, None)
     table.size = on_device("size", size, wp.vec3, None)
     table.body = on_device("body", body, wp.int32, -1)
@@ -142,23 +156,31 @@ def make_shapes(
         check_struct("textures", textures, Textures)
     table.textures = no_textures(device) if textures is None else textures
     _check_shapes(table)
+    bodies = int(table.body.numpy().max()) + 1
     if world is None:
         world = np.full(count, 0 if worlds == 1 else -1)
     world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
     if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
         raise ArgumentError(f"world is not one of -1 to {worlds - 1} for each of {count} shapes")
-    seen = np.arange(count) if visible is None else np.flatnonzero(np.broadcast_to(visible, (count,)))
+    seen = np.arange(count)
+    if visible is not None:
+        if np.shape(visible) not in ((), (count,)):
+            raise ArgumentError(f"visible has shape {np.shape(visible)}; one for each of {count} shapes is needed")
+        seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
     table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
     table.pose = wp.clone(table.local)
-    return Shapes(table, worlds, device, meshes)
+    return Shapes(table, worlds, device, meshes, bodies)
 
 
 def _check_shapes(table: ShapeTable) -> None:
     kind, mesh = table.kind.numpy(), table.mesh.numpy()
     if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
         raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
+    albedo = table.albedo.numpy()
+    if not ((albedo >= 0.0) & (albedo <= 1.0)).all():
+        raise ArgumentError(f"albedo holds {albedo.min()} to {albedo.max()}, outside [0, 1]")
     without = np.flatnonzero((kind == MESH) & (mesh == 0))
     if without.size:
         raise ArgumentError(f"kind[{without[0]}] is a mesh and mesh[{without[0]}] = 0 is none")
@@ -181,10 +203,16 @@ def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
     Args:
         shapes: From `make_shapes`.
         body_q: `wp.transform` `[bodies]`, in the worlds' frames; None where no shape is on a body.
+
+    Raises:
+        ArgumentError: Fewer poses than the shapes' bodies, or on another device.
     """
+    check_kind("shapes", shapes, Shapes)
     if body_q is None:
         body_q = wp.empty(0, dtype=wp.transform, device=shapes.device)
     check_array("body_q", body_q, wp.transform, (None,), shapes.device)
+    if body_q.size < shapes.bodies:
+        raise ArgumentError(f"body_q has {body_q.size} poses; the shapes are on {shapes.bodies} bodies")
     wp.launch(_move_kernel, len(shapes), [shapes.table, body_q], device=shapes.device)
 
 

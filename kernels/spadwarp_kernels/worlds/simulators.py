@@ -171,6 +171,7 @@ def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
     Raises:
         ArgumentError: Arrays that do not fit.
     """
+    check_array("position", position, wp.vec3, (None,) * (2 if getattr(position, "ndim", 1) == 2 else 1))
     shape = (position.shape[0], 1) if position.ndim == 1 else position.shape
     matrix = isinstance(rotation, wp.array) and wp.types.types_equal(rotation.dtype, wp.mat33)
     check_array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)

@@ -6,7 +6,7 @@ import warp as wp
 
 from spadwarp_kernels.analytic.lidar import Lidar, beam_path
 from spadwarp_kernels.analytic.signal import radiometric_signal
-from spadwarp_kernels.arguments import check_array
+from spadwarp_kernels.arguments import check_array, check_number
 
 from .cameras import WorldCameras
 from .config import SpadConfig
@@ -238,12 +238,12 @@ class SpadCamera(WorldCameras):
         if isinstance(albedo, wp.array):
             check_array("albedo", albedo, wp.float32, shape, self.device)
         else:
-            number, albedo = float(albedo), self._none
+            number, albedo = check_number("albedo", albedo, "[0, 1]"), self._none
         if normal is not None:
             check_array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
             check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
-        inputs = [view, depth, int(along_ray), self._no_normal if normal is None else normal]
+        inputs = [view, depth, int(bool(along_ray)), self._no_normal if normal is None else normal]
         inputs += [self._no_pose if camera_q is None else camera_q, self._optical, albedo, number]
         outputs = [self.true_depth, self.normal, self.albedo]
         wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)

@@ -109,14 +109,14 @@ class SpadTracer(WorldCameras):
         check_choice("estimator", estimator, ESTIMATORS)
         self.photons = check_integer("photons", photons, 1, 1 << 26)
         self.shapes, self._public_tree = shapes, public_tree
-        worlds = [int(one) for one in (range(self.cameras) if world is None else world)]
+        worlds = self._world.numpy().tolist()
         if max(worlds) >= shapes.worlds:
             raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
         self._meshes = CameraMeshes(shapes, worlds, self.device)
         for v, faces in enumerate(self._meshes.face_shape):
             if not len(faces):
                 raise ArgumentError(f"world {worlds[v]} of camera {v} has no shapes")
-        self._parts = check_integer("oversampling", oversampling, 1)
+        self._parts = check_integer("oversampling", oversampling, 1, 1024)
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(taps, dtype=float, device=self.device)
         shape = (self.config.height * self.config.width, self._parts * self.config.bins)

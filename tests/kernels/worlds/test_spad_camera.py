@@ -255,6 +255,9 @@ def test_a_step_depends_on_the_seed_and_its_number(device):
     assert not np.array_equal(frame(1, 7), frame(1, 8)) and not np.array_equal(frame(1, 7), frame(2, 7))
 
 
+BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
+
+
 @pytest.mark.parametrize(
     ("call", "text"),
     [
@@ -266,11 +269,36 @@ def test_a_step_depends_on_the_seed_and_its_number(device):
         (lambda: sk.make_shapes(["mesh"], [(1, 1, 1)], device="cpu"), r"mesh\[0\] = 0 is none"),
         (lambda: sk.make_shapes(["box"], [(1, 1, 1)], world=[3], device="cpu"), "world is not one of -1 to 0"),
         (lambda: sk.make_shapes(["box"] * 2, [(1, 1, 1)], body=[1, 2, 3], device="cpu"), "body does not fit 2 shapes"),
+        (lambda: sk.make_shapes(3, [(1, 1, 1)], device="cpu"), "kind is int; a list is needed"),
+        (lambda: sk.make_shapes(["box"], [(1, np.nan, 1)], device="cpu"), "size is not finite"),
+        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], albedo=1.5, device="cpu"), r"albedo holds .* outside \[0, 1\]"),
+        (lambda: sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[-1], device="cpu"), r"mesh = -1 is outside"),
+        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], mesh=2, device="cpu"), "mesh is int; a list is needed"),
+        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], visible=[True] * 3, device="cpu"), r"visible has shape \(3,\)"),
+        (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
+        (lambda: sk.move_shapes(3, None), "shapes is int; a Shapes is needed"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, oversampling=2**31 - 1, device="cpu"), "oversampling = .* is outside"),
     ],
 )
 def test_errors_name_the_argument(call, text):
     with pytest.raises(sk.ArgumentError, match=text):
         call()
+
+
+def test_poses_and_worlds_that_there_are_not_are_refused():
+    """Kernels would read beyond the arrays."""
+    pose = transforms([(0, 0, 0, 0, 0, 0, 1)], "cpu")
+    for body_q in (None, transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, "cpu")):
+        with pytest.raises(sk.ArgumentError, match=r"body_q has [02] poses; the shapes are on 3 bodies"):
+            sk.SpadCamera(sk.SpadConfig(**SMALL), device="cpu").update(BOX_ON_BODY_2, pose, body_q)
+    camera = sk.SpadCamera(sk.SpadConfig(**SMALL), world=[1], device="cpu")
+    with pytest.raises(sk.ArgumentError, match="world = 1 is none of the 1 worlds"):
+        camera.update(BOX_ON_BODY_2, pose, transforms([(0, 0, 0, 0, 0, 0, 1)] * 3, "cpu"))
+    with pytest.raises(sk.ArgumentError, match=r"albedo = 'dark' is not a number"):
+        camera.update_from_images(camera.true_depth, albedo="dark")
+    with pytest.raises(sk.ArgumentError, match="position is None"):
+        sk.write_poses(None, pose, pose)
 
 
 def test_images_of_another_size_are_refused():
