@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, output_tensor, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, output_tensor, tensor_of
 from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
@@ -22,6 +22,7 @@ from spadwarp.frames.response import InstrumentResponse, detector_response, resp
 from spadwarp.frames.window import Window, detector_window, missing_light
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
 from spadwarp.result.file import as_result
+from spadwarp.result.result import Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 
 __all__ = ["detect"]
@@ -99,7 +100,8 @@ def detect(
             background = source.component("backscatter") * detections_per_photon
         if ambient is None and scene.daylight is not None:
             lit = scene.model_copy(update={"detector": detector, "laser": laser})
-            ambient = noise_rate(lit, source.truth)[..., 0] - detector.noise_rate
+            truth = Truth(**{name: on_host(getattr(source.truth, name)) for name in Truth.__dataclass_fields__})
+            ambient = noise_rate(lit, truth)[..., 0] - detector.noise_rate
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses

@@ -99,6 +99,14 @@ def test_frames_are_the_same_in_torch(result, mode):
     assert np.array_equal(mine.numpy(), expected.counts)
 
 
+def test_daylight_is_the_same_in_torch(result):
+    scene = result.scene.with_overrides(daylight={"sun_elevation_deg": 30.0, "depth": 20.0})
+    lit = dataclasses.replace(result, scene=scene)
+    expected, dark = (spadwarp.detect(one, seed=5, device="cpu").expected for one in (lit, result))
+    frames = spadwarp.detect(spadwarp.result.to_torch(lit), seed=5, device="cpu")
+    assert np.array_equal(frames.expected.numpy(), expected) and (expected > dark).all()
+
+
 def test_frames_share_their_memory(result):
     frames = spadwarp.detect(result, seed=5, device="cpu")
     view = spadwarp.result.to_torch(frames)
