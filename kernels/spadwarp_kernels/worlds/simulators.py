@@ -3,6 +3,7 @@
 Nothing of either is imported before it is there: a model is read by its attributes.
 """
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -41,14 +42,15 @@ def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
     Raises:
         ArgumentError: A model without shapes.
     """
-    from newton import GeoType, ShapeFlags
-
+    newton = sys.modules.get("newton")  # there if the model is
+    if newton is None:
+        raise ArgumentError(f"model is {type(model).__name__}; a newton.Model is needed")
     if not model.shape_count:
         raise ArgumentError("model.shape_count = 0; a camera needs something to look at")
-    kinds = {getattr(GeoType, name.upper()): index for index, name in enumerate(SHAPE_KINDS)}
-    kinds |= {GeoType.CONVEX_MESH: kinds[GeoType.MESH], GeoType.HFIELD: kinds[GeoType.MESH]}
+    kinds = {getattr(newton.GeoType, name.upper()): index for index, name in enumerate(SHAPE_KINDS)}
+    kinds |= {newton.GeoType.CONVEX_MESH: kinds[newton.GeoType.MESH], newton.GeoType.HFIELD: kinds[newton.GeoType.MESH]}
     types = model.shape_type.numpy().tolist()
-    visible = (model.shape_flags.numpy() & int(ShapeFlags.VISIBLE)) != 0
+    visible = (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE)) != 0
     visible &= np.array([kind in kinds for kind in types])  # neither empty nor made of Gaussians
     if albedo is None:
         albedo = srgb_to_linear(model.shape_color.numpy()[:, GREEN])
