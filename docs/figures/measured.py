@@ -22,6 +22,7 @@ import spadwarp
 from spadwarp.frames import InstrumentResponse, read_histograms
 from spadwarp.scene import Detector
 from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.viz import style as viz
 
 Floats = NDArray[np.float64]
 NEIGHBOURS = 5  # side of the square of pixels that says where a pixel's surface is
@@ -168,29 +169,31 @@ def largest_difference(one: Floats, other: Floats) -> float:
                         - np.searchsorted(np.sort(other), both, "right") / other.size).max())  # fmt: skip
 
 
+@viz.paper()
 def draw(measured: Analysis, simulated: Analysis, path: Path) -> None:
     """Three panels: delays of counts, depth errors, counts a pixel."""
-    from spadwarp.viz import style as viz
-
     figure = viz.new_figure(viz.PAGE, 2.3)
     delays, errors, counts = figure.subplots(1, 3)
     for one, style, label in (
         (measured, {"color": "black"}, "measured"),
         (simulated, {"color": viz.BLUE}, "simulated"),
     ):
-        delays.step(1e9 * one.delays, np.maximum(one.often, 1e-12), where="mid", lw=1, label=label, **style)
+        delays.step(1e9 * one.delays, np.maximum(one.often, 1e-12), where="mid", label=label, **style)
         millimetres = 0.5e3 * SPEED_OF_LIGHT * one.errors
         limit = 0.5e3 * SPEED_OF_LIGHT * 1.1 * float(np.quantile(np.abs(measured.errors), 0.98))
-        errors.hist(millimetres, np.linspace(-limit, limit, 41), histtype="step", density=True, lw=1, **style)
+        errors.hist(millimetres, np.linspace(-limit, limit, 41), histtype="step", density=True, **style)
         most = float(np.quantile(measured.counts, 0.999)) + 2
-        counts.hist(one.counts, np.arange(-0.5, most), histtype="step", density=True, lw=1, **style)
+        counts.hist(one.counts, np.arange(-0.5, most), histtype="step", density=True, **style)
     least = 0.5 * float(measured.often[measured.often > 0].min())
-    delays.set(
-        yscale="log", ylim=(least, None), xlabel="delay from the surface [ns]", ylabel="counts per pixel and bin"
-    )
+    delays.set(ylim=(least, None), xlabel="delay from the surface [ns]", ylabel="counts per pixel and bin")
+    viz.log_axis(delays, "y")
     errors.set(xlabel="error of one pixel [mm in air]", ylabel="density [1/mm]")
     counts.set(xlabel="counts of a pixel", ylabel="fraction of pixels")
-    delays.legend(frameon=False, loc="upper left", fontsize=6)
+    for axis in (delays.xaxis, errors, counts):
+        axis.minorticks_on()
+    for axis in (delays, errors, counts):
+        viz.plain_axis(axis)
+    delays.legend(loc="upper right")
     viz.save(figure, path)
 
 

@@ -31,9 +31,8 @@ def densities(angles: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @style.paper()
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images" / "phase_functions.png")
+def draw(path: Path) -> None:
+    """Writes the figure."""
     figure = style.new_figure(style.PAGE, 3.1)
     for axis, angles in zip(
         figure.subplots(1, 2), (np.geomspace(0.01, 180.0, 2000), np.linspace(90.0, 180.0, 500)), strict=True
@@ -49,7 +48,13 @@ def main() -> None:
     style.log_axis(forward, "x")
     style.log_axis(forward, "y", most=9)
     forward.legend()
-    style.save(figure, parser.parse_args().out)
+    style.save(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images" / "phase_functions.png")
+    draw(parser.parse_args().out)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
 """Every kind of picture at the widths of a page and of a column: no texts overlap, none is cut."""
 
+import importlib.util
+import json
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -191,12 +194,51 @@ PICTURES = {
 }
 
 
+def docs_figure(name):
+    path = Path(__file__).parents[2] / "docs" / "figures" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"figure_{name}", path)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def draw_limits(path, width):
+    module = docs_figure("analytic_limits")
+    numbers = json.loads(Path(module.__file__).with_suffix(".json").read_text())
+    module.draw(np.array(numbers["mean"]), np.array(numbers["error"])).savefig(path)
+
+
+def draw_measured(path, width):
+    module, random = docs_figure("measured"), np.random.default_rng(1)
+    delays = np.linspace(-2e-9, 6e-9, 160)
+    often = 1e-4 + np.exp(-0.5 * (delays / 2e-10) ** 2)
+    one = module.Analysis(delays, often, 1e-10 * random.normal(size=500), random.poisson(60, 500).astype(float))
+    module.draw(one, one, path)
+
+
+PICTURES_OF_THE_DOCS = {
+    "limits": draw_limits,
+    "measured": draw_measured,
+    "phase_functions": lambda path, width: docs_figure("phase_functions").draw(path),
+    "water": lambda path, width: docs_figure("water").draw(path),
+}
+
+
 @pytest.mark.parametrize("width", [style.PAGE, style.COLUMN], ids=["page", "column"])
 @pytest.mark.parametrize("kind", PICTURES)
 def test_texts_stand_alone_and_whole(kind, width, tmp_path, monkeypatch, request):
     draw = PICTURES[kind]
     wanted = draw.__code__.co_varnames[2 : draw.__code__.co_argcount]
     given = {name: request.getfixturevalue(name) for name in wanted if name not in ("of", "vary", "truth")}
+    check(kind, width, tmp_path, monkeypatch, lambda path, width: draw(path, width, **given))
+
+
+@pytest.mark.parametrize("kind", PICTURES_OF_THE_DOCS)
+def test_texts_of_the_docs_figures(kind, tmp_path, monkeypatch):
+    check(kind, style.PAGE, tmp_path, monkeypatch, PICTURES_OF_THE_DOCS[kind])
+
+
+def check(kind, width, tmp_path, monkeypatch, draw):
     drawn = []
     original = style.PaperFigure.savefig
 
@@ -208,7 +250,7 @@ def test_texts_stand_alone_and_whole(kind, width, tmp_path, monkeypatch, request
 
     monkeypatch.setattr(style.PaperFigure, "savefig", savefig)
     monkeypatch.setattr(style, "atomic_path", _no_file)
-    draw(tmp_path / "picture.png", width, **given)
+    draw(tmp_path / "picture.png", width)
     (figure,) = drawn
     found = texts(figure)
     assert cut(found, figure) == []
