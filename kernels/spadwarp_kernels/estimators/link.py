@@ -124,10 +124,10 @@ def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
 @functools.cache
 def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
-    and ``(camera, x) -> vec3`` to the lens's centre; the straight one where there is no way."""
+    and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""
     if spec.port is None:
         return _toward_in_water, _toward_centre_in_water
-    connect = spec.port.connect
+    connect, apparent_centre = spec.port.connect, spec.port.apparent_centre
 
     @wp.func
     def toward_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
@@ -136,6 +136,6 @@ def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
 
     @wp.func
     def toward_centre_behind_port(camera: Camera, x: wp.vec3) -> wp.vec3:
-        return toward_port(camera, x, wp.vec3(0.0))
+        return wp.normalize(apparent_centre(camera.port) - x)
 
     return toward_port, toward_centre_behind_port

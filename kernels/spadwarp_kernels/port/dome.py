@@ -9,7 +9,9 @@ import warp as wp
 
 from .port import Connection, Passage, Port, refracted, transmission
 
+# After a step of this size, relative to the angle, the error of Newton's method is its square.
 _STEPS = wp.constant(12)
+_LAST_STEP = wp.constant(1.0e-4)
 
 
 @wp.func
@@ -79,7 +81,7 @@ def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
         slope = 1.0 + n[0] * d * wp.cos(i) * bend[1]
         step = (beta - i - bend[0]) / slope
         i += step
-        if wp.abs(step) <= 1.0e-7 * i:
+        if wp.abs(step) <= _LAST_STEP * i:
             break
     sin_i = wp.sin(i)
     cos_i = wp.cos(i)
@@ -107,6 +109,12 @@ def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
 def apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
     """The point of the ray of a connection from x to o, if it goes straight on, that is nearest to o."""
     return x + wp.dot(o - x, c.to_port) * c.to_port
+
+
+@wp.func
+def apparent_centre_dome(port: Port) -> wp.vec3:
+    """The lens's centre: from near the centre of a dome, rays hardly bend."""
+    return wp.vec3(0.0)
 
 
 @wp.func

@@ -9,8 +9,8 @@ import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_number, check_vector
 
-from .dome import apparent_dome, connect_dome, enter_dome, leave_dome
-from .flat import apparent_flat, connect_flat, enter_flat, leave_flat
+from .dome import apparent_centre_dome, apparent_dome, connect_dome, enter_dome, leave_dome
+from .flat import apparent_centre_flat, apparent_flat, connect_flat, enter_flat, leave_flat
 from .port import Port
 
 # Stands for no bound.
@@ -24,6 +24,7 @@ class PortKind(NamedTuple):
         name: "flat" or "dome".
         connect: Warp function (port, x, o) -> Connection from x in the water to o inside.
         apparent: Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m].
+        apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
         leave: Warp function (port, x, u) -> Passage of a ray from the water to the plane z = 0 inside.
         enter: Warp function (port, x, u) -> Passage of a ray from inside into the water.
     """
@@ -31,14 +32,15 @@ class PortKind(NamedTuple):
     name: str
     connect: wp.Function
     apparent: wp.Function
+    apparent_centre: wp.Function
     leave: wp.Function
     enter: wp.Function
 
 
-FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, leave_flat, enter_flat)
+FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat)
 """A plane window, or a calm surface without one."""
 
-DOME_PORT = PortKind("dome", connect_dome, apparent_dome, leave_dome, enter_dome)
+DOME_PORT = PortKind("dome", connect_dome, apparent_dome, apparent_centre_dome, leave_dome, enter_dome)
 """A spherical window."""
 
 
