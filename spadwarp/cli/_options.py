@@ -86,7 +86,7 @@ Mesh = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="A mesh (STL, OBJ, PLY, OFF, GLB) that replaces the scene's first target, with the same position, "
+        help="A mesh (STL, OBJ, PLY, OFF, GLB, USD) that replaces the scene's first target, with the same position, "
         "rotation and reflectance; in metres, or in millimetres with --set 'targets[0].scale=0.001'.",
     ),
 ]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def targets(
     meshes: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[FILE]...", help="Mesh files (STL, OBJ, PLY, OFF, GLB) to look at instead."),
+        typer.Argument(metavar="[FILE]...", help="Mesh files (STL, OBJ, PLY, OFF, GLB, USD) to look at instead."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Directory for pictures: targets.png, or NAME.png of each mesh.")

@@ -15,13 +15,14 @@ from spadwarp.dataset.recipe import Recipe, Targets
 from spadwarp.errors import ConfigError, FileError, MeshError
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.targets import placement
+from spadwarp.mesh.usd import USD_ENDINGS
 from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Target
 from spadwarp.scene.pose import rotation_angles
 
 __all__ = ["TargetSource", "check_extents", "find_targets"]
 
-_MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb")
+_MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb", *USD_ENDINGS)
 # The axes of mesh files in those of the camera.
 _UPRIGHT = {
     "camera": np.eye(3),

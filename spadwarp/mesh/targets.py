@@ -17,6 +17,7 @@ from spadwarp.io.paths import file_problem
 from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
+from spadwarp.mesh.usd import USD_ENDINGS, read_usd
 from spadwarp.scene.pose import rotation_matrix, to_camera
 
 if TYPE_CHECKING:
@@ -236,14 +237,16 @@ def placement(
 
 
 def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
-    """A mesh file in the file's own units and axes; several objects in it become one."""
+    """A mesh file in the file's own axes, several objects in it as one; in metres where the format has units."""
     import trimesh
 
+    if path.suffix.lower() in USD_ENDINGS:
+        return read_usd(path, name)
     check_sizes(path, name)
     try:
         mesh = trimesh.load_mesh(path, process=False)  # processing would drop what is not finite, without a warning
     except Exception as error:  # what trimesh raises depends on the format and its parser
-        known = "STL, OBJ, PLY, OFF and GLB can be read"
+        known = "STL, OBJ, PLY, OFF, GLB and USD can be read"
         raise MeshError(f"{name}: not a readable mesh file ({type(error).__name__}: {error}); {known}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"{name}: the file holds no triangles")
