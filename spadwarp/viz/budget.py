@@ -64,7 +64,7 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
             label = f"{name}, c = {own[0].extinction:.3g} 1/m"
             axis.plot(x, y, "o-", color=colour, markevery=-(-len(x) // 12), label=label)
     for axis, (label, _, shown) in zip(axes, _PANELS.values(), strict=True):
-        axis.set(xlabel="range [m]", ylabel=wrapped(label, 1.5), yscale="log")
+        axis.set(xlabel="range [m]", ylabel=_label(label), yscale="log")
         low, high = axis.get_ylim()
         low, high = max(low, shown[0]), min(high, shown[1])
         axis.set(
@@ -113,7 +113,7 @@ def draw_sweep(
             p90 = curves.column("sigma_depth_p90") * scale
             axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
             axis.legend()
-        axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=wrapped(label, 1.5))
+        axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=_label(label))
         _value_axis(axis, y, probability=name in ("outlier_probability", "estimate_fraction"))
         if not numeric:
             space = 0.95 * axis.get_position().width * width / len(x)
@@ -128,6 +128,11 @@ def draw_sweep(
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _label(text: str) -> str:
+    """The unit on a line of its own where both together are longer than an axis."""
+    return text if len(text) < 26 else text.replace(" [", "\n[")
 
 
 def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool) -> None:
