@@ -23,6 +23,7 @@ CASES = {
     "water": tank(),
     "rotated": tank(camera={"rotation_deg": [12.0, -8.0, 25.0], "position": [0.05, 0.1, 0.1]}),
     "layers": tank(medium={"layers": [{"start": 1.0, "extinction": 1.2, "albedo": 0.6}]}),
+    "port": tank(camera={"port": {"shape": "flat", "distance": 0.1}, "horizontal_fov_deg": 60.0}),
     "roulette": tank(transport={"termination": "roulette", "weight_cutoff": 0.3}),
 }
 
