@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory
-from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.errors import DeviceError
 from spadwarp.mesh import focus_distance
 from spadwarp.result import COMPONENTS
 from spadwarp.scene import Scene, phase_function
@@ -20,7 +20,8 @@ from spadwarp.scene.beam_profile import load_profile, profile_extent
 from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
-from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
 from spadwarp.transport.tally_unit import tally_scale
 
 if TYPE_CHECKING:
@@ -64,9 +65,10 @@ def build_model(
         FileError: That table or the beam's profile cannot be read.
         DeviceError: The device has too little memory.
     """
-    _check_domain(scene, camera)
+    check_domain(scene, camera)
+    check_discs(scene, camera)
     if camera:
-        _check_gate(scene)
+        check_gate(scene)
     lens, limits = _camera(scene, mesh), _limits(scene, camera)
     if scene.domain.reflecting:
         limits.boundary = _boundary(scene, device)
@@ -312,7 +314,7 @@ def _port(
             return sk.make_flat_port(distance=port.distance, normal=port.normal, **choices)
         return sk.make_dome_port(radius=port.radius, centre=port.centre, **choices)
     except sk.ArgumentError as error:
-        raise _config_error(scene, f"camera.port or laser.port: {error}") from None
+        raise config_error(scene, f"camera.port or laser.port: {error}") from None
 
 
 def _has_plain_lens(scene: Scene) -> bool:
@@ -335,40 +337,12 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _check_domain(scene: Scene, camera: bool) -> None:
-    beam = scene.beam
-    ways = {"laser.position": (laser_port(scene), beam.position, beam.axis)}
-    if camera:
-        ways["camera.position"] = (camera_port(scene), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    for name, (port, position, axis_of) in ways.items():
-        point, slack = np.asarray(position, np.float64), 0.0
-        if port is not None:
-            # The water begins behind the port, which may be a face of the domain.
-            name, slack = f"{name}, its axis behind the port", 1e-6
-            point = port.enter(position, axis_of)[0]
-            if not np.isfinite(point).all():
-                raise _config_error(scene, f"{name}: light along the axis does not get through the port")
-        for axis, value, low, high in zip(
-            "xyz", to_world(scene.camera, point).tolist(), *scene.domain.bounds, strict=True
-        ):
-            if not low - slack <= value <= high + slack:
-                raise _config_error(scene, f"{name}: {axis} = {value} is outside [{low}, {high}], the domain")
-
-
-def _check_gate(scene: Scene) -> None:
-    begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
-    if max_path is not None and max_path <= begin:
-        raise _config_error(
-            scene, f"transport.max_path = {max_path} m is outside ({begin:g}, inf), the path at which the gate begins"
-        )
-
-
 def _check_size(scene: Scene, model: sk.Model, copies: float) -> None:
     """Refuses what cannot fit before anything is computed."""
     camera, size = scene.camera, model.tally_size
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
     if size >= 2**31:
-        raise _config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")
+        raise config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")
     cuda = model.device.is_cuda
     # On the CPU counts on the device, their copy in the result, and the total of the components.
     needed = (8 if cuda else 16) * size * copies / 2**30
@@ -377,7 +351,3 @@ def _check_size(scene: Scene, model: sk.Model, copies: float) -> None:
         raise DeviceError(
             f"{shape} need {needed:.1f} GiB on {model.device.alias}; {available / 2**30:.1f} GiB are available"
         )
-
-
-def _config_error(scene: Scene, problem: str) -> ConfigError:
-    return ConfigError(problem, source=None if scene.source is None else str(scene.source))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
+from spadwarp import simulate
 from spadwarp.errors import ConfigError
 from spadwarp.transport.records import trace
 
@@ -111,6 +112,22 @@ BOX = {"shape": "box", "lower": -1.0, "upper": 3.0}
 def test_faces_that_cannot_reflect_are_refused_by_name(sections, message):
     with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
         scene(**sections)
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"camera": {"position": [0.0, -0.9, 0.0]}}, "camera.aperture_diameter: reaches 0.1 m through y_low"),
+        (
+            {"laser": {"profile": "collimated", "beam_radius": 0.3, "position": [0.0, -0.9, 0.0]}},
+            "laser.beam_radius: reaches 0.2 m through y_low",
+        ),
+    ],
+)
+def test_a_lens_or_a_beam_through_a_face_is_refused(sections, message):
+    one = scene(domain={**BOX, "outside_index": {"y_low": 1.0}}, **sections)
+    with pytest.raises(ConfigError, match=message):
+        simulate(one, photons=10, device="cpu")
 
 
 def test_faces_that_reflect_survive_a_scene_file():
