@@ -13,6 +13,7 @@ from spadwarp.errors import ArgumentError, FileError
 
 __all__ = ["histogram_of_tags", "most_values"]
 
+_MOST_BINS = 1_000_000  # as of a scene's gate
 _MOST_VALUES = 1 << 29  # 2 GiB of counts
 
 
@@ -46,10 +47,18 @@ def histogram_of_tags(
             raise FileError("time tags are not all whole numbers")
     elif tags.dtype.kind not in "iu":
         raise FileError(f"time tags are {tags.dtype}, not whole numbers")
+    if not -(2**62) < int(tags.min()) <= int(tags.max()) < 2**62:
+        raise FileError(f"time tags from {tags.min()} to {tags.max()} are beyond 2^62")
     tags = tags.astype(np.int64)
     first = int(tags.min()) // step * step
     bins = (int(tags.max()) - first) // step + 1
-    most_values((*cells.shape, bins), f"a wider bin than {step * unit * 1e12:g} ps (--bin-width-ps)")
+    wider = f"a wider bin than {step * unit * 1e12:g} ps (--bin-width-ps)"
+    if bins > _MOST_BINS:
+        raise ArgumentError(
+            f"time tags from {tags.min()} to {tags.max()} are {bins} bins, more than {_MOST_BINS}; {wider} would help,"
+            " unless a tag is wrong"
+        )
+    most_values((*cells.shape, bins), wider)
     counts = np.zeros(cells.size * bins, np.int32)
     np.add.at(counts, np.repeat(np.arange(cells.size), sizes) * bins + (tags - first) // step, 1)
     return counts.reshape(*cells.shape, bins), step * unit, first

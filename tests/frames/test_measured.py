@@ -168,9 +168,16 @@ def test_facts_that_are_missing_are_asked_for_or_said(tmp_path):
     assert np.array_equal(wide.values, np.pad(COUNTS, [(0, 0), (0, 0), (2, 3)]).reshape(3, 5, 9, 5).sum(-1))
     assert (wide.bin_width, wide.gate_start) == pytest.approx((2e-11, 5 * 4e-12))
     far = cells(COUNTS, 7)
-    far[0, 0] = np.array([[2**40]])
+    for tag in (2**40, 2**20 + 30):  # one bit that is wrong
+        far[0, 0] = np.array([[tag]])
+        scipy_io.savemat(tmp_path / "far.mat", {"Ts": far})
+        with pytest.raises(
+            ArgumentError, match=rf"to {tag} are .* a wider bin than 4 ps \(--bin-width-ps\) would help"
+        ):
+            read_histograms(tmp_path / "far.mat", tag_unit=4e-12, **START)
+    far[0, 0] = np.array([[2**63 + 5]], np.uint64)
     scipy_io.savemat(tmp_path / "far.mat", {"Ts": far})
-    with pytest.raises(ArgumentError, match=r"a wider bin than 4 ps \(--bin-width-ps\) would help"):
+    with pytest.raises(FileError, match=r"beyond 2\^62|not all whole"):
         read_histograms(tmp_path / "far.mat", tag_unit=4e-12, **START)
     scipy_io.savemat(tmp_path / "flat.mat", {"spad": pytest.importorskip("scipy.sparse").eye_array(15, 40).tocsc()})
     with pytest.raises(ArgumentError, match=r"image's size is missing \(--image-size\): 15 pixels"):
