@@ -101,3 +101,33 @@ def test_light_scattered_once_between_two_faces_is_that_of_the_images(estimator,
     assert totals.mean() == pytest.approx(expected.sum(), abs=4.5 * totals.std(ddof=1) / 4)
     seen = expected > 0
     assert (np.abs(mean - expected)[seen] < 5.5 * error[seen]).all()
+
+
+def test_analog_counts_what_it_drops_for_too_many_reflections(device):
+    """Without mirrored connections, and with so many that hardly anything is left out; next_event reports none."""
+    results = [
+        spadwarp.simulate(
+            tank(domain={"max_reflections": longest}, transport={"estimator": "analog"}), photons=60_000, device=device
+        )
+        for longest in (0, 3)
+    ]
+    dropped, none = (result.counters["beyond_max_reflections"] for result in results)
+    assert dropped > 100 > 2 >= none
+    # A history that has ended already flies on no further, which is not counted.
+    gained = results[1].counters["contributions"] - results[0].counters["contributions"]
+    assert dropped - none <= gained < 1.1 * (dropped - none)
+    assert results[0].counters["reflections"] > 10_000
+    for result in results:
+        assert result.ledger_report()["exact"]
+    # The transport itself, up to the light of last events, is the same: no weight is taken by what is dropped.
+    assert results[0].ledger["absorbed_water"] == results[1].ledger["absorbed_water"]
+
+
+def test_ballistic_light_has_not_been_reflected(device):
+    """Faces that reflect leave it as it is, to the bit."""
+    walls = tank(transport={"estimator": "next_event"})
+    runs = [
+        spadwarp.simulate(one, photons=20_000, device=device).component("ballistic")
+        for one in (walls, walls.with_overrides({"domain.outside_index": None}))
+    ]
+    np.testing.assert_array_equal(*runs)
