@@ -26,6 +26,7 @@ SMALLER = {
     r"^(spadwarp simulate (?!.*(--photons|--resume)).*)": r"\1 --photons 5e3",
     r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
     r"--pulses 20000": "--pulses 500",
+    r"(--trajectory \S+)": r"\1 --photons 5e3 --set camera.width=16 --set camera.height=12",
     r"--steps 24": "--steps 9",
     r"--size 320 240": "--size 64 48",
     r"dataset make \S+": "dataset make small --set scenes_per_target=1 --set frames.per_scene=2",
@@ -81,7 +82,15 @@ def checkout(tmp_path, monkeypatch):
         (folder / name).symlink_to(ROOT / name)
     monkeypatch.chdir(folder)
     yield folder
-    left = {path.name for path in folder.iterdir()} - {"configs", "kernels", "out", "data", "runs", "bust.stl"}
+    left = {path.name for path in folder.iterdir()} - {
+        "configs",
+        "kernels",
+        "out",
+        "data",
+        "runs",
+        "bust.stl",
+        "poses.csv",
+    }
     assert not left, f"{left} would be left in the checkout"
 
 
@@ -112,8 +121,9 @@ def test_python_in_the_text_runs(page, checkout, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=by_name)
 def test_commands_in_the_text_run(page, checkout):
-    """The commands of a page, one after the other. A mesh, a depth frame and a result are the reader's own."""
+    """The commands of a page, one after the other. A mesh, poses, a depth frame and a result are the reader's."""
     trimesh.creation.box().export("bust.stl")
+    Path("poses.csv").write_text("time,camera.position[2]\n0.0,0.0\n0.1,0.4\n")
     if page.name == "denoising.md":
         Path("out").mkdir()
         np.save("out/depth.npy", np.full((24, 32), 15.0))
