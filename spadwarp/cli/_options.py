@@ -75,6 +75,8 @@ def from_to(text: str, unit: str, option: str) -> tuple[float, float]:
             raise typer.BadParameter(
                 f"{shown(text)} is ambiguous: {with_unit} has a unit and {without} has none; write the unit of both"
             )
+        if first > second:
+            raise typer.BadParameter(f"{shown(text)} is FROM:TO; {parts[0]} is more than {parts[1]}")
     except typer.BadParameter as error:
         error.param_hint = option
         raise

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.hdf5_file import Hdf5File
-from spadwarp.io.paths import existing_file
+from spadwarp.io.paths import existing_file, used
 
 if TYPE_CHECKING:
     import h5py
@@ -107,13 +107,14 @@ def open_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
     try:
         opened = h5py.File(path, "r")
     except (OSError, RuntimeError) as error:
-        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(path) else "not an HDF5 file"
+        problem = f"damaged or not readable: {error}" if h5py.is_hdf5(path) else f"not an HDF5 file{used(path)}"
         raise FileError(f"{path}: {problem}") from error
     file = Hdf5File(opened, path, format or "HDF5 file of this kind")
     try:
         found = file.attribute("format", "unknown")
         if format is not None and not (isinstance(found, str) and found == format):
-            raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}")
+            hint = "; give the directory of a run of `spadwarp simulate`" if format == "spadwarp result" else ""
+            raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}{hint}")
         if version is not None and (newer := file.integer("format_version")) > version:
             raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
     except BaseException:

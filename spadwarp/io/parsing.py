@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ConfigError, FileError
+from spadwarp.io.paths import similar, used
 from spadwarp.limits import Interval, parse_number, shown
+from spadwarp.units import UNITS
 
 __all__ = ["parse_json", "parse_toml", "read_columns", "read_text", "read_toml"]
 
@@ -33,7 +35,8 @@ def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> 
         with open(path, "rb") as file:
             content = file.read(largest + 1)
     except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+        hint = similar(path) if isinstance(error, FileNotFoundError) else ""
+        raise FileError(f"{path}: cannot be read: {error.strerror}{hint}") from None
     except ValueError:  # a NUL in the name
         raise FileError(f"{str(path)!r} is no name of a file") from None
     if len(content) > largest:
@@ -41,7 +44,7 @@ def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> 
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FileError(f"{path}: not a text file: {error}") from None
+        raise FileError(f"{path}: not a text file: {error}{used(path)}") from None
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -60,12 +63,27 @@ def parse_toml(text: str, *, source: str | None = None) -> dict[str, Any]:
             raise ValueError(f"a key in line {text.count(chr(10), 0, key.start()) + 1} has 64 parts or more")
         tables = tomllib.loads(text, parse_float=_parse_float)
     except ValueError as error:
-        raise ConfigError(f"not valid TOML: {error}", source=source) from None
+        raise ConfigError(f"not valid TOML: {error}{_bare_unit(text, str(error))}", source=source) from None
     except RecursionError:
         raise ConfigError("not valid TOML: lists or tables are nested too deeply", source=source) from None
     if problems := list(_problems(tables)):
         raise ConfigError(problems, source=source)
     return tables
+
+
+# A number and what follows it, outside quotes.
+_WITH_UNIT = re.compile(r"""(?<![\w.+"'-])([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d,"'#[\]]+)""", re.I | re.A)
+
+
+def _bare_unit(text: str, error: str) -> str:
+    """What to add to the error of a line such as `aperture_diameter = 20 mm`."""
+    if (place := re.search(r"at line (\d+)", error)) is None:
+        return ""
+    line = text.split("\n")[int(place[1]) - 1][:200]
+    for number, unit in _WITH_UNIT.findall(line.partition("=")[2]):
+        if unit in UNITS:
+            return f'; a number with a unit needs quotes: "{number} {unit}"'
+    return ""
 
 
 def _parse_float(text: str) -> float:

@@ -9,10 +9,46 @@ from typing import Any
 
 from spadwarp.errors import FileError
 from spadwarp.io.examples import examples
+from spadwarp.limits import suggestion
 
-__all__ = ["check_apart", "existing_file", "file_problem", "file_within", "is_stream"]
+__all__ = [
+    "MESH_ENDINGS",
+    "check_apart",
+    "existing_file",
+    "file_problem",
+    "file_within",
+    "is_stream",
+    "similar",
+    "used",
+]
+
+MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
+"""Of files that are meshes."""
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
+
+
+def similar(path: str | os.PathLike[str]) -> str:
+    """What to add to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
+    it."""
+    place = Path(path)
+    try:
+        beside = [one for one in os.listdir(place.parent) if one.endswith(place.suffix)]
+    except (OSError, ValueError):
+        return ""
+    return suggestion(place.name, beside)
+
+
+def used(path: str | os.PathLike[str]) -> str:
+    """What to add to an error about a file of another kind: how a scene, a mesh or a result is used."""
+    ending = Path(path).suffix.lower()
+    if ending == ".toml":
+        return f"; if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it"
+    if ending in MESH_ENDINGS:
+        return f"; a mesh goes into a scene: `spadwarp simulate SCENE --mesh {path} --out DIR`"
+    if ending in (".h5", ".hdf5"):
+        return "; HDF5 files hold results, and a scene is a .toml file"
+    return ""
 
 
 def file_problem(path: str | os.PathLike[str]) -> str | None:
@@ -29,7 +65,7 @@ def existing_file(path: str | Path) -> Path:
     """The path of a file that exists. Raises `FileError`, also for folders, pipes and names that no file can have."""
     if (problem := file_problem(path)) is not None:
         scene = str(path) in examples("scenes")
-        hint = f"; `spadwarp simulate {path} --out DIR` makes a result of this scene" if scene else ""
+        hint = f"; `spadwarp simulate {path} --out DIR` makes a result of this scene" if scene else similar(path)
         raise FileError(f"{path}: {problem}{hint}")
     return Path(path)
 

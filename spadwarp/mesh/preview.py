@@ -73,7 +73,7 @@ class MeshSummary:
 
 def describe_mesh(path: str | Path) -> MeshSummary:
     """Size, unit, orientation and closedness of a mesh file (STL, OBJ, PLY, OFF, GLB, USD). Raises `MeshError`."""
-    mesh = load_target(Target(mesh=str(path)), field="mesh")
+    mesh = load_target(Target(mesh=str(path)), field="")
     low, high = np.asarray(mesh.bounds, np.float64)
     extent, centre = high - low, 0.5 * (low + high)
     guess = guess_unit(float(extent.max()))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import MeshError
-from spadwarp.io.paths import file_problem
+from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
 from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
@@ -163,7 +163,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
 
     Args:
         target: What and where.
-        field: How errors and warnings name the target.
+        field: How errors and warnings name the target; if empty, they name its file.
 
     Raises:
         MeshError: Missing or unreadable file, unknown built-in, or a mesh that is empty, not finite or has no area.
@@ -175,9 +175,11 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
     """`load_target`, and the images of a file that gives the reflectance."""
     images: Images = ()
     if target.mesh is not None:
-        name, path = f"{field}.mesh = {target.mesh!r}", Path(target.mesh)
+        name, path = f"{field}.mesh = {target.mesh!r}" if field else target.mesh, Path(target.mesh)
         if (problem := file_problem(path)) is not None:
-            raise MeshError(f"{name}: {problem}")
+            raise MeshError(f"{name}: {problem}{similar(path) if problem == 'no such file' else ''}")
+        if path.suffix.lower() not in MESH_ENDINGS and path.suffix[1:].lower() not in _other_endings():
+            raise MeshError(f"{name}: {path.suffix!r} is no ending of a mesh file; {', '.join(MESH_ENDINGS)} are read")
         if target.reflectance == "from_file":
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
         else:
@@ -234,6 +236,13 @@ def placement(
     matrix[:3, :3] = rotation_matrix(rotation_deg) * scale
     matrix[:3, 3] = translation
     return matrix
+
+
+def _other_endings() -> set[str]:
+    """Endings, without the dot, of the formats that trimesh reads."""
+    import trimesh
+
+    return trimesh.available_formats()
 
 
 def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:

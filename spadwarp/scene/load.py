@@ -12,7 +12,7 @@ from typing import Any
 
 from spadwarp.errors import ConfigError
 from spadwarp.io.parsing import parse_toml
-from spadwarp.limits import parse_number, shown
+from spadwarp.limits import parse_number, shown, suggestion
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.phase_fields import PHASE_FIELDS
 from spadwarp.scene.preset import PRESETS, Preset
@@ -101,6 +101,12 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
 def _preset(section: str, fields: Mapping[str, Any]) -> Preset | None:
     name = fields.get("preset")
     return PRESETS.get(section, {}).get(name) if isinstance(name, str) else None
+
+
+def preset_hint(section: str, word: Any) -> str:
+    """What to add to an error about a word in place of a table: how a preset is taken."""
+    known = PRESETS.get(section, {})
+    return f'; a preset is taken by {{preset = "{word}"}}' if word in known else suggestion(word, list(known))
 
 
 def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:
@@ -263,7 +269,9 @@ def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
     elif shape == (str, str, str) and key[:2] in _TABLES and isinstance(fields, dict):
         inner = fields.setdefault(key[1], {})
         if not isinstance(inner, dict):
-            raise ConfigError(f"override {shown(key_text(key))}: {key_text(key[:2])} = {shown(inner)} is not a table")
+            hint = preset_hint(_TABLES[key[0], key[1]], inner)
+            text = f"override {shown(key_text(key))}: {key_text(key[:2])} = {shown(inner)} is not a table{hint}"
+            raise ConfigError(text)
         inner[key[2]] = value
     else:
         raise ConfigError(

@@ -11,8 +11,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from spadwarp.limits import Interval, shown, suggestion
-from spadwarp.scene.load import Key, key_text
+from spadwarp.scene.load import Key, key_text, preset_hint
 from spadwarp.scene.quantities import field_unit
+from spadwarp.units import quantity
 
 # What people write for a field's name, beyond misspellings.
 _SYNONYMS = {
@@ -97,11 +98,12 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         if not key:  # of the scene as a whole
             return text
         if not whole_table:
-            return f"{entry} {text}"
+            return f"{entry} {text}{_factor(key, value)}"
         return f"{name} {text}" if text.startswith(("needs", "holds", "is ")) else f"{name}.{text}"
     choices = _choices(info, cause)
     if kind in _LIMITS and info is not None:
-        return f"{entry} is outside {_interval(info)}" + "".join(f" and not {word!r}" for word in choices)
+        others = "".join(f" and not {word!r}" for word in choices)
+        return f"{entry} is outside {_interval(info)}{others}{_percentage(info, value)}"
     if choices and kind in _KINDS and isinstance(value, str):
         return f"{entry} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
     if choices:
@@ -109,9 +111,35 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
         return f"{entry} is not one of {listed}{_suggest(value, choices)}"
     if kind in _KINDS:
-        return f"{entry} is not {_KINDS[kind]}"
+        return f"{entry} is not {_KINDS[kind]}{_instead(key, info, kind, value)}"
     message = problem["msg"]
     return f"{entry}: {message[0].lower()}{message[1:]}"
+
+
+def _factor(key: Key, value: Any) -> str:
+    """What to add where a mesh's scale is given as a length."""
+    try:
+        metres = quantity(value if any(map(str.isdigit, value)) else f"1 {value}", "m") if key[-1] == "scale" else None
+    except (TypeError, ValueError):
+        return ""
+    return "" if metres is None else f"; for a mesh in units of {value.strip()} write {metres:g}"
+
+
+def _percentage(info: FieldInfo, value: Any) -> str:
+    """What to add where a ratio within [0, 1] is given in per cent."""
+    bounds, number = _limits(info), isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or field_unit(info) != "1" or bounds.low < 0.0 or bounds.high != 1.0 or not 1 < value <= 100:
+        return ""
+    return f'; did you mean "{value:g} %"?' if 0.01 * value in bounds else ""
+
+
+def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
+    """What to write in place of a value of another kind."""
+    if kind == "tuple_type" and isinstance(value, Mapping):
+        return f" of tables; write [[{key_text(key)}]]"
+    if kind in ("model_type", "model_attributes_type") and isinstance(value, str) and info is not None:
+        return "".join(preset_hint(getattr(one, "section", ""), value) for one in list(_models(info.annotation))[:1])
+    return _factor(key, value)
 
 
 def _fields(model: type[BaseModel], key: Key) -> list[str]:
@@ -144,6 +172,12 @@ def _literals(annotation: Any) -> Iterator[str]:
 
 def _interval(info: FieldInfo) -> str:
     """The range of a numeric field with its unit, such as `(0, 1e6] 1/m`."""
+    interval, unit = _limits(info), field_unit(info)
+    return str(interval) if unit in (None, "1") else f"{interval} {unit}"
+
+
+def _limits(info: FieldInfo) -> Interval:
+    """The range of a numeric field."""
     interval = Interval(-math.inf, math.inf, False, False)
     for bound in _bounds(info):
         for name, includes in (("gt", False), ("ge", True)):
@@ -152,8 +186,7 @@ def _interval(info: FieldInfo) -> str:
         for name, includes in (("lt", False), ("le", True)):
             if getattr(bound, name, None) is not None:
                 interval = interval._replace(high=getattr(bound, name), includes_high=includes)
-    unit = field_unit(info)
-    return str(interval) if unit in (None, "1") else f"{interval} {unit}"
+    return interval
 
 
 def _bounds(holder: Any) -> Iterator[Any]:

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import parse_toml, read_toml
+from spadwarp.io.paths import MESH_ENDINGS, used
 from spadwarp.limits import shown
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic
@@ -260,6 +261,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "scenes")
+    if path.suffix.lower() in (*MESH_ENDINGS, ".h5", ".hdf5") and path.is_file():
+        raise FileError(f"{path}: not a scene{used(path)}")
     return _build(read_toml(path), overrides=overrides, source=path)
 
 

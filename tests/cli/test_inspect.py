@@ -144,3 +144,6 @@ def test_targets_looks_at_mesh_files(tmp_path):
     assert found["scale"] == 0.001 and found["hints"]
     assert (tmp_path / "pictures" / "box.png").stat().st_size > 5000
     assert "no such file" in run("targets", tmp_path / "nothing.stl", code=1).stderr
+    (tmp_path / "figure.py").write_text("")
+    complaint = run("targets", tmp_path / "figure.py", code=1).stderr
+    assert complaint.startswith(f"error: {tmp_path / 'figure.py'}: '.py' is no ending of a mesh file; .stl, .obj")

@@ -75,6 +75,7 @@ def test_two_numbers_take_units(text, unit, values):
         ("plan", "--range", "10cm:1", "is ambiguous"),
         ("plan", "--range", "10ns:60ns", "is a time; a length is needed"),
         ("plan", "--range", "1:2:3", "FROM:TO"),
+        ("plan", "--range", "9m:8m", "9m is more than 8m"),
         ("budget", "--range", "1:10cm:5", "is ambiguous"),
         ("budget", "--range", "1,10cm", "is ambiguous"),
     ],

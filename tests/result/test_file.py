@@ -145,9 +145,13 @@ def test_missing_foreign_and_newer_files_are_told_apart(result, tmp_path):
     assert "is not a file" in error_of(tmp_path)
     (tmp_path / "text.h5").write_text("not HDF5")
     assert "not an HDF5 file" in error_of(tmp_path / "text.h5")
+    (tmp_path / "planned.toml").write_text("[medium]")
+    assert "`spadwarp simulate" in error_of(tmp_path / "planned.toml")
+    assert "did you mean 'planned.toml'?" in error_of(tmp_path / "planed.toml")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["data"] = np.arange(3)
-    assert "not a spadwarp result" in error_of(tmp_path / "foreign.h5")
+    assert "not a spadwarp result" in (text := error_of(tmp_path / "foreign.h5"))
+    assert "the directory of a run" in text
     with h5py.File(tmp_path / "foreign.h5", "r+") as file:
         file.attrs["format"] = "spadwarp frames"
     assert "its format is 'spadwarp frames'" in error_of(tmp_path / "foreign.h5")

@@ -102,6 +102,14 @@ def test_files_and_overrides_take_units(tmp_path):
         ("detector.pdp=3 x", "detector.pdp = '3 x' (an override) is text; a number without quotes"),
         ("gate.bins=5 ns", "gate.bins = '5 ns' (an override) is not an integer"),
         ("medium.albedo=fast", "is neither a number nor 'lu2024'"),
+        ("targets[0].scale='1 mm'", "; for a mesh in units of 1 mm write 0.001"),
+        ("targets[0].scale=mm", "; for a mesh in units of mm write 0.001"),
+        ("targets[0].reflectance=30", "is outside [0, 1] and not 'from_file'; did you mean \"30 %\"?"),
+        ("detector.pdp=25", 'did you mean "25 %"?'),
+        ("laser.pulse_energy=[20 mJ]", '; a number with a unit needs quotes: "20 mJ"'),
+        ("camera.port=flat-glass", '; a preset is taken by {preset = "flat-glass"}'),
+        ("camera.port=flat-glas", "; did you mean 'flat-glass'?"),
+        ("medium=uwoc-harbour", '; a preset is taken by {preset = "uwoc-harbour"}'),
     ],
 )
 def test_wrong_kinds_are_refused_by_name(override, words):

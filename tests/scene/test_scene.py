@@ -269,6 +269,11 @@ def test_fields_that_contradict_each_other_are_refused(section, fields, message)
             "camera needs either aperture_diameter or f_number with focal_length",
         ),
         ({"targets": [{"builtin": "plane"}]}, ["targets[2].scale=2"], "targets[2] does not exist; the scene has 1"),
+        (
+            {"targets": {"builtin": "plane"}},
+            None,
+            "targets = {'builtin': 'plane'} is not a list of tables; write [[targets]]",
+        ),
     ],
 )
 def test_what_is_missing_is_named(tables, override, message):
@@ -297,12 +302,29 @@ def test_a_missing_or_broken_file_is_named(tmp_path):
     with pytest.raises(FileError, match=r"nowhere\.toml: cannot be read: No such file"):
         load_scene(tmp_path / "nowhere.toml")
     broken = tmp_path / "broken.toml"
+    with pytest.raises(FileError, match=r"did you mean 'broken\.toml'"):
+        broken.write_bytes(b"")
+        load_scene(tmp_path / "brokn.toml")
     broken.write_bytes(b"[medium\n")
     with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
         load_scene(broken)
     broken.write_bytes(b"\xff\xfe")
     with pytest.raises(FileError, match=r"broken\.toml: not a text file"):
         load_scene(broken)
+
+
+@pytest.mark.parametrize("line", ["aperture_diameter = 20 mm", "position = [0, 20mm, 0]"])
+def test_a_number_with_a_unit_needs_quotes(line, tmp_path):
+    (tmp_path / "scene.toml").write_text(f"[camera]\nwidth = 4\n{line}\n")
+    with pytest.raises(ConfigError, match=r'line 3, .*; a number with a unit needs quotes: "20 mm"'):
+        load_scene(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize(("name", "words"), [("a.stl", "SCENE --mesh"), ("a.h5", "results")])
+def test_files_of_another_kind_are_no_scene(name, words, tmp_path):
+    (tmp_path / name).write_bytes(b"\xff")
+    with pytest.raises(FileError, match=f"not a scene; .*{words}"):
+        load_scene(tmp_path / name)
 
 
 def test_models_are_frozen():
