@@ -269,7 +269,7 @@ def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
     elif shape == (str, str, str) and key[:2] in _TABLES and isinstance(fields, dict):
         inner = fields.setdefault(key[1], {})
         if not isinstance(inner, dict):
-            hint = preset_hint(_TABLES[key[0], key[1]], inner)
+            hint = preset_hint(_TABLES[str(key[0]), str(key[1])], inner)
             text = f"override {shown(key_text(key))}: {key_text(key[:2])} = {shown(inner)} is not a table{hint}"
             raise ConfigError(text)
         inner[key[2]] = value

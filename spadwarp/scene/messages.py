@@ -102,8 +102,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         return f"{name} {text}" if text.startswith(("needs", "holds", "is ")) else f"{name}.{text}"
     choices = _choices(info, cause)
     if kind in _LIMITS and info is not None:
-        others = "".join(f" and not {word!r}" for word in choices)
-        return f"{entry} is outside {_interval(info)}{others}{_percentage(info, value)}"
+        words = "".join(f" and not {word!r}" for word in choices)
+        return f"{entry} is outside {_interval(info)}{words}{_percentage(info, value)}"
     if choices and kind in _KINDS and isinstance(value, str):
         return f"{entry} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
     if choices:
