@@ -166,7 +166,7 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
         }
     signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
-    bound, shot = _bounds(both, device)
+    bound, shot = _bounds(both, (first, second), device)
     noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
@@ -175,8 +175,8 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
         backscatter=median(both.component("backscatter").sum(axis=-1) * scale),
         noise=noise,
         brightest=float(np.quantile(both.detections.sum(axis=-1), 0.99)),
-        bound=_finite_median(bound[seen]),
-        shot_noise=_finite_median(shot[seen]),
+        bound=_known_median(bound[seen]),
+        shot_noise=_known_median(shot[seen]),
         floor={name: abs(bias[name]) if even else _finite_median(np.abs(errors[name][seen])) for name in errors},
         bias=bias,
         unscattered_floor={name: _finite_median(np.abs(error[seen])) for name, error in alone.items()},
@@ -199,6 +199,12 @@ def _as_traced(traced: Scene, wanted: Scene) -> Scene:
 def _finite_median(values: Floats) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else math.inf
+
+
+def _known_median(values: Floats) -> float:
+    """With infinite ones."""
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else math.inf
 
 
 def _depth_error(result: Result, frames: Frames, histogram: Floats | None, method: Any, device: str | None) -> Floats:
@@ -230,16 +236,22 @@ def _return(signal: Floats, background: Floats, result: Result) -> tuple[Floats,
     return peak, level
 
 
-def _bounds(result: Result, device: str | None) -> tuple[Floats, Floats]:
-    """Bounds of depth for one pulse [m], `[H, W]`: as the detector records it, and without background and pile-up."""
+def _bounds(result: Result, runs: tuple[Result, Result], device: str | None) -> tuple[Floats, Floats]:
+    """Bounds of depth for one pulse [m], `[H, W]`: as the detector records it, and without background and pile-up.
+
+    The difference of the runs says how much of the information is noise; inf where all of it is.
+    """
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
-    signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
+    signal, first, second = (
+        (run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
+    )
     background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     options: dict[str, Any] = {
         "bin_width": scene.gate.bin_width,
         "pulses": 1,
         "irf": detector_response(scene.detector, scene.laser),
+        "signal_variance": np.square(0.5 * (first - second)),
         "device": device,
     }
     law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +25,9 @@ _DETECTOR_FIELDS = (
     *(f"laser.{name}" for name in ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps")),
     *(f"laser.{name}" for name in ("linewidth_nm", "spectrum")),
 )
+
+_MEDIAN_PER_SIGMA = 0.6745  # of the absolute values of normal errors
+_NOISE = 0.1  # part of the bound's information that is noise of the simulation, from which on it is said
 
 
 @app.command()
@@ -104,6 +108,8 @@ def detect(
         )
     for note in recording.notes:
         complain(f"note: {note}")
+    if recording.bound_noise > _NOISE:
+        complain(f"note: {_bound_noise(recording, result.photons)}")
     written = [recording.path, draw_recording(recording, result, out / "frame.png")]
     summary = _summary(recording, frames)
     if not quiet:
@@ -136,7 +142,8 @@ def _with_detector(result: Result, overrides: list[str] | None) -> Result:
 def _summary(recording: Recording, frames: int) -> dict[str, Any]:
     import numpy as np
 
-    first, bound = recording.first, recording.bound_depth[np.isfinite(recording.bound_depth)]
+    first, bound = recording.first, recording.bound_depth[~np.isnan(recording.bound_depth)]
+    median = float(np.median(bound)) if bound.size else math.inf
     pixels = first.counts.shape[1] * first.counts.shape[2]
     return {
         "pulses": first.pulses,
@@ -144,7 +151,11 @@ def _summary(recording: Recording, frames: int) -> dict[str, Any]:
         "seed": first.seed,
         "detections_per_frame_and_pixel": recording.detections / (frames * pixels),
         "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
-        "bound": {"pixels": int(bound.size), "median_m": float(np.median(bound)) if bound.size else None},
+        "bound": {
+            "pixels": int(bound.size),
+            "median_m": median if math.isfinite(median) else None,
+            "noise_fraction": recording.bound_noise if math.isfinite(recording.bound_noise) else None,
+        },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
         "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
         "notes": list(recording.notes),
@@ -157,15 +168,29 @@ def _lines(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
         "frames": f"{opt.count(summary['frames'])} of {opt.count(summary['pulses'])} pulses, seed {summary['seed']}",
         "detections": f"{summary['detections_per_frame_and_pixel']:.4g} a frame and pixel, "
         f"{summary['detections_per_pulse_and_pixel']:.3g} a pulse and pixel",
-        "bound": "no depth information in any pixel"
+        "bound": ("unknown" if summary["bound"]["pixels"] else "no depth information in any pixel")
         if median is None
-        else f"{1000 * median:.3g} mm of depth in the median pixel (Cramér–Rao, one frame)",
+        else f"standard deviation {1000 * median:.3g} mm of depth in the median pixel (Cramér–Rao, one frame); normal "
+        f"errors then have a median of {1000 * _MEDIAN_PER_SIGMA * median:.3g} mm",
     }
     for name, error in recording.errors.items():
         lines[name] = (
-            f"{100 * error.estimate_fraction:.3g} % of the target's pixels; error {1000 * error.median:.3g} mm in the "
-            f"median, below {1000 * error.p90:.3g} mm in 90 %"
+            f"{100 * error.estimate_fraction:.3g} % of the target's pixels; median error {1000 * error.median:.3g} mm, "
+            f"below {1000 * error.p90:.3g} mm in 90 %"
             if error.estimate_fraction > 0.0
             else "no pixel of the target has a depth"
         )
     return lines
+
+
+def _bound_noise(recording: Recording, photons: int) -> str:
+    """How much of the bound's information was noise, and the photons that would leave a tenth."""
+    noise = min(recording.bound_noise, 0.999)
+    needed = photons * noise / (1.0 - noise) * (1.0 - _NOISE) / _NOISE
+    return (
+        f"{100 * noise:.2g} % of the information in the median pixel was noise of the simulation; the Cramér–Rao bound "
+        f"is without it"
+        + (", and only roughly known" if noise > 0.3 else "")
+        + f"; about {needed:.1e} photons instead "
+        f"of {photons:.1e} would make that {100 * _NOISE:g} %"
+    )

@@ -28,6 +28,7 @@ def crlb_from_histogram(
     pulses: float,
     irf: InstrumentResponse | float | ArrayLike | None = None,
     law: Literal["poisson", "first_photon"] = "poisson",
+    signal_variance: ArrayLike | None = None,
     device: Any = None,
 ) -> Map:
     """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
@@ -43,10 +44,14 @@ def crlb_from_histogram(
         irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
             value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
+        signal_variance: Square of the standard error of `signal_cube`, of the same shape, where it is a Monte Carlo
+            estimate. Its noise would count as information, and the bound would be too small: a slope that is a sum of
+            bins with weights w has Σ w² var more in the mean of its square, which is subtracted, for independent bins
+            and to first order: where more than a third of the information is noise, the bound comes out too large.
         device: Warp device; default: the first GPU, else the CPU.
 
     Returns:
-        float64 `[...]` [s]; NaN where the histogram holds no information.
+        float64 `[...]` [s]; NaN where the histogram holds no information, inf where its noise makes up all of it.
 
     Raises:
         ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
@@ -76,9 +81,33 @@ def crlb_from_histogram(
         wp.array(slope_taps, dtype=wp.float64, device=device),
         first_photon=law == "first_photon",
     ).numpy()
+    is_known = information > 0
+    if signal_variance is not None:
+        variance = np.asarray(signal_variance, np.float64)
+        if variance.shape != signal.shape or not (np.isfinite(variance).all() and (variance >= 0).all()):
+            raise ArgumentError(
+                f"signal_variance has shape {variance.shape} or a value outside [0, inf); {signal.shape}"
+            )
+        total = np.asarray(signal + background, np.float64).reshape(-1, bins)
+        noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law)
+        information = np.maximum(information - noise, 0.0)
     with np.errstate(divide="ignore"):
         sigma = bin_width / np.sqrt(pulses * information)
-    return np.where(information > 0, sigma, np.nan).reshape(signal.shape[:-1])
+    return np.where(is_known, sigma, np.nan).reshape(signal.shape[:-1])
+
+
+def _information_of_noise(variance: Map, total: Map, taps: Map, slope_taps: Map, law: str) -> Map:
+    """What independent noise of the bins adds to the mean of the Fisher information per pulse, in 1/bins²."""
+    from scipy.ndimage import convolve1d
+
+    added = np.empty(len(total))
+    for i, row in enumerate(total):  # one pixel at a time: cubes are large
+        rate = convolve1d(row, taps, mode="constant")
+        squares = convolve1d(variance[i], slope_taps**2, mode="nearest")
+        if law == "first_photon":
+            squares, rate = squares * np.exp(-np.cumsum(rate)), -np.expm1(-rate)
+        added[i] = np.divide(squares, rate, out=np.zeros_like(rate), where=rate > 0).sum()
+    return added
 
 
 def crlb(
@@ -91,7 +120,9 @@ def crlb(
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
-    The scene's instrument response is applied.
+    The scene's instrument response is applied. The noise of the simulation counts as information and makes the bound
+    too small; it is subtracted where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where
+    it is all there is.
 
     Args:
         result: Of `spadwarp.simulate`, or its path.
@@ -103,6 +134,12 @@ def crlb(
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
     background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
+    variance = None
+    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+        # The errors are those of all light: the signal has its part of the variance.
+        light = result.histogram * scale
+        part = np.divide(signal, light, out=np.zeros_like(light), where=light > 0)
+        variance = np.square(result.standard_error * scale) * part
     return crlb_from_histogram(
         signal,
         background,
@@ -110,6 +147,7 @@ def crlb(
         pulses=scene.pulses_per_depth_frame if pulses is None else pulses,
         irf=detector_response(scene.detector, scene.laser),
         law=law,
+        signal_variance=variance,
         device=device,
     )
 

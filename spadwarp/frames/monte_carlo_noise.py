@@ -55,7 +55,8 @@ class MonteCarloNoise:
 
 UNKNOWN = (
     "Monte Carlo noise is unknown: the result keeps no standard errors (simulate with --uncertainty); the noise of its "
-    "histograms is drawn as if it were light, the same in every frame"
+    "histograms is drawn as if it were light, the same in every frame, and counts as information in the Cramér–Rao "
+    "bound, which is too small where few photons were traced"
 )
 
 

@@ -51,7 +51,9 @@ class Recording:
         first: The first frame, its counts `[1, H, W, T]`.
         depth: First frame by each estimator, float64 `[H, W]` [m].
         errors: By estimator; of at most the first 256 MiB of counts.
-        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m].
+        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m]; see `crlb`.
+        bound_noise: Part of the histograms' information that was noise of the simulation and is subtracted, median of
+            the pixels; NaN if the result keeps no standard errors.
         detections: Counts of all frames.
         notes: What the simulation could not give, in words.
         monte_carlo: Its noise against the shot noise of one frame; None if the result keeps no standard errors.
@@ -63,6 +65,7 @@ class Recording:
     errors: dict[Method, FrameErrors]
     bound_time: Map
     bound_depth: Map
+    bound_noise: float
     detections: int
     notes: tuple[str, ...]
     monte_carlo: MonteCarloNoise | None
@@ -108,7 +111,7 @@ def record_frames(
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
-    bound_time, bound_depth = _bounds(result, pulses, device)
+    bound_time, bound_depth, bound_noise = _bounds(result, pulses, device)
     recording: Recording | None = None
     detections = 0
     with FramesFile.create(path) as file:
@@ -128,6 +131,7 @@ def record_frames(
                     errors={method: _errors(found, result.truth.depth) for method, found in depth.items()},
                     bound_time=bound_time,
                     bound_depth=bound_depth,
+                    bound_noise=bound_noise,
                     detections=0,
                     notes=part.notes,
                     monte_carlo=monte_carlo_noise(result, pulses=pulses),
@@ -140,14 +144,18 @@ def record_frames(
     return replace(recording, detections=detections)
 
 
-def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map]:
-    """Cramér–Rao bounds of one frame [s], [m]; NaN for a response without a derivative."""
+def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map, float]:
+    """Cramér–Rao bounds of one frame [s], [m], NaN for a response without a derivative; the part that was noise."""
     scene, distance = result.scene, result.truth.range.astype(np.float64)
-    bound = np.full(distance.shape, np.nan)
+    bound, noise = np.full(distance.shape, np.nan), np.nan
     if detector_response(scene.detector, scene.laser).is_smooth:
         law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
         bound = crlb(result, pulses=pulses, law=law, device=device)
-    return bound, bound * depth_per_time(scene, distance)
+        known = ~np.isnan(bound)
+        if result.second_moment is not None and known.any():
+            with_noise = crlb(replace(result, second_moment=None, batch_size=0), pulses=pulses, law=law, device=device)
+            noise = float(1.0 - np.median(with_noise[known] / bound[known]) ** 2)
+    return bound, bound * depth_per_time(scene, distance), noise
 
 
 def _errors(depth: Map, truth: NDArray[np.float32]) -> FrameErrors:

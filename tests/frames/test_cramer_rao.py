@@ -1,5 +1,7 @@
 """Cramér–Rao bounds from the shape of histograms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -91,3 +93,32 @@ def test_the_bound_of_a_monte_carlo_result_is_the_analytic_one_in_clear_water():
     # 600 photons land on a pixel's part of the plate: 2 % on the bound.
     np.testing.assert_allclose(found, expected, rtol=0.1)
     assert np.median(found / expected) == pytest.approx(1, abs=0.03)
+
+
+def test_noise_of_the_simulation_does_not_count_as_information():
+    """Histograms with Poisson noise: the mean of the information is that of the expected one, not above it."""
+    expected, level, events = gaussian(6.0, counts=1.0), 0.05, 100.0
+    drawn = np.random.default_rng(2).poisson(expected * events, (400, 240)) / events
+    for law in ("poisson", "first_photon"):
+        options = {"background": level, "law": law, "irf": 3.0 * FWHM_PER_SIGMA * BIN}
+        truth = bound(expected, **options) ** -2
+        noisy = bound(drawn, **options) ** -2
+        mended = bound(drawn, signal_variance=drawn / events, **options) ** -2
+        error = mended.std() / np.sqrt(len(drawn))
+        assert noisy.mean() > 1.1 * truth
+        # The noise of the denominators is of second order.
+        assert mended.mean() == pytest.approx(truth, abs=4 * error + 0.02 * truth)
+
+
+@pytest.mark.filterwarnings("ignore:.*one of 40 batches")
+def test_a_result_with_standard_errors_has_a_bound_without_their_noise():
+    murky = scene(
+        laser={"pulse_energy": 1e-12},
+        detector={"jitter_fwhm_ps": 200.0},
+        camera={"width": 4, "height": 4, "horizontal_fov_deg": 4.0},
+        transport={"estimator": "next_event"},
+    )
+    few = spadwarp.simulate(murky, photons=40_000, seed=1, uncertainty=True, device="cpu")
+    plain = dataclasses.replace(few, second_moment=None, batch_size=0)
+    with_noise, mended = (spadwarp.crlb(one, pulses=1000, device="cpu") for one in (plain, few))
+    assert (mended > with_noise).all()
