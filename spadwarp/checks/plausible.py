@@ -10,17 +10,18 @@ import numpy as np
 from spadwarp.checks.message import CheckMessage, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.mesh import guess_unit
+from spadwarp.scene.port import Port
 from spadwarp.scene.quantities import field_unit
 from spadwarp.units import quantity, with_prefix
 
 # Section → field → lowest and highest plausible value in the field's own unit, and units that people take it for.
-# 0 is always allowed: it leaves something out. Lasers from femtosecond oscillators to Q-switched, cameras from
+# 0 is always allowed: it leaves something out. Lasers from picosecond diodes to Q-switched ones of 1 kHz, cameras from
 # endoscopes to telescopes, water from pure to milk.
 _PLAUSIBLE: dict[str, dict[str, tuple[float, float, tuple[str, ...]]]] = {
     "laser": {
         "pulse_energy": (1e-14, 0.1, ("nJ", "µJ")),
-        "repetition_rate": (5.0, 1e10, ("kHz", "MHz")),
-        "pulse_fwhm_ps": (0.01, 1e5, ("s", "ns")),
+        "repetition_rate": (1e3, 1e10, ("kHz", "MHz")),
+        "pulse_fwhm_ps": (1.0, 1e5, ("s", "ns")),
         "wavelength_nm": (200.0, 2000.0, ("m", "µm")),
         "linewidth_nm": (1e-7, 300.0, ("m", "µm")),
         "half_angle_deg": (1e-3, 180.0, ()),
@@ -43,13 +44,19 @@ _PLAUSIBLE: dict[str, dict[str, tuple[float, float, tuple[str, ...]]]] = {
     },
     "gate": {
         "start_ns": (1e-3, 1e5, ("s", "µs", "ps")),
-        "bin_width_ps": (0.1, 1e6, ("s", "ns")),
+        "bin_width_ps": (0.1, 1e5, ("s", "ns", "fs")),
     },
     "medium": {
         "absorption": (1e-6, 1e3, ()),
         "scattering": (1e-6, 1e4, ()),
         "extinction": (1e-5, 1e4, ()),
     },
+}
+# Of a port with a window; that of a calm surface may be far.
+_PORT: dict[str, tuple[float, float, tuple[str, ...]]] = {
+    "distance": (1e-4, 2.0, ("mm",)),
+    "radius": (1e-3, 2.0, ("mm",)),
+    "thickness": (1e-4, 0.5, ("mm",)),
 }
 _MOST_POWER = 100.0  # [W]
 _FARTHEST = 1000.0  # [m] of a laser, a camera or a target
@@ -78,8 +85,11 @@ def check_plausible(survey: Survey) -> Iterator[CheckMessage]:
 
 
 def _check_fields(survey: Survey) -> Iterator[CheckMessage]:
-    for section, fields in _PLAUSIBLE.items():
-        model = getattr(survey.scene, section)
+    scene = survey.scene
+    tables = [(section, getattr(scene, section), fields) for section, fields in _PLAUSIBLE.items()]
+    ports = {"camera.port": scene.camera.port, "laser.port": scene.laser.port}
+    tables += [(name, port, _PORT) for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0]
+    for section, model, fields in tables:
         for name, (low, high, units) in fields.items():
             value = getattr(model, name)
             if isinstance(value, float) and value != 0.0 and not low <= value <= high:

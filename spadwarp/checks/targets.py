@@ -19,6 +19,8 @@ from spadwarp.units import path_from_time
 
 Points = NDArray[np.float64]
 
+_AROUND = 2.0  # [ns] of a gate before and after a target
+
 
 def check_targets(survey: Survey) -> Iterator[CheckMessage]:
     """Findings about the targets and about where camera and laser stand."""
@@ -50,6 +52,7 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> Iterator[Chec
     if (hidden := _why_dark(survey, name, triangles, in_view, illuminated)) is not None:
         yield hidden
         return
+    yield from _check_beam(survey, name, in_view)
     yield from _check_gate(survey, name, survey.paths(illuminated))
     yield from _check_limits(survey, name, triangles, illuminated)
     extent = np.ptp(image_points(survey.scene.camera, in_view[:, :2] / in_view[:, 2:]), axis=0)
@@ -95,13 +98,36 @@ def _check_gate(survey: Survey, name: str, paths: Points) -> Iterator[CheckMessa
         partly = "" if first >= stop or last < start else "partly "
         text = (
             f"{partly}outside the gate: its light comes back from {first:.5g} to {last:.5g} ns, the gate is open from "
-            f"{start:.5g} to {stop:.5g} ns"
+            f"{start:.5g} to {stop:.5g} ns; {_gate_that_holds(first, last, scene.gate.bin_width_ps)}"
         )
         yield warning(name, text, first_ns=first, last_ns=last, start_ns=start, stop_ns=stop)
     limit = scene.path_limit
     if paths.max() > limit < path_from_time(scene.gate.stop, scene.medium.group_index):
         text = f"max_path = {limit:.4g} m ends photons before they return from {name}, up to {paths.max():.4g} m"
         yield warning("transport.max_path", text, max_path=limit, path=float(paths.max()))
+
+
+def _gate_that_holds(first: float, last: float, width_ps: float) -> str:
+    """What to do about light from `first` to `last` [ns] outside the gate."""
+    start = max(0.0, math.floor(first - _AROUND))
+    bins = math.ceil(1e3 * (last + _AROUND - start) / width_ps)
+    if bins > 1_000_000:
+        return "`spadwarp plan` proposes one"
+    return f"start_ns = {start:g} and bins = {bins} hold it, and `spadwarp plan` proposes a gate"
+
+
+def _check_beam(survey: Survey, name: str, in_view: Points) -> Iterator[CheckMessage]:
+    """Whether the beam leaves most of what is seen of a target dark."""
+    scene, laser = survey.scene, survey.scene.beam
+    if laser.profile not in ("uniform_cone", "gaussian") or scene.scan_positions > 1 or laser.half_angle_deg >= 90.0:
+        return
+    widest = math.degrees(float(_angles(in_view, laser).max()))
+    if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
+        text = (
+            f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
+            f"{_beam_text(scene.laser)}"
+        )
+        yield note("laser.half_angle_deg", text, widest_angle_deg=widest)
 
 
 def _check_limits(survey: Survey, name: str, triangles: Points, illuminated: Points) -> Iterator[CheckMessage]:

@@ -74,8 +74,8 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
         "laser": f"{numbers['photons_per_pulse']:.3g} photons a pulse, {with_prefix(numbers['average_power'], 'W')} on "
         f"average, {with_prefix(numbers['peak_power'], 'W')} at the peak",
         "irradiance": about(numbers["irradiance"], "{:.3g} W/m² unscattered at the target, mean over time"),
-        "photons": about(numbers["photons_per_pixel"], "{:.3g} unscattered ones a pulse arrive in a pixel; ")
-        + f"detection efficiency {100 * numbers['pde']:.3g} %",
+        "photons": about(numbers["photons_per_pixel"], "{:.3g} unscattered ones a pulse arrive in a pixel")
+        + f"; detection efficiency {100 * numbers['pde']:.3g} %",
         "signal": about(numbers["signal_per_pulse"], "{:.3g} unscattered detections a pulse in a pixel"),
         "sampling": about(numbers["samples_per_pixel"], "{:.3g} traced photons on what a pixel sees, unscattered"),
         "histograms": opt.in_bytes(numbers["histogram_bytes"]),

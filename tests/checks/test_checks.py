@@ -1,6 +1,7 @@
 """The check's numbers against geometry done by hand."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,8 @@ def test_a_target_that_the_beam_misses(profile):
     # The nearest point that is seen lies 0.6 m off the axis.
     assert message.values["nearest_angle_deg"] == pytest.approx(math.degrees(math.atan(0.6 / 5)), abs=1e-3)
     assert "half angle is 2°" in message.text
+    mostly = find(check(narrow, plate(5.0, side=1.4)), "laser.half_angle_deg", "note")
+    assert "misses most" in mostly.text and mostly.values["widest_angle_deg"] == pytest.approx(11.2, abs=0.5)
     assert warnings(check(narrow, plate(5.0, side=1.4))) == []
 
 
@@ -114,6 +117,10 @@ def test_a_target_outside_the_gate():
     assert (message.values["start_ns"], message.values["stop_ns"]) == pytest.approx((40.0, 50.0))
     part = find(check(BASE.with_overrides({"gate.start_ns": 45.6}), plate(5.0)), "targets[0]")
     assert part.text.startswith("partly outside the gate")
+    start, bins = re.search(r"start_ns = (\d+) and bins = (\d+) hold it", message.text).groups()
+    assert (
+        warnings(check(BASE.with_overrides({"gate.start_ns": float(start), "gate.bins": int(bins)}), plate(2.0))) == []
+    )
 
 
 def test_beyond_the_unambiguous_range():
@@ -240,6 +247,9 @@ def test_a_specular_lobe_is_said_to_be_left_out_of_budgets():
         ("detector.jitter_fwhm_ps", 50e-12, '"5e-11 s" (50 ps)'),
         ("camera.aperture_diameter", 25.0, '"25 mm" (0.025 m)'),
         ("gate.bin_width_ps", 0.05, '"0.05 ns" (50 ps)'),
+        ("laser.repetition_rate", 100.0, '"100 kHz" (100000 Hz)'),
+        ("laser.pulse_fwhm_ps", 0.5, '"0.5 ns" (500 ps)'),
+        ("gate.bin_width_ps", 1e6, '"1e+06 fs" (1000 ps)'),
     ],
 )
 def test_a_value_in_the_wrong_unit_is_told_with_the_likely_one(field, value, words):
@@ -249,6 +259,14 @@ def test_a_value_in_the_wrong_unit_is_told_with_the_likely_one(field, value, wor
     right = words.split('"')[1]  # what it suggests is plausible
     found = check(BASE.with_overrides({section: {name: right}}), plate(5.0))
     assert not any("plausible" in one.text for one in found if one.field == field)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"), [("distance", 50.0, '"50 mm" (0.05 m)'), ("thickness", 10.0, '"10 mm" (0.01 m)')]
+)
+def test_ports_in_millimetres_are_told(field, value, words):
+    port = {"distance": 0.05, "thickness": 0.01, "material": "BK7", field: value}
+    assert words in find(check(BASE.with_overrides({"camera.port": port}), plate(5.0)), f"camera.port.{field}").text
 
 
 def test_powers_and_places_that_nobody_has_are_told():
