@@ -85,6 +85,13 @@ class Proposal(Exposure):
         }
 
 
+_WITHOUT_PORT = (
+    "plan without it, with the angles in water: behind a flat port, divide the sines of half of "
+    "camera.horizontal_fov_deg and of laser.half_angle_deg by the water's index; behind a centred dome, keep them. "
+    "Then add the port and put the angles in air back; `spadwarp check` prints the view in water"
+)
+
+
 def plan(
     scene: SceneLike,
     *,
@@ -131,7 +138,7 @@ def plan(
         ArgumentError: An argument out of range.
     """
     scene = as_scene(scene)
-    refuse_ports(scene, "`plan`")
+    refuse_ports(scene, "`plan`", _WITHOUT_PORT)
     for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
         check_real(name, value, "[1e-9, 1e9]")
     photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)

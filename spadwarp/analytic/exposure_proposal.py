@@ -16,7 +16,7 @@ from spadwarp.analytic.pilot import Pilot, measure, trace, window
 from spadwarp.device import pick_device
 from spadwarp.frames import Method, detector_response
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.units import range_from_time
+from spadwarp.units import range_from_time, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -126,7 +126,7 @@ def propose_exposure(
         reached=purpose in ("depth error", "false peaks") and frame_time <= question.time,
         terms=terms,
         limit=limit,
-        advice=_ADVICE[limit],
+        advice=_advice(limit, purpose, frame_time, rate, gate.largest_rate, question),
         pilot=pilot,
     )
 
@@ -218,7 +218,24 @@ _ADVICE = {
     "bin width": "narrower bins, gate.bin_width_ps: where light is within a bin is not known",
     "backscatter": "a gate that begins closer to the target, more distance between laser and lens, a narrower view",
     "dark counts and ambient light": "a shorter gate, a narrower spectral filter, a cooler or quieter detector",
-    "forward scattering": "a shorter distance, clearer water, a narrower beam or view; more pulses do not help",
+    "forward scattering": "a shorter distance, clearer water, a narrower beam or view",
     "pixel size": "smaller pixels: slopes and edges of the target within one pixel, also without scattered light",
     "pile-up": "less pulse energy, or Coates' correction (`spadwarp detect --coates`)",
 }
+
+
+def _advice(limit: str, purpose: str, frame_time: float, rate: float, largest: float, question: Question) -> str:
+    """What would help: time, where the pulses reach the depth error but take too long."""
+    advice = _ADVICE[limit]
+    if purpose not in ("depth error", "false peaks"):
+        return advice + ("; more pulses do not help" if limit == "forward scattering" else "")
+    if frame_time <= question.time:
+        return advice
+    faster = f"; this gate allows up to {with_prefix(largest, 'Hz')}" if largest > rate else ""
+    return (
+        f"a longer time (--time): these pulses reach the depth error, but take {with_prefix(frame_time, 's')} at a "
+        f"repetition rate of {with_prefix(rate, 'Hz')}{faster}; fewer pulses are needed with {advice}"
+        if limit != "shot noise"
+        else f"more light per pulse (energy, aperture, reflectance), a longer time (--time) or a higher repetition "
+        f"rate: these pulses take {with_prefix(frame_time, 's')} at {with_prefix(rate, 'Hz')}{faster}"
+    )

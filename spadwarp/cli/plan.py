@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from spadwarp.analytic import Proposal
 from spadwarp.cli._tables import new_table, short
 
+_PLANE = "for a plane square to the optical axis, not for the scene's target"
+
 
 @app.command()
 def plan(
@@ -162,8 +164,10 @@ def _lines(found: Proposal) -> dict[str, str]:
     if found.largest_range == found.largest_range:
         asked = f"{with_prefix(found.depth_error, 'm')} within {with_prefix(found.time, 's')}"
         ends = f"; beyond it: {found.range_limit}" if found.range_limit else ""
-        none = f"no range reaches {asked}: {found.range_limit}"
-        lines["largest range"] = f"{found.largest_range:.3g} m for {asked}{ends}" if found.largest_range else none
+        none = f"none for {asked}, {_PLANE}: {found.range_limit}"
+        lines["largest range"] = (
+            f"{found.largest_range:.3g} m for {asked}, {_PLANE}{ends}" if found.largest_range else none
+        )
     return lines
 
 

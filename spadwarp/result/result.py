@@ -198,11 +198,12 @@ class Result:
     @property
     def relative_error(self) -> float:
         """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
-        the pixels in which anything returned. Infinite if nothing did."""
+        the pixels that hold a target, or of all without any, in which anything returned. Infinite if nothing did."""
         peak = self.histogram.argmax(axis=2)[..., None]
         value = np.take_along_axis(self.histogram, peak, axis=2)[..., 0]
         error = np.take_along_axis(self.standard_error, peak, axis=2)[..., 0]
-        returned = value > 0
+        target = np.isfinite(self.truth.depth)
+        returned = (value > 0) & (target | ~target.any())
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
     @property

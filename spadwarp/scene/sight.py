@@ -155,12 +155,13 @@ def depth_per_time(scene: Scene, distance: Floats) -> Floats:
     return scene.medium.pulse_speed * lines_of_sight(scene).depth_per_path(distance, beam_axis=axis)
 
 
-def refuse_ports(scene: Scene, what: str) -> None:
-    """Raises `ConfigError` for a scene with a port: `what` knows cameras and lasers in the water alone."""
+def refuse_ports(scene: Scene, what: str, instead: str = "") -> None:
+    """Raises `ConfigError` for a scene with a port: `what` knows cameras and lasers in the water alone; what to do
+    `instead`."""
     for section in ("camera", "laser"):
         if getattr(scene, section).port is not None:
             raise ConfigError(
                 f"{section}.port does not go with {what}, for cameras and lasers in the water alone; photon transport "
-                "takes ports: simulate, detect, depth, truth maps",
+                f"takes ports: simulate, detect, depth, truth maps{instead and '; '}{instead}",
                 source=None if scene.source is None else str(scene.source),
             )
