@@ -14,10 +14,10 @@ from spadwarp.analytic.largest_range import largest_range as find_largest_range
 from spadwarp.analytic.largest_range import with_plane
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Method
-from spadwarp.limits import SEED, check_choice, check_integer, check_real
+from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.scene.sight import refuse_ports
-from spadwarp.units import range_from_time
+from spadwarp.units import quantity, range_from_time
 
 __all__ = ["Proposal", "plan"]
 
@@ -92,17 +92,25 @@ _WITHOUT_PORT = (
 )
 
 
+def _number(name: str, value: Any, unit: str) -> Any:
+    """An argument that may be text with a unit, as a number of another."""
+    try:
+        return quantity(value, unit) if isinstance(value, str) else value
+    except ValueError as error:
+        raise ArgumentError(f"{name} = {shown(value)} {error}") from None
+
+
 def plan(
     scene: SceneLike,
     *,
-    depth_error: float = 0.01,
-    time: float = 1.0,
-    ranges: tuple[float, float] | None = None,
-    margin: float = 0.25,
+    depth_error: float | str = 0.01,
+    time: float | str = 1.0,
+    ranges: tuple[float | str, float | str] | None = None,
+    margin: float | str = 0.25,
     method: Method = "likelihood",
     full_power: bool = False,
-    eye_distance: float | None = None,
-    eye_exposure: float = 100.0,
+    eye_distance: float | str | None = None,
+    eye_exposure: float | str = 100.0,
     photons: int = 2_000_000,
     seed: int = 0,
     largest_range: bool = True,
@@ -113,7 +121,8 @@ def plan(
 
     Counts, background and the error that scattering leaves are measured by a Monte Carlo run of a window of the image
     (`spadwarp.analytic.Pilot`); the Cramér–Rao bound is that of its histograms. The bound falls with the pulses; the
-    floor, the error of an estimator that takes the scattered light for unscattered, does not.
+    floor, the error of an estimator that takes the scattered light for unscattered, does not. Lengths and times may be
+    text with a unit, such as "2 cm".
 
     Args:
         scene: Water, laser, camera, detector, target; of the gate the bins' width alone.
@@ -139,16 +148,21 @@ def plan(
     """
     scene = as_scene(scene)
     refuse_ports(scene, "`plan`", _WITHOUT_PORT)
+    depth_error, margin = _number("depth_error", depth_error, "m"), _number("margin", margin, "m")
+    time, eye_exposure = _number("time", time, "s"), _number("eye_exposure", eye_exposure, "s")
+    eye_distance = _number("eye_distance", eye_distance, "m")
     for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
         check_real(name, value, "[1e-9, 1e9]")
     photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)
     margin = check_real("margin", margin, "[0, 1e6] m")
     check_choice("method", method, METHODS)
     if ranges is not None:
-        if not 0 < ranges[0] <= ranges[1] < math.inf:
-            raise ArgumentError(f"ranges = {ranges} m: 0 < least <= largest < inf is needed")
-        scene = with_plane(scene, ranges[1])
-    span = ranges or target_span(scene, device)
+        span = _number("ranges", ranges[0], "m"), _number("ranges", ranges[1], "m")
+        if not 0 < span[0] <= span[1] < math.inf:
+            raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
+        scene = with_plane(scene, span[1])
+    else:
+        span = target_span(scene, device)
     question = Question(depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device)
     gate = propose_gate(scene, span, margin)
     exposure = propose_exposure(scene, gate, question, photons, progress)

@@ -9,13 +9,14 @@ import typer
 
 import spadwarp
 from spadwarp.cli import _options as opt
-from spadwarp.cli._app import app, say
+from spadwarp.cli._app import app, complain, say
 from spadwarp.cli._progress import progress
 from spadwarp.units import with_prefix
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from spadwarp import Scene
     from spadwarp.analytic import Proposal
 from spadwarp.cli._tables import new_table, short
 
@@ -88,6 +89,8 @@ def plan(
     outputs = opt.check_outputs(
         files={"--write": write}, json=json_path, inputs=(scene_path, *scene.files), overwrite=overwrite
     )
+    if ranges is None:
+        _complain_of_targets(scene)
     with progress(quiet=quiet) as report:
         found = spadwarp.plan(
             scene,
@@ -120,6 +123,13 @@ def plan(
         if write is not None:
             say(f"written: {write}")
     outputs.write_json({"scene": scene_path, **found.to_dict(), "files": [] if write is None else [write]})
+
+
+def _complain_of_targets(scene: Scene) -> None:
+    """What `check` warns of in the targets, before a run that would be in vain; the gate is what is proposed."""
+    for message in spadwarp.check(scene):
+        if message.level == "warning" and message.field.startswith("targets") and "gate" not in message.text:
+            complain(str(message))
 
 
 def _verdict(found: Proposal) -> str:

@@ -138,6 +138,8 @@ def test_ranges_stand_for_an_unknown_target():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"depth_error": "2 ns"}, "depth_error = '2 ns' is a time; a length is needed"),
+        ({"ranges": ("3 m", "2 m")}, "least <= largest"),
         ({"depth_error": 0.0}, "depth_error = 0.0"),
         ({"ranges": (5.0, 3.0)}, "least <= largest"),
         ({"method": "guess"}, "'guess' is not one of"),

@@ -80,7 +80,7 @@ def test_plan_is_that_of_python_and_writes_a_scene(spad_scene, tmp_path):
     options = ("--depth-error", "5cm", "--time", "100ms", "--photons", "2e4", "--no-range", "--write", written)
     printed = run("plan", spad_scene, *options, "--json", summary, *DEVICE)
     scene = spadwarp.load_scene(spad_scene)
-    twin = spadwarp.plan(scene, depth_error=0.05, time=0.1, photons=20_000, largest_range=False, device="cpu")
+    twin = spadwarp.plan(scene, depth_error="5 cm", time="100 ms", photons=20_000, largest_range=False, device="cpu")
     found = tables(summary)
     assert found["values"] == twin.values and found["terms"] == twin.terms and found["limit"] == twin.limit
     assert spadwarp.load_scene(written) == twin.scene
@@ -88,3 +88,9 @@ def test_plan_is_that_of_python_and_writes_a_scene(spad_scene, tmp_path):
         assert words in printed.stdout, words
     assert "is a time" in run("plan", spad_scene, "--depth-error", "1ns", code=2).stderr
     assert "FROM:TO" in run("plan", spad_scene, "--range", "3", code=2).stderr
+
+
+def test_plan_warns_of_targets_before_it_traces(spad_scene):
+    behind = ("--set", "targets[0].translation=[0, 0, -3]")
+    lines = run("plan", spad_scene, *behind, "--photons", "1e3", *DEVICE, code=2).stderr.splitlines()
+    assert lines[0].startswith("warning: targets[0]: behind the camera") and "no target is in view" in lines[-1]
