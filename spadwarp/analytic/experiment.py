@@ -92,10 +92,11 @@ _WITHOUT_PORT = (
 )
 
 
-def _number(name: str, value: Any, unit: str) -> Any:
+def _number(name: str, value: Any, unit: str) -> float:
     """An argument that may be text with a unit, as a number of another."""
     try:
-        return quantity(value, unit) if isinstance(value, str) else value
+        found: float = quantity(value, unit) if isinstance(value, str) else value
+        return found
     except ValueError as error:
         raise ArgumentError(f"{name} = {shown(value)} {error}") from None
 
@@ -150,7 +151,7 @@ def plan(
     refuse_ports(scene, "`plan`", _WITHOUT_PORT)
     depth_error, margin = _number("depth_error", depth_error, "m"), _number("margin", margin, "m")
     time, eye_exposure = _number("time", time, "s"), _number("eye_exposure", eye_exposure, "s")
-    eye_distance = _number("eye_distance", eye_distance, "m")
+    eye_distance = None if eye_distance is None else _number("eye_distance", eye_distance, "m")
     for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
         check_real(name, value, "[1e-9, 1e9]")
     photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)
