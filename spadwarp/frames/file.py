@@ -47,6 +47,9 @@ def is_frames_file(path: str | Path) -> bool:
     return hdf5_format(path) == FORMAT
 
 
+_OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf")
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FramesFile:
     """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory.
@@ -117,6 +120,25 @@ class FramesFile:
                 expected=_expectation(file, "expected", shape),
                 background=_expectation(file, "background", shape),
             )
+
+    def plot(self, frame: int = 0, **options: Any) -> Any:
+        """A figure of one frame: intensity, and the counts of a pixel; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self.frame(frame), **options)
+
+    def frame(self, number: int) -> Frames:
+        """One frame as `Frames`. Raises `ArgumentError` where it is not there or the file holds no expected counts."""
+        if self.expected is None or self.background is None:
+            raise ArgumentError(f"{self.path}: holds no expected counts")
+        return Frames(
+            counts=self.counts(number)[None],
+            frames=1,
+            first_frame=number,
+            expected=self.expected,
+            background=self.background,
+            **{name: getattr(self, name) for name in _OF_A_FRAME},
+        )
 
     @property
     def best_method(self) -> Method | None:

@@ -12,7 +12,7 @@ from matplotlib.ticker import SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from spadwarp.frames import first_photon_probabilities
-from spadwarp.viz.panels import Panels, arrival_line, median_pixel, shown_limits, target_limits
+from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
 from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, PROBABILITY_MAP, paper, save, spaced
 
 if TYPE_CHECKING:
@@ -40,15 +40,17 @@ def draw_recording(recording: Recording, result: Result, path: str | Path, *, wi
     columns = 4 if width > 5 else 2
     panels.figure.legend(*panels.figure.axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     mode = result.scene.detector.mode.replace("_", "-")
-    panels.caption(f"frame {first.first_frame}: {spaced(first.pulses)} pulses, {mode}; seed {first.seed}")
+    panels.caption(f"frame {first.first_frame + 1}: {spaced(first.pulses)} pulses, {mode}; seed {first.seed}")
     return save(panels.figure, path)
 
 
 def _plot_counts(recording: Recording, result: Result, axis: Axes) -> None:
-    """The pixel of median bound, or intensity: counts, their mean, the arrival of the target's light."""
+    """The pixel of the target with most of its light, or of most counts: counts, their mean, the arrival of the target's light."""
     first, detector = recording.first, result.scene.detector
-    known = np.isfinite(recording.bound_depth)
-    row, column = median_pixel(recording.bound_depth if known.any() else first.intensity[0], known)
+    signal = (first.expected - first.background).sum(axis=-1)
+    chosen = np.where(np.isfinite(result.truth.depth), signal, -1.0)
+    row, column = np.unravel_index(np.argmax(chosen if (chosen > 0).any() else first.intensity[0]), chosen.shape)
+    row, column = int(row), int(column)
     edges = 1e9 * (first.gate_start + first.edges)
     expected, background = _mean_counts(first, row, column, pile_up=detector.mode == "first_photon")
     counts = first.counts[0, row, column]
@@ -59,11 +61,13 @@ def _plot_counts(recording: Recording, result: Result, axis: Axes) -> None:
     axis.stairs(background, edges, baseline=None, color=GREEN, linewidth=0.8, label="background part")
     arrival_line(axis, result, row, column, edges)
     top = float(max(counts.max(), expected.max(), 1.0))
+    scale = "counts per bin"
     if top > 50 * max(float(np.median(expected)), 0.02):
         axis.set_yscale("symlog", linthresh=1.0)
+        scale += " (linear to 1, then log)"
         axis.set_yticks([0] + [10**e for e in range(int(np.log10(top)) + 1)])
         axis.yaxis.set_minor_locator(SymmetricalLogLocator(base=10, linthresh=1.0, subs=range(2, 10)))
-    axis.set(xlim=edges[[0, -1]], ylim=(0, 1.3 * top), xlabel="time of flight [ns]", ylabel="counts per bin")
+    axis.set(xlim=edges[[0, -1]], ylim=(0, 1.3 * top), xlabel="time of flight [ns]", ylabel=scale)
     axis.xaxis.minorticks_on()
     axis.set_title(f"Pixel in row {row}, column {column}")
 

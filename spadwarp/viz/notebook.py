@@ -124,7 +124,7 @@ def _frames_figure(frames: Frames, number: int, width: float) -> Figure:
     axis.set_title(f"Pixel in row {row}, column {column}")
     axis.xaxis.minorticks_on()
     panels.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3 if width > 5 else 1)
-    which = "all frames added up" if frames.summed else f"frame {number} of {frames.frames}"
+    which = "all frames added up" if frames.summed else f"frame {frames.first_frame + number + 1}"
     panels.caption(f"{which}: {spaced(frames.pulses)} pulses; seed {frames.seed}")
     return panels.figure
 

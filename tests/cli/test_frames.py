@@ -26,6 +26,8 @@ def test_frames_are_those_of_detect(done, tmp_path):
         assert sorted(file["depth"]) == ["centroid", "likelihood", "matched", "peak"]
         depth = file["depth/likelihood"][...]
         bound = file["bound/depth"][...]
+    recorded = spadwarp.load(out)
+    assert np.array_equal(recorded.frame(2).counts[0], twin.counts[2]) and recorded.plot(2).axes
     assert (out / "frame.png").read_bytes().startswith(b"\x89PNG")
     error = np.abs(depth.astype(float) - result.truth.depth)
     # No estimator beats its bound; this one comes near it: 20 pixels, bins of 15 mm, light that was scattered forward.
