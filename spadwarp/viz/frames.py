@@ -45,7 +45,7 @@ def draw_recording(recording: Recording, result: Result, path: str | Path, *, wi
 
 
 def _plot_counts(recording: Recording, result: Result, axis: Axes) -> None:
-    """The pixel of the target with most of its light, or of most counts: counts, their mean, the arrival of the target's light."""
+    """Counts of the pixel of the target with most of its light, or of most counts; their mean, the true arrival."""
     first, detector = recording.first, result.scene.detector
     signal = (first.expected - first.background).sum(axis=-1)
     chosen = np.where(np.isfinite(result.truth.depth), signal, -1.0)
