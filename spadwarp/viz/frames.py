@@ -49,8 +49,8 @@ def _plot_counts(recording: Recording, result: Result, axis: Axes) -> None:
     first, detector = recording.first, result.scene.detector
     signal = (first.expected - first.background).sum(axis=-1)
     chosen = np.where(np.isfinite(result.truth.depth), signal, -1.0)
-    row, column = np.unravel_index(np.argmax(chosen if (chosen > 0).any() else first.intensity[0]), chosen.shape)
-    row, column = int(row), int(column)
+    brightest = int(np.argmax(chosen if (chosen > 0).any() else first.intensity[0]))
+    row, column = divmod(brightest, chosen.shape[1])
     edges = 1e9 * (first.gate_start + first.edges)
     expected, background = _mean_counts(first, row, column, pile_up=detector.mode == "first_photon")
     counts = first.counts[0, row, column]
