@@ -15,6 +15,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
+from spadwarp.frames.tag_columns import PACKED, TAG_DIMENSION, add_tags, create_tag_columns, described_tags
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.io.hdf5_file import Hdf5File
@@ -28,10 +29,6 @@ FORMAT = "spadwarp frames"
 FORMAT_VERSION = 1
 
 _CHUNK_BYTES = 1 << 20
-_TAG_CHUNK = 1 << 16
-_TAGS = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
-_TAG_DIMENSION = "tags/detection"
-_PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _READ_ME = (
     "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
     "seconds of flight. depth/NAME: [frame, height, width], planar depth in metres by that estimator, NaN where "
@@ -222,22 +219,21 @@ class FramesWriter:
         if part.irf.times is not None:
             file.create_dataset("irf", data=np.array([part.irf.times, part.irf.values], np.float64))
         for name, values in {"expected": part.expected, "background": part.background}.items():
-            file.create_dataset(name, data=values, **_PACKED)
-        file.create_dataset("truth/depth", data=result.truth.depth, **_PACKED)
+            file.create_dataset(name, data=values, **PACKED)
+        file.create_dataset("truth/depth", data=result.truth.depth, **PACKED)
         for name, sigma in bound.items():
             file.create_dataset(f"bound/{name}", data=sigma)
         height, width, bins = part.expected.shape
         columns = max(1, min(width, _CHUNK_BYTES // (4 * bins)))
         lines = max(1, min(height, _CHUNK_BYTES // (4 * bins * columns)))
         chunks = (1, lines, columns, bins)
-        file.create_dataset("counts", (frames, height, width, bins), np.int32, chunks=chunks, **_PACKED)
-        image: dict[str, Any] = {"shape": (frames, height, width), "chunks": (1, height, width), **_PACKED}
+        file.create_dataset("counts", (frames, height, width, bins), np.int32, chunks=chunks, **PACKED)
+        image: dict[str, Any] = {"shape": (frames, height, width), "chunks": (1, height, width), **PACKED}
         file.create_dataset("intensity", dtype=np.int64, **image)
         for method in methods:
             file.create_dataset(f"depth/{method}", dtype=np.float32, **image)
         if part.tags is not None:
-            for name, kind in _TAGS.items():
-                file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(_TAG_CHUNK,), **_PACKED)
+            create_tag_columns(file)
         name_dimensions(file, _coordinates(part, frames, (height, width)), _dimensions(part, methods))
 
     def add(self, part: Frames, depth: dict[Method, NDArray[np.float64]]) -> None:
@@ -248,12 +244,7 @@ class FramesWriter:
         for method, frames in depth.items():
             file[f"depth/{method}"][rows] = frames
         if part.tags is not None:
-            for name, values in part.tags._asdict().items():
-                column = file[f"tags/{name}"]
-                before = column.shape[0]
-                column.resize((before + len(values),))
-                column[before:] = values
-            file[_TAG_DIMENSION].resize(column.shape)
+            add_tags(file, part.tags)
         self._written = rows.stop
 
 
@@ -267,7 +258,7 @@ def _coordinates(part: Frames, frames: int, shape: tuple[int, int]) -> dict[str,
         "edges": ("edges", "s", "edges of the bins after the start of the gate"),
         "sample": 0 if part.irf.times is None else np.size(part.irf.times),
         "quantity": (["time [s]", "value"], "1", "of the measured instrument response"),
-        _TAG_DIMENSION: None,
+        TAG_DIMENSION: None,
     }
 
 
@@ -284,7 +275,7 @@ def _dimensions(part: Frames, methods: Sequence[Method]) -> dict[str, tuple[tupl
         "bound/depth": (image, "m", "Cramér–Rao bound of one frame"),
         "truth/depth": (image, "m", "true planar depth"),
         "irf": (("quantity", "sample"), "1", "measured instrument response"),
-        **{f"tags/{name}": ((_TAG_DIMENSION,), "1", f"{name} of the detection") for name in _TAGS},
+        **described_tags(),
     }
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError
 from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.frames import Frames
+from spadwarp.frames.tag_columns import PACKED, TAG_DIMENSION, add_tags, create_tag_columns, described_tags
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.result.result import Result, Truth
@@ -25,10 +26,7 @@ __all__ = ["FORMAT", "SequenceFile", "SequenceWriter"]
 FORMAT = "spadwarp sequence"
 FORMAT_VERSION = 1
 
-_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _TRUTH = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
-_TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
-_TAG_DIMENSION = "tags/detection"
 _READ_ME = (
     "Frames of a scene that moves; in each frame it stands still, at frame_time [s]. counts: [frame, height, width, "
     "bin], detections. depth/NAME: planar depth in metres by that estimator, NaN where nothing was detected. expected: "
@@ -206,18 +204,17 @@ class SequenceWriter:
         file.create_dataset("trajectory", data=trajectory.values)
         kinds: dict[str, Any] = {"counts": np.int32, "expected": np.float32}
         for name, kind in kinds.items():
-            file.create_dataset(name, (frames, height, width, bins), kind, chunks=(1, 1, width, bins), **_PACKED)
+            file.create_dataset(name, (frames, height, width, bins), kind, chunks=(1, 1, width, bins), **PACKED)
         file.create_dataset("background", (frames,), np.float64)
         images = ("intensity", *(f"depth/{method}" for method in self._methods), *(f"truth/{name}" for name in _TRUTH))
         for name in images:
             shape = (height, width, *((3,) if name == "truth/normal" else ()))
             kind = np.int64 if name == "intensity" else np.float32
-            file.create_dataset(name, (frames, *shape), kind, chunks=(1, *shape), **_PACKED)
+            file.create_dataset(name, (frames, *shape), kind, chunks=(1, *shape), **PACKED)
         file.create_dataset("camera_position", (frames, 3), np.float64)
         file.create_dataset("camera_rotation", (frames, 3, 3), np.float64)
         if self._tags:
-            for name, kind in _TAGS.items():
-                file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(1 << 16,), **_PACKED)
+            create_tag_columns(file)
         name_dimensions(file, _coordinates(part, trajectory), _dimensions(self._methods))
 
     def add(self, result: Result, part: Frames, depth: dict[Method, NDArray[np.float64]]) -> None:
@@ -237,12 +234,7 @@ class SequenceWriter:
         file["camera_position"][row] = camera["camera_position"]
         file["camera_rotation"][row] = camera["camera_rotation"].reshape(3, 3)
         if part.tags is not None:
-            for name, values in part.tags._asdict().items():
-                column = file[f"tags/{name}"]
-                before = column.shape[0]
-                column.resize((before + len(values),))
-                column[before:] = values
-            file[_TAG_DIMENSION].resize(column.shape)
+            add_tags(file, part.tags)
         self._written += 1
 
 
@@ -256,7 +248,7 @@ def _coordinates(part: Frames, trajectory: Trajectory) -> dict[str, Coordinate |
         "time": (centres, "s", "time of flight at the centre of the bin"),
         "camera_axis": (["x", "y", "z"], "1", "of the camera"),
         "field": (list(trajectory.fields), "1", "of the scene"),
-        _TAG_DIMENSION: None,
+        TAG_DIMENSION: None,
     }
 
 
@@ -276,5 +268,5 @@ def _dimensions(methods: Sequence[Method]) -> dict[str, tuple[tuple[str, ...], s
         },
         "camera_position": (("frame", "axis"), "m", "the lens in the world"),
         "camera_rotation": (("frame", "axis", "camera_axis"), "1", "the camera's axes in the world as columns"),
-        **{f"tags/{name}": ((_TAG_DIMENSION,), "1", f"{name} of the detection") for name in _TAGS},
+        **described_tags(),
     }
