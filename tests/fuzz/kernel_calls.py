@@ -11,6 +11,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from fuzz import world_calls
 from fuzz.isolation import run_isolated
+from helpers.lit_box import lit_box
 from spadwarp_kernels import analytic, detection
 
 NUMBERS = (0, -1, 1, 2, 1.5, -0.5, math.nan, math.inf, -math.inf, 1e30, 1e-30, 2**31 - 1, 2**31, 2**63, 2**64, -(2**31))
@@ -55,19 +56,6 @@ def _filled(*shape, dtype=float):
     return wp.full(shape, 0.01, dtype=dtype, device="cpu")
 
 
-def _structs():
-    medium, laser, camera, gate = sk.Medium(), sk.Laser(), sk.Camera(), sk.Gate()
-    limits, guiding = sk.Limits(), sk.Guiding()
-    medium.extinction, medium.albedo, medium.anisotropy, medium.axis_threshold = 0.3, 0.8, 0.9, 1.0
-    laser.axis, laser.spread = wp.vec3(0.0, 0.0, 1.0), 0.01
-    camera.width, camera.height, camera.pixel_tangent = 4, 3, 0.05
-    camera.aperture_radius, camera.aperture_area = 0.01, math.pi * 0.01**2
-    gate.start, gate.stop, gate.bins, gate.bins_per_metre = 8.0, 12.0, 8, 2.0
-    limits.max_path, limits.max_collisions = 20.0, 8
-    guiding.probability, guiding.surface_probability, guiding.anisotropy = 0.3, 0.3, 0.9
-    return {"medium": medium, "laser": laser, "camera": camera, "gate": gate, "limits": limits, "guiding": guiding}
-
-
 def _lidar():
     one = sk.Lidar()
     one.photons, one.pde, one.extinction, one.scattering, one.speed = 1e9, 0.2, 0.3, 0.2, 2.2e8
@@ -82,7 +70,7 @@ def _valid_calls():
     box.apply_translation((0, 0, 5))
     points = wp.array(box.vertices, dtype=wp.vec3, device="cpu")
     mesh = wp.Mesh(points, wp.array(box.faces.ravel(), dtype=int, device="cpu"))
-    model = sk.Model(device="cpu", mesh=mesh, surfaces=sk.make_surfaces(mesh, 0.5), scale=2.0**50, **_structs())
+    model = sk.Model(device="cpu", mesh=mesh, surfaces=sk.make_surfaces(mesh, 0.5), scale=2.0**50, **lit_box())
     textures = sk.make_textures(np.zeros(12, int), np.zeros((12, 3, 2)), [np.ones((2, 2))], device="cpu")
     sight = wp.full(4, wp.vec3(0, 0, 1), dtype=wp.vec3, device="cpu")
     view = wp.full(4, wp.vec3d(0, 0, 1), dtype=wp.vec3d, device="cpu")
@@ -111,7 +99,7 @@ def _valid_calls():
     bins = {"background": _filled(1, 8), "response": np.ones((16, 3)) / 3, "lowest_tap": -1, "first": 0, "stop": 8}
     scatter = {"lidar": _lidar(), "phase": phase, "view": view}
     statistics = {"profile": _filled(1, 8), "signal": four(), "arrival": four(5e-8), "backscatter": four()}
-    ours = {"device": "cpu", "mesh": mesh, "surfaces": model.surfaces, "scale": 1.0, **_structs()}
+    ours = {"device": "cpu", "mesh": mesh, "surfaces": model.surfaces, "scale": 1.0, **lit_box()}
     faces = {"mesh": mesh, "reflectance": _filled(12), "textures": textures, "specular": 0.1, "roughness": 0.2}
     layers = {"start": [0.0, 1.0], "extinction": [1.0, 1.0], "albedo": [0.5, 0.5], "anisotropy": [0.1, 0.1]}
     calls = {
@@ -128,7 +116,7 @@ def _valid_calls():
         ),
         "make_data": (sk.make_data, {"model": model, "tally": None, "record_count": 3, "histogram": True}),
         "Model": (sk.Model, ours),
-        "make_surfaces": (sk.make_surfaces, faces | {"camera": _structs()["camera"], "corner_reflectance": None}),
+        "make_surfaces": (sk.make_surfaces, faces | {"camera": lit_box()["camera"], "corner_reflectance": None}),
         "make_textures": (
             sk.make_textures,
             {
@@ -146,7 +134,7 @@ def _valid_calls():
         "fournier_forand": (sk.fournier_forand_density, {"t": 0.5, "particle_index": 1.1, "junge_slope": 3.6}),
         "henyey_greenstein": (sk.henyey_greenstein_density, {"t": 0.5, "g": 0.5}),
         "two_term": (sk.two_term_henyey_greenstein_density, {"t": 0.5, "g1": 0.5, "g2": -0.1, "alpha": 0.9}),
-        "near_depth_map": (sk.near_depth_map, {"mesh": mesh, "camera": _structs()["camera"]}),
+        "near_depth_map": (sk.near_depth_map, {"mesh": mesh, "camera": lit_box()["camera"]}),
         "load_kernel": (sk.load_transport_kernel, {"spec": sk.TransportSpec("next_event"), "device": "cpu"}),
         "batches": (
             lambda close, **rest: sk.Batches(**rest).close(close),
