@@ -27,7 +27,7 @@ from spadwarp_kernels.tally.ledger import (
     OUTSIDE_SHIFT,
     PORT_ENTRY,
 )
-from spadwarp_kernels.tally.tally import COMPONENTS
+from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel
 
 from .checks import check_launch, check_model, check_spec
 from .kernel import make_transport_kernel
@@ -125,6 +125,8 @@ def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> 
     check_spec(spec)
     device = check_device("device", device)
     make_transport_kernel(spec, device.is_cuda).module.load(device, BLOCK_SIZE if device.is_cuda else 1)
+    # Here and not by a worker's first use: for each thread that compiles, Warp prepares its headers anew, 1.5 s on a CPU.
+    wp.load_module(find_overflow_kernel.module, device=device)
 
 
 def launch_transport(
