@@ -125,7 +125,7 @@ def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> 
     check_spec(spec)
     device = check_device("device", device)
     make_transport_kernel(spec, device.is_cuda).module.load(device, BLOCK_SIZE if device.is_cuda else 1)
-    # Here and not by a worker's first use: for each thread that compiles, Warp prepares its headers anew, 1.5 s on a CPU.
+    # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
 
 
