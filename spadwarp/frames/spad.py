@@ -6,7 +6,6 @@ dark counts, ambient light, crosstalk → hazard λ per detector bin → counts,
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from typing import Any, NamedTuple
@@ -18,8 +17,9 @@ from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, o
 from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
 from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
-from spadwarp.frames.response import InstrumentResponse, detector_response, response_matrix
-from spadwarp.frames.window import Window, detector_window, missing_light
+from spadwarp.frames.receiver import Receiver
+from spadwarp.frames.response import InstrumentResponse, detector_response
+from spadwarp.frames.window import Window, missing_light
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Truth
@@ -174,78 +174,29 @@ class _Light(NamedTuple):
 
 def _expected(source: Any, background: Any, camera: _Camera, axis: tuple[float, float], device: Any) -> _Light:
     """Light through the response, noise and crosstalk; `axis`: start and bin width of the source [s]."""
-    from spadwarp_kernels import detection as kernels
-
-    detector, laser = camera.detector, camera.laser
-    free_running = detector.mode == "free_running"
     form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
     rows, shape = histogram_rows(source, name="source", device=device, **form)
-    window = detector_window(
-        camera.window or (axis[0], shape[2]),
-        axis[1],
-        camera.tdc_widths,
-        period=math.inf if laser is None else 1.0 / laser.repetition_rate,
-        wrap=detector.wrap,
-        free_running=free_running,
-    )
-    edges, period = window.start + window.edges, window.period if detector.wrap else None
-    matrix = response_matrix(
-        camera.irf, source_start=axis[0], source_width=axis[1], source_bins=shape[2], edges=edges, period=period
-    )
-    noise = kernels.dark_count_rates(
-        rows.shape[0],
-        median=detector.dark_count_rate,
-        spread=detector.dark_count_spread,
-        hot_fraction=detector.hot_pixel_fraction,
-        hot_rate=detector.hot_pixel_rate,
-        offset=detector.ambient_rate,
-        seed=camera.seed,
+    receiver = Receiver.of(
+        camera.detector,
+        camera.laser,
+        shape=shape,
+        axis=axis,
         device=rows.device,
+        irf=camera.irf,
+        window=camera.window,
+        tdc_widths=camera.tdc_widths,
+        ambient=camera.ambient,
+        camera_seed=camera.seed,
     )
-
-    if camera.ambient is not None:
-        noise = _with_ambient(noise, camera.ambient, shape)
-
-    def with_noise(light: Any) -> Any:
-        return kernels.expected_detections(light, **matrix._asdict(), width=np.diff(window.edges), noise_rate=noise)
-
-    hazard = with_noise(rows)
-    if detector.crosstalk_probability > 0:
-        dead_time = detector.dead_time_ns * 1e-9
-        if free_running:
-            fired = kernels.free_running_probabilities(hazard, dead_time=dead_time, period=window.period)
-        else:
-            fired = kernels.first_photon_probabilities(hazard)
-        kernels.add_crosstalk(hazard, fired, image_width=shape[1], probability=detector.crosstalk_probability)
+    hazard = receiver.hazard(rows)
     if background is None:
-        expected_background = _noise_alone(window, noise, equal_bins=camera.tdc_widths is None)
+        expected_background = receiver.noise_alone()
     else:
         known, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
         if known_shape != shape:
             raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
-        expected_background = with_noise(known)
-    return _Light(hazard, expected_background, window, (shape[0], shape[1]))
-
-
-def _with_ambient(noise: Any, ambient: ArrayLike, shape: tuple[int, ...]) -> Any:
-    """Rates of the pixels with ambient light on top [1/s]."""
-    import warp as wp
-
-    values = np.asarray(ambient, np.float64)
-    if values.shape not in ((), shape[:2]):
-        raise ArgumentError(f"ambient has shape {values.shape}; a number or {shape[:2]} is needed")
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise ArgumentError("ambient holds a value outside [0, inf)")
-    rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
-    return wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
-
-
-def _noise_alone(window: Window, noise: Any, *, equal_bins: bool) -> Any:
-    """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
-    import warp as wp
-
-    widths = np.diff(window.edges[: 2 if equal_bins else window.recorded + 1])
-    return wp.array((noise.numpy()[:, None] * widths).astype(np.float32), device=noise.device)
+        expected_background = receiver.light(known)
+    return _Light(hazard, expected_background, receiver.window, (shape[0], shape[1]))
 
 
 # Counts
