@@ -19,7 +19,10 @@ from .estimators import ESTIMATORS, Estimator, next_event_value
 from .intersect import segment_meets_box
 from .math import one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 from .medium import (
+    DELTA_TRACKING,
+    REGULAR_TRACKING,
     Boundary,
+    Grid,
     Layers,
     Limits,
     Medium,
@@ -31,6 +34,7 @@ from .medium import (
     layered_free_path,
     layered_water,
     make_boundary,
+    make_grid,
     make_layers,
     reflection_images,
 )
@@ -123,6 +127,7 @@ __all__ = [
     "COMPONENTS",
     "COUNTERS",
     "COUNT_LAWS",
+    "DELTA_TRACKING",
     "DOME_PORT",
     "ESTIMATORS",
     "FLAT_PORT",
@@ -131,6 +136,7 @@ __all__ = [
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
     "PLAIN",
+    "REGULAR_TRACKING",
     "SHAPE_KINDS",
     "TABULATED",
     "ArgumentError",
@@ -140,6 +146,7 @@ __all__ = [
     "Data",
     "Estimator",
     "Gate",
+    "Grid",
     "Guiding",
     "Laser",
     "Layers",
@@ -194,6 +201,7 @@ __all__ = [
     "make_data",
     "make_dome_port",
     "make_flat_port",
+    "make_grid",
     "make_layers",
     "make_phase_tables",
     "make_records",

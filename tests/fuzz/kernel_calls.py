@@ -126,6 +126,11 @@ def _valid_calls():
                 "device": "cpu",
             },
         ),
+        "make_grid": (
+            sk.make_grid,
+            {"extinction": np.ones((2, 3, 4)), "albedo": np.full((2, 3, 4), 0.5), "anisotropy": None, "size": (1, 1, 2)}
+            | {"centre": (0, 0, 1.0), "rotation": np.eye(3), "block_edge": 2, "device": "cpu"},
+        ),
         "make_layers": (sk.make_layers, layers | {"axis": (0, 0, 1.0), "device": "cpu"}),
         "make_records": (sk.make_records, {"count": 3, "device": "cpu"}),
         "phase_tables": (sk.make_phase_tables, {"density": np.ones_like, "device": "cpu"}),

@@ -6,12 +6,13 @@ import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import u01, u01_fine, u01_high, u01_low
+from spadwarp_kernels.random.splitmix import join_words
 from spadwarp_kernels.sensor.camera import Camera, lens_point
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.sensor.port_view import port_view
@@ -34,12 +35,13 @@ class Request:
         wanted: Whether there is anything.
         x: Where the photon scatters, or where the flight begins [m].
         u: Its direction until there, or of the flight.
-        weight: Of the photon; in water times the albedo, but for flights through layers, whose albedo is that of the
-            sampled point.
+        weight: Of the photon; in water times the albedo, but for flights through water that varies, whose albedo is
+            that of the sampled point.
         path: Geometric path up to x [m].
         lens: The point of the lens by which a flight is scored; others draw one from `first`.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
-        first, second: Random words: of the lens's point or, of a flight, of the choice and the distance.
+        first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
+            tracking through a grid.
         rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
         component: Index into COMPONENTS.
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
@@ -99,7 +101,7 @@ class ScoredPoint:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
-    reflecting = spec.reflecting
+    reflecting, tracks = spec.reflecting, spec.grid is not None
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
@@ -116,6 +118,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.path = s.path
                 q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
+                if wp.static(tracks):
+                    q.second = s.flight.block[0]
                 q.rounding_sample = s.flight.block[2]  # of the azimuth to come
                 q.slot = -1
                 q.target = s.target
@@ -137,9 +141,13 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
     scored."""
-    local_albedo = spec.layered and not spec.random_albedo
-    _, water_extinction, water_at = LAYERED if spec.layered else HOMOGENEOUS
-    sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE)
+    local_albedo = spec.varies and not spec.random_albedo
+    water, profile = spec.water, spec.water.profile
+    water_extinction, water_at = water.extinction, water.at
+    sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
+    # What the flight has passed where its point was drawn is known, unless that was drawn from blocks.
+    has_profile, exact = profile is not None, profile is not None and profile.exact
+    depth_along = profile.depth if profile is not None else water_extinction
     apparent_lens = make_apparent_lens(spec)
 
     @wp.func
@@ -147,25 +155,33 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         point = ScoredPoint()
         # Layers: a density with the mean extinction; what is scored weighs with the exact one.
         s0 = request.interval[0]
+        width = request.interval[1] - s0
         middle = request.x + (0.5 * (s0 + request.interval[1])) * request.u
-        flight = sample_flight(
-            request.x - apparent_lens(camera, middle, request.lens),
-            request.u,
-            request.interval,
-            water_extinction(medium, layers, request.x + s0 * request.u, request.u, request.interval[1] - s0),
-            medium,
-            u01(request.first),
-            u01_fine(request.second),
-        )
+        begin = request.x + s0 * request.u
+        seed = join_words(request.first, request.second)
+        from_lens = request.x - apparent_lens(camera, middle, request.lens)
+        xi_choice = u01(request.first)
+        xi = u01_fine(request.second)
+        if wp.static(has_profile):
+            mean = depth_along(medium, layers, begin, request.u, width) / width
+            flight = sample_flight(from_lens, request.u, request.interval, mean, medium, xi_choice, xi, layers, begin)
+        else:
+            mean = water_extinction(medium, layers, begin, request.u, width, seed)
+            flight = sample_flight(from_lens, request.u, request.interval, mean, medium, xi_choice, xi)
         point.x = request.x + flight.s * request.u
         point.path = request.path + flight.s
         there = water_at(medium, layers, point.x)
         weight = float(request.weight)
         if wp.static(local_albedo):
             weight *= there.albedo
-        weight *= there.extinction * wp.exp(
-            -water_extinction(medium, layers, request.x, request.u, flight.s) * flight.s
-        )
+        if wp.static(exact):
+            before = float(0.0)
+            if s0 > 0.0:
+                before = depth_along(medium, layers, request.x, request.u, s0)
+            weight *= there.extinction * wp.exp(-before - flight.depth)
+        else:
+            passed = water_extinction(medium, layers, request.x, request.u, flight.s, seed)
+            weight *= there.extinction * wp.exp(-passed * flight.s)
         point.weight = wp.where(flight.density <= 0.0, 0.0, weight / flight.density)
         return point
 
@@ -177,7 +193,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, medium, layers, surfaces) -> float``: density [1/sr] of what the water or the
     face of the request scatters at x into the direction v."""
     has_mesh, specular = spec.mesh, spec.specular
-    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    water_at = spec.water.at
     phase_pdf = spec.phase.pdf
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
 
@@ -213,7 +229,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     `flights`: whether requests may ask for a point of a flight.
     """
     confocal, reflecting = spec.confocal, spec.reflecting
-    water_extinction = (LAYERED if spec.layered else HOMOGENEOUS).extinction
+    water_extinction = spec.water.extinction
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of = make_link(spec)
@@ -251,7 +267,8 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         pixel = image_of(camera, view, request.target, link.image, found.lens)
         scattering = scattering_density(request, found.origin, link.to_lens, medium, layers, surfaces)
         if pixel >= 0 and not scattering <= 0.0:
-            extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water)
+            seed = join_words(request.second, request.first)
+            extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
             found.contribution.value = value_of(camera, extinction, weight, scattering, link)
             found.contribution.index = tally_index(camera, gate, pixel, path + link.path, request.component)
         found.lens = link.end

@@ -8,6 +8,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, Layers, Profile
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.phase.phase_function import PhaseGuide
@@ -18,11 +19,12 @@ from spadwarp_kernels.sensor.camera import Camera, lens_point
 @wp.struct
 class FlightSample:
     """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
-    none."""
+    none. With a `Profile`: its optical depth up to there."""
 
     s: float
     r: float
     density: float
+    depth: float
 
 
 @wp.struct
@@ -120,8 +122,11 @@ def _chord_slope(d: float, along: float, r: float) -> float:
 
 
 @functools.cache
-def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Function:
-    """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``."""
+def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Profile | None = None) -> wp.Function:
+    """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
+    profile ``(..., layers, begin_point)``, the latter where the interval begins."""
+    has_profile = profile is not None
+    depth_along, distance_to, extinction_at = profile or HOMOGENEOUS[:3]
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
     # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
     turn_of, along_of, slope = (
@@ -130,13 +135,22 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
 
     @wp.func
     def sample_flight(
-        x: wp.vec3, u: wp.vec3, interval: wp.vec2, extinction: float, medium: Medium, xi_choice: float, xi: float
+        x: wp.vec3,
+        u: wp.vec3,
+        interval: wp.vec2,
+        extinction: float,
+        medium: Medium,
+        xi_choice: float,
+        xi: float,
+        layers: Layers,
+        begin_point: wp.vec3,
     ) -> FlightSample:
         """A point of the flight x + s u within the interval, x relative to the lens point.
 
-        Half the points are drawn from exp(-c s), half in the angle theta(s) = atan2(D, t_c - s), D = |x cross u|, by
-        which the light must turn to reach the lens: from the guide, which follows the phase function; on flights that
-        lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi = pi - theta, small far from the lens.
+        Half the points are drawn from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) =
+        atan2(D, t_c - s), D = |x cross u|, by which the light must turn to reach the lens: from the guide, which
+        follows the phase function; on flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi =
+        pi - theta, small far from the lens.
         """
         sample = FlightSample()
         s0 = interval[0]
@@ -162,12 +176,22 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
             g = begin - xi * span
             s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
         else:
-            s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
+            if wp.static(has_profile):
+                s = s0 + xi * width
+                if thick:
+                    s = s0 + distance_to(medium, layers, begin_point, u, -wp.log(1.0 - xi * kept))
+            else:
+                s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
         s = wp.clamp(s, s0, s1)
 
         along = s - t_c
         r = wp.sqrt(d * d + along * along)
-        linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
+        if wp.static(has_profile):
+            sample.depth = depth_along(medium, layers, begin_point, u, s - s0)
+            exponential = extinction_at(medium, layers, begin_point + (s - s0) * u) * wp.exp(-sample.depth)
+            linear_density = wp.where(thick, exponential / kept, 1.0 / width)
+        else:
+            linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
         towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)
         angular_density = wp.where(away, d / (r * (r + along)), towards) / wp.max(span, 1.0e-30)
         if angular == 0.0:
@@ -177,4 +201,14 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE) -> wp.Functi
         sample.density = (1.0 - angular) * linear_density + angular * angular_density
         return sample
 
-    return sample_flight
+    if profile is not None:
+        return sample_flight
+
+    @wp.func
+    def sample_flight_without_profile(
+        x: wp.vec3, u: wp.vec3, interval: wp.vec2, extinction: float, medium: Medium, xi_choice: float, xi: float
+    ) -> FlightSample:
+        """As `sample_flight`, in water of one extinction."""
+        return sample_flight(x, u, interval, extinction, medium, xi_choice, xi, Layers(), wp.vec3())
+
+    return sample_flight_without_profile

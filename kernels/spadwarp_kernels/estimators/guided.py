@@ -7,7 +7,7 @@ al. 2013 (joint distance-angle sampling).
 import warp as wp
 
 from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import (
@@ -52,7 +52,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
 def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     view_of = spec.lens.view
-    layered, bounded, has_phase_guide = spec.layered, spec.bounded, spec.phase.guide is not None
+    varies, bounded, has_phase_guide = spec.varies, spec.bounded, spec.phase.guide is not None
     to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
     clip_to_view, _, clip_to_gate = port_view(spec.port)
     sample_lens = make_sample_lens(spec.port)
@@ -76,7 +76,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
             limit = wp.min(limit, to_exit(limits, s.x, s.u))
         plan.interval = clip_to_view(camera, view_of(camera, s.view), s.x, s.u, plan.lens, limit)
         plan.interval = clip_to_gate(camera, gate, s.x, s.u, s.path, plan.lens, plan.interval)
-        if not (wp.static(layered) or medium.extinction > 0.0):
+        if not (wp.static(varies) or medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
 
@@ -85,7 +85,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo = spec.layered and not spec.random_albedo
+    local_albedo = spec.varies and not spec.random_albedo
 
     @wp.func
     def request_flight(s: PhotonState) -> Request:
@@ -140,7 +140,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
-    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    water_at = spec.water.at
     view_of = spec.lens.view
     has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)

@@ -12,11 +12,12 @@ from spadwarp_kernels.medium.boundary import (
     image_reflectance,
     reflections_of,
 )
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, next_face, to_next_face
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.random.philox import u01, u01_high, u01_low
+from spadwarp_kernels.random.splitmix import join_words
 from spadwarp_kernels.sensor.camera import Camera, lens_point
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.scan import Scan
@@ -64,10 +65,10 @@ def _no_origin(limits: Limits) -> wp.vec3:
 
 @functools.cache
 def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
-    """The Warp function ``(x, v, length, reflections, medium, layers, limits, surfaces) -> Way`` of the light that
-    leaves x along v, in the domain's axes, and is reflected so many times within that length."""
+    """The Warp function ``(x, v, length, reflections, medium, layers, limits, surfaces, seed) -> Way`` of the light
+    that leaves x along v, in the domain's axes, and is reflected so many times within that length."""
     has_mesh, brute_force = spec.mesh, brute_force
-    water_extinction = (LAYERED if spec.layered else HOMOGENEOUS).extinction
+    water_extinction = spec.water.extinction
     turn_back, origin = (_from_domain, _origin) if spec.rotated_domain else (_same, _no_origin)
 
     @wp.func
@@ -80,6 +81,7 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
         layers: Layers,
         limits: Limits,
         surfaces: Surfaces,
+        seed: wp.uint64,
     ) -> Way:
         way = Way()
         way.clear = True
@@ -94,7 +96,7 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
                 face = next_face(limits, begin, along)
             start = turn_back(limits, begin - origin(limits))
             heading = turn_back(limits, along)
-            way.depth += part * water_extinction(medium, layers, start, heading, part)
+            way.depth += part * water_extinction(medium, layers, start, heading, part, seed + wp.uint64(k))
             if wp.static(has_mesh):
                 if way.clear and segment_meets_box(start, heading, part, surfaces.lower, surfaces.upper):
                     way.shadow_queries += 1
@@ -118,7 +120,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
 
     `flights`: whether requests may ask for a point of a flight, which is not scored by way of reflections: events are.
     """
-    confocal, needs_way = spec.confocal, spec.mesh or spec.layered
+    confocal, needs_way = spec.confocal, spec.mesh or spec.varies
     image_of = spec.lens.project
     scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
     link_to, value_of = make_link(spec)
@@ -159,7 +161,8 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         extinction = float(medium.extinction)
         if wp.static(needs_way):
             if not scattering <= 0.0:
-                way = way_of(x, heading, link.water, reflections_of(image), medium, layers, limits, surfaces)
+                seed = join_words(request.first, wp.uint32(number + 1) << wp.uint32(8))
+                way = way_of(x, heading, link.water, reflections_of(image), medium, layers, limits, surfaces, seed)
                 found.shadow_queries = way.shadow_queries
                 extinction = way.depth / link.water
                 scattering = wp.where(way.clear, scattering, 0.0)

@@ -1,8 +1,9 @@
 """Water in plane layers, and the three questions that transport asks of any water.
 
 How far does a photon fly, what does a flight let through, and which water is at a point: `HOMOGENEOUS` answers from the
-medium alone, `LAYERED` from the layers. A boundary between equal extinctions is none: layers of one water give the bits
-of the homogeneous one. Light passes boundaries straight on; one index holds for all layers.
+medium alone, `LAYERED` from the layers, `REGULAR_TRACKING` and `DELTA_TRACKING` from a grid of cells. A boundary
+between equal extinctions is none: layers of one water give the bits of the homogeneous one. Light passes boundaries
+straight on; one index holds for all water.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from spadwarp_kernels.arguments import (
     check_vector,
 )
 
+from .grid import Grid
 from .water import Medium, free_path
 
 _RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)"}
@@ -37,6 +39,7 @@ class Layers:
         extinction: c [1/m], > 0.
         albedo: Single-scattering albedo in [0, 1].
         anisotropy: g in (-1, 1), for phase functions that use the medium's.
+        grid: Of a spec with a grid, which has no layers: cells in a box; the medium is outside it.
     """
 
     axis: wp.vec3
@@ -44,6 +47,7 @@ class Layers:
     extinction: wp.array(dtype=float)
     albedo: wp.array(dtype=float)
     anisotropy: wp.array(dtype=float)
+    grid: Grid
 
 
 @wp.func
@@ -121,12 +125,24 @@ def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 
 @wp.func
-def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float) -> float:
+def _layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
+    return layered_free_path(medium, layers, x, u, xi)
+
+
+@wp.func
+def _layered_extinction(
+    medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64
+) -> float:
+    return layered_extinction(medium, layers, x, u, length)
+
+
+@wp.func
+def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     return free_path(xi, medium.extinction)
 
 
 @wp.func
-def _extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+def _extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     return medium.extinction
 
 
@@ -135,22 +151,41 @@ def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     return medium
 
 
-class Water(NamedTuple):
-    """What transport asks of water, as Warp functions.
+class Profile(NamedTuple):
+    """Extinction along a line from which `guided` draws a point of a flight, as Warp functions.
 
     Attributes:
-        free_path: ``(medium, layers, x, u, xi) -> float``, free flight [m].
-        extinction: ``(medium, layers, x, u, length) -> float``, mean extinction of a flight [1/m].
+        depth: ``(medium, layers, x, u, length) -> float``, optical depth.
+        distance: ``(medium, layers, x, u, depth) -> float``, distance [m] to an optical depth; 1e30: there is none.
+        at: ``(medium, layers, x) -> float``, extinction at a point [1/m].
+        exact: Whether it is the water's own, and not that of blocks of cells.
+    """
+
+    depth: wp.Function
+    distance: wp.Function
+    at: wp.Function
+    exact: bool = True
+
+
+class Water(NamedTuple):
+    """What transport asks of water, as Warp functions; `seed` has 64 random bits for those that answer by chance.
+
+    Attributes:
+        free_path: ``(medium, layers, x, u, xi, seed) -> float``, free flight [m].
+        extinction: ``(medium, layers, x, u, length, seed) -> float``, mean extinction of a flight [1/m]; by chance, one
+            whose exp(-extinction length) has the expectation of what passes.
         at: ``(medium, layers, x) -> Medium``, the water at a point.
+        profile: How `guided` draws a point of a flight; None: with the mean extinction.
     """
 
     free_path: wp.Function
     extinction: wp.Function
     at: wp.Function
+    profile: Profile | None = None
 
 
 HOMOGENEOUS = Water(_free_path, _extinction, _water)
-LAYERED = Water(layered_free_path, layered_extinction, layered_water)
+LAYERED = Water(_layered_free_path, _layered_extinction, layered_water)
 
 
 def make_layers(

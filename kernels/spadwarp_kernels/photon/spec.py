@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import PhaseFunction
 from spadwarp_kernels.port.kinds import PortKind
@@ -37,6 +38,8 @@ class TransportSpec(NamedTuple):
         port: What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
             water.
         laser_port: The same of the laser and `Laser.port`.
+        grid: The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING;
+            None: there is no grid.
     """
 
     estimator: str = "next_event"
@@ -59,3 +62,14 @@ class TransportSpec(NamedTuple):
     stepped: bool = False
     port: PortKind | None = None
     laser_port: PortKind | None = None
+    grid: Water | None = None
+
+    @property
+    def water(self) -> Water:
+        """What transport asks of the water."""
+        return self.grid or (LAYERED if self.layered else HOMOGENEOUS)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the water differs from place to place."""
+        return self.layered or self.grid is not None

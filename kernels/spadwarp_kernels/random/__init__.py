@@ -25,6 +25,7 @@ from .philox import (
     u01_tail,
 )
 from .quantiles import count_quantile
+from .splitmix import join_words, splitmix
 
 __all__ = [
     "DensityTables",
@@ -33,11 +34,13 @@ __all__ = [
     "count_quantile",
     "fold",
     "folded_quadrature",
+    "join_words",
     "make_density_tables",
     "philox4x32",
     "random_block",
     "random_block_keyed",
     "round_keys",
+    "splitmix",
     "table_cumulative",
     "table_density",
     "table_sample",

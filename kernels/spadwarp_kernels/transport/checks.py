@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -19,7 +20,8 @@ from spadwarp_kernels.arguments import (
 )
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
-from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.medium.grid import Grid
+from spadwarp_kernels.medium.layers import Layers, Water
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
@@ -74,6 +76,10 @@ def check_spec(spec: Any) -> None:
     for name in ("port", "laser_port"):
         if not isinstance(getattr(spec, name), PortKind | None):
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a PortKind or None")
+    if not isinstance(spec.grid, Water | None):
+        raise ArgumentError(f"spec.grid = {spec.grid!r} is not REGULAR_TRACKING, DELTA_TRACKING or None")
+    if spec.grid is not None and (spec.layered or spec.random_albedo):
+        raise ArgumentError("spec.grid goes without spec.layered and spec.random_albedo")
     for name in _CHOICES:
         if not isinstance(getattr(spec, name), bool):
             raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
@@ -133,6 +139,26 @@ def _check_water(spec: TransportSpec, model: Model) -> None:
         check_vector("model.layers.axis", layers.axis, unit=True)
         for name in ("extinction", "albedo", "anisotropy"):
             check_array(f"model.layers.{name}", getattr(layers, name), wp.float32, start.shape, device)
+    if spec.grid is not None:
+        _check_grid(model.layers.grid, device)
+
+
+def _check_grid(grid: Grid, device: wp.Device) -> None:
+    sizes = {"size": list(grid.size), "block_size": list(grid.block_size)}
+    for name, size in sizes.items():
+        for count in size:
+            check_integer(f"model.layers.grid.{name}", count, 1)
+    cells, blocks = (math.prod(size) for size in sizes.values())
+    for name in ("extinction", "albedo"):
+        check_array(f"model.layers.grid.{name}", getattr(grid, name), wp.float32, (cells,), device)
+    anisotropy = check_array("model.layers.grid.anisotropy", grid.anisotropy, wp.float32, (None,), device)
+    if anisotropy.size:
+        check_array("model.layers.grid.anisotropy", anisotropy, wp.float32, (cells,), device)
+    edge = check_integer("model.layers.grid.block_edge", grid.block_edge, 1)
+    if sizes["block_size"] != [-(-count // edge) for count in sizes["size"]]:
+        raise ArgumentError(f"model.layers.grid: {sizes['block_size']} blocks of {edge} cells; see make_grid")
+    for name in ("block_majorant", "block_mean", "block_deviation"):
+        check_array(f"model.layers.grid.{name}", getattr(grid, name), wp.float32, (blocks,), device)
 
 
 def _check_laser(spec: TransportSpec, model: Model) -> None:

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.medium.boundary import face_index
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import (
     Limits,
     exit_distance,
@@ -46,8 +46,8 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
     has_mesh, reflecting = spec.mesh, spec.reflecting
     bounded = spec.bounded and not reflecting
-    local_albedo = spec.layered and not spec.random_albedo
-    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    local_albedo = spec.varies and not spec.random_albedo
+    water_at = spec.water.at
     to_exit, face_of_exit, outside = (
         (exit_distance_rotated, exit_face_rotated, is_outside_rotated)
         if spec.rotated_domain

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -17,6 +17,7 @@ from spadwarp_kernels.random.philox import (
     u01,
     u01_tail,
 )
+from spadwarp_kernels.random.splitmix import join_words
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 
@@ -25,7 +26,7 @@ from spadwarp_kernels.sensor.gate import Gate
 def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, gate, limits, keys, id) -> Flight``."""
     plans = plan_flight is not None
-    water_free_path = (LAYERED if spec.layered else HOMOGENEOUS).free_path
+    water_free_path = spec.water.free_path
 
     @wp.func
     def fly(
@@ -40,7 +41,8 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Functio
     ) -> Flight:
         f = Flight()
         f.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
-        f.distance = water_free_path(medium, layers, s.x, s.u, u01_tail(f.block[0], f.block[2]))
+        seed = join_words(f.block[0], f.block[2])
+        f.distance = water_free_path(medium, layers, s.x, s.u, u01_tail(f.block[0], f.block[2]), seed)
         f.reach = wp.min(f.distance, limits.max_path - s.path)
         if wp.static(plans):
             plan = plan_flight(s, medium, camera, gate, limits, keys, id)

@@ -7,7 +7,7 @@ import warp as wp
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
 from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Layers
+from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
@@ -82,7 +82,7 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
         return direct
     has_mesh, specular = spec.mesh, spec.specular
     phase_sample = spec.phase.sample
-    water_at = (LAYERED if spec.layered else HOMOGENEOUS).at
+    water_at = spec.water.at
 
     @wp.func
     def turn(
