@@ -8,7 +8,7 @@ from spadwarp_kernels.surface.reflectance import reflectance_at
 from spadwarp_kernels.surface.trace import intersect_surfaces
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")
 def truth_along_kernel(
     surfaces: Surfaces,
     origins: wp.array2d(dtype=wp.vec3),
@@ -39,7 +39,7 @@ def truth_along_kernel(
         reflectance[row, column] = wp.NAN
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")
 def truth_kernel(
     camera: Camera,
     surfaces: Surfaces,

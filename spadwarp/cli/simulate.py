@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -133,7 +135,7 @@ def simulate(
     inputs = (scene_path, *scene.files)
     options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
     outputs = _outputs(out, resume=earlier is not None, **options)
-
+    _load_pictures(scene)
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
@@ -203,6 +205,12 @@ def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt
     if not resume:
         remove_checkpoint(out)
     return outputs
+
+
+def _load_pictures(scene: Scene) -> None:
+    """Loads what draws the pictures at the end, beside the compilation of kernels."""
+    if scene.output.png or scene.output.pdf:
+        threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True).start()
 
 
 def _has_errors(result: Result) -> bool:

@@ -8,8 +8,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from spadwarp.dataset import Recipe
-from spadwarp.denoise import TrainingRecipe
 from spadwarp.errors import ArgumentError
 from spadwarp.mesh import builtin_names
 from spadwarp.scene import Scene, presets
@@ -18,8 +16,8 @@ from spadwarp.scene.load import ENERGIES
 
 __all__ = ["SCHEMAS", "json_schema"]
 
-SCHEMAS: dict[str, type[BaseModel]] = {"scene": Scene, "dataset": Recipe, "training": TrainingRecipe}
-"""Kinds of TOML files and their models."""
+SCHEMAS = ("scene", "dataset", "training")
+"""Kinds of TOML files."""
 
 # A number with a unit, as in `spadwarp.units.quantity`; which unit goes with which field is not in the schema.
 _QUANTITY = {
@@ -42,7 +40,7 @@ def json_schema(kind: str) -> dict[str, Any]:
     """
     if kind not in SCHEMAS:
         raise ArgumentError(f"kind = {kind!r} is not one of {', '.join(map(repr, SCHEMAS))}")
-    schema: dict[str, Any] = _plain(SCHEMAS[kind].model_json_schema(mode="validation"))
+    schema: dict[str, Any] = _plain(_model(kind).model_json_schema(mode="validation"))
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": f"spadwarp {kind}"}
     if kind == "dataset":
         schema["$defs"]["Distribution"] = _distribution(schema["$defs"]["Distribution"])
@@ -55,6 +53,18 @@ def json_schema(kind: str) -> dict[str, Any]:
     if kind == "scene":
         schema["$defs"]["Quantity"] = _QUANTITY
     return schema
+
+
+def _model(kind: str) -> type[BaseModel]:
+    if kind == "scene":
+        return Scene
+    if kind == "dataset":
+        from spadwarp.dataset import Recipe
+
+        return Recipe
+    from spadwarp.denoise import TrainingRecipe
+
+    return TrainingRecipe
 
 
 def _plain(value: Any) -> Any:

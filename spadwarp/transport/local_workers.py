@@ -6,10 +6,12 @@ import queue
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
+import spadwarp_kernels as sk
 from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError
 from spadwarp.limits import check_integer
@@ -59,15 +61,23 @@ class LocalWorkers:
         size = check_integer("launch_size", size, f"[1, {LARGEST_LAUNCH[kind]}]")
         threads = core_count() if threads is None else check_integer("threads", threads, "[1, 4096]")
         threads = 1 if kind == "cuda" else max(1, threads // len(devices))
-        self._scene, self._devices = plan.scene, devices
+        self._devices = devices
         copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
         began = time.perf_counter()
         models = []
-        for device in devices:
-            with device_errors(device):
-                models.append(build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale, kept=kept))
-        built = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh)
+        with ThreadPoolExecutor(1) as beside:
+            # It may have to be compiled, which takes as long as all that is done meanwhile.
+            loading = beside.submit(_load_transport_kernel, spec, devices)
+            for device in devices:
+                with device_errors(device):
+                    models.append(
+                        build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale, kept=kept)
+                    )
+            with device_errors(devices[0]):
+                self._truth = trace_truth(plan.scene, models[0])
+            built = time.perf_counter()
+            loading.result()
         settings: dict[str, Any] = {
             "seed": plan.seed,
             "launch_size": size,
@@ -132,7 +142,7 @@ class LocalWorkers:
         return events
 
     def truth(self) -> Truth:
-        return trace_truth(self._scene, self.workers[0].model)
+        return self._truth
 
     def tallies(self) -> Tallies:
         """Those of all devices; with a single CPU in its own memory."""
@@ -146,3 +156,9 @@ class LocalWorkers:
     def metadata(self) -> dict[str, Any]:
         names = list(dict.fromkeys(map(processor_name, self._devices)))
         return {"device": ",".join(device.alias for device in self._devices), "device_name": ", ".join(names)}
+
+
+def _load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> None:
+    for device in devices:
+        with device_errors(device):
+            sk.load_transport_kernel(spec, device)
