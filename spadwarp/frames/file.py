@@ -119,10 +119,10 @@ class FramesFile:
             )
 
     def plot(self, frame: int = 0, **options: Any) -> Any:
-        """A figure of one frame: intensity, and the counts of a pixel; see `spadwarp.viz.plot`."""
+        """A figure of one frame: depth, error, bound, intensity, the counts of a pixel; see `spadwarp.viz.plot`."""
         import spadwarp
 
-        return spadwarp.viz.plot(self.frame(frame), **options)
+        return spadwarp.viz.plot(self, frame=frame, **options)
 
     def frame(self, number: int) -> Frames:
         """One frame as `Frames`. Raises `ArgumentError` where it is not there or the file holds no expected counts."""
@@ -156,6 +156,11 @@ class FramesFile:
     def depth(self, method: Method, frame: int | None = None) -> NDArray[np.float32]:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
         return self._read(f"depth/{method}", np.float32, self._shape, frame)
+
+    def bound_depth(self) -> NDArray[np.float64]:
+        """Cramér–Rao bound of one frame [m], `[H, W]`; NaN where there is no information."""
+        with read_hdf5(self.path, FORMAT) as file:
+            return file.array("bound/depth", np.float64, self._shape)
 
     @property
     def _shape(self) -> tuple[int, int]:

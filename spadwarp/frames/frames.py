@@ -69,7 +69,7 @@ class Frames:
         return f"Frames({frames} of {self.pulses} pulses, seed {self.seed}, {width} x {height} pixels x {bins} bins)"
 
     def plot(self, frame: int = 0, **options: Any) -> Any:
-        """A figure of one frame: intensity, and the counts of a pixel; see `spadwarp.viz.plot`."""
+        """A figure of one frame: time of the fullest bin, intensity, the counts of a pixel; see `spadwarp.viz.plot`."""
         import spadwarp
 
         return spadwarp.viz.plot(self, frame=frame, **options)

@@ -15,16 +15,16 @@ from matplotlib.figure import Figure
 from spadwarp.analytic import AnalyticResult, Proposal
 from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, SpadwarpError
-from spadwarp.frames import Frames
+from spadwarp.frames import Frames, FramesFile
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
 from spadwarp.scene import Scene
 from spadwarp.transport import truth_maps
 from spadwarp.units import with_prefix
-from spadwarp.viz.frames import analytic_figure
-from spadwarp.viz.panels import Panels, median_pixel, shown_limits
+from spadwarp.viz.frames import analytic_figure, frame_figure, stored_frame_figure
+from spadwarp.viz.panels import Panels, shown_limits
 from spadwarp.viz.result import KINDS, result_figure
-from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, paper, spaced
+from spadwarp.viz.style import INTENSITY_MAP, PAGE, paper, spaced
 
 __all__ = ["html", "plot"]
 
@@ -33,7 +33,7 @@ _HTML_DPI = 100
 
 @paper()
 def plot(
-    shown: Result | Frames | Scene | AnalyticResult,
+    shown: Result | Frames | FramesFile | Scene | AnalyticResult,
     kind: Literal["depth", "intensity", "histogram", "truth"] | None = None,
     *,
     method: Any = "centroid",
@@ -44,8 +44,9 @@ def plot(
     """A figure of a result, of frames or of a scene; notebooks show it, `savefig` writes it.
 
     Args:
-        shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: the counts of one.
-            An analytic result: its maps and a frame. A scene: true depth and reflectance, by ray casting.
+        shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: one of them, from a
+            file with its depth. An analytic result: its maps and a frame. A scene: true depth and reflectance, by ray
+            casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
@@ -64,7 +65,11 @@ def plot(
         raise ArgumentError(f"kind = {kind!r} goes with results only, not with {type(shown).__name__}")
     if isinstance(shown, AnalyticResult):
         return analytic_figure(shown, width)
-    return _frames_figure(shown, frame, width) if isinstance(shown, Frames) else _scene_figure(shown, device, width)
+    if isinstance(shown, FramesFile):
+        return stored_frame_figure(shown, frame, width)
+    if isinstance(shown, Frames):
+        return frame_figure(shown, frame, width=width)
+    return _scene_figure(shown, device, width)
 
 
 def html(shown: Result | Frames | Scene | AnalyticResult | Proposal) -> str:
@@ -100,32 +105,6 @@ def _scene_figure(scene: Scene, device: Any, width: float) -> Figure:
     panels.show_depth(truth.depth, "Truth", shown_limits(truth.depth))
     panels.show(truth.reflectance, "Reflectance", "Lambertian reflectance", INTENSITY_MAP, (0.0, 1.0))
     panels.caption(repr(scene))
-    return panels.figure
-
-
-def _frames_figure(frames: Frames, number: int, width: float) -> Figure:
-    if not 0 <= number < (1 if frames.summed else frames.frames):
-        raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
-    counts = np.asarray(frames.counts if frames.summed else frames.counts[number])
-    intensity = counts.sum(axis=-1)
-    row, column = median_pixel(intensity, intensity > 0)
-    edges = 1e9 * (frames.gate_start + frames.edges)
-    panels = Panels(intensity.shape, 2, width=width, below=2.0)
-    panels.show_intensity(intensity, "Intensity", "counts in a frame")
-    fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
-    panels.show_depth(fullest, "Fullest bin", shown_limits(fullest), "time of flight [ns]")
-    axis = panels.below()
-    pulses = frames.exposure
-    axis.stairs(counts[row, column], edges, fill=True, color="0.72", label="counts")
-    for name, values, colour in (("expected", frames.expected, BLUE), ("background", frames.background, GREEN)):
-        curve = np.broadcast_to(np.asarray(values)[row, column], counts.shape[-1:]) * pulses
-        axis.stairs(curve, edges, baseline=None, color=colour, label=f"{name}, before pile-up")
-    axis.set(xlabel="time of flight [ns]", ylabel="counts per bin", xlim=edges[[0, -1]])
-    axis.set_title(f"Pixel in row {row}, column {column}")
-    axis.xaxis.minorticks_on()
-    panels.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3 if width > 5 else 1)
-    which = "all frames added up" if frames.summed else f"frame {frames.first_frame + number + 1}"
-    panels.caption(f"{which}: {spaced(frames.pulses)} pulses; seed {frames.seed}")
     return panels.figure
 
 

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
 
-from spadwarp.result import Result
 from spadwarp.viz.style import (
     BACKGROUND,
     BOUND_MAP,
@@ -181,9 +180,8 @@ def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, i
     return row, column
 
 
-def arrival_line(axis: Axes, result: Result, row: int, column: int, edges: NDArray[np.float64]) -> None:
-    """A line where the target's light arrives, within the edges [ns]."""
-    arrival = 1e9 * result.true_path()[row, column] / result.pulse_speed
+def arrival_line(axis: Axes, arrival: float, edges: NDArray[np.float64]) -> None:
+    """A line at the time at which the target's light arrives, where it is within the edges; all in [ns]."""
     if edges[0] <= arrival < edges[-1]:
         axis.axvline(arrival, color="0.2", linewidth=0.8, linestyle=DASHED, label="true arrival")
 

@@ -16,7 +16,7 @@ from spadwarp.result import COMPONENTS, Result
 from spadwarp.scene import Medium
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
-from spadwarp.viz.sparse import merged_edges, merged_means, typical_weight
+from spadwarp.viz.sparse import merged_means, shared_edges, typical_weight
 from spadwarp.viz.style import COMPONENTS as STYLES
 from spadwarp.viz.style import (
     INTENSITY_MAP,
@@ -147,7 +147,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
 def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     """Components of one pixel over time of flight, and over the range along its line of sight.
 
-    Where light is sparse, bins are added up until their sum is known to a third; see `merged_edges`.
+    Where light is sparse, bins are added up until their sum is known to a third; see `shared_edges`.
     """
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
@@ -155,25 +155,24 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     total = parts.sum(axis=0)
     known = result.second_moment is not None and result.photons >= 2 * result.batch_size
     error = result.standard_error[row, column] * per_pulse if known else None
-    weight = typical_weight(total) if error is None else np.divide(error**2, total, out=0.0 * total, where=total > 0)
-    curves = {}
-    for name, values in zip(COMPONENTS, parts, strict=True):
-        edges = np.arange(len(time)) if name == "ballistic" else merged_edges(values, weight * values)
-        curves[name] = edges, merged_means(values, edges)
+    variance = typical_weight(total) * total if error is None else error**2
+    edges, groups = shared_edges(parts, variance)
+    groups[COMPONENTS.index("ballistic")] = np.arange(len(time))
+    curves = {name: (own, merged_means(part, own)) for name, part, own in zip(COMPONENTS, parts, groups, strict=True)}
     means = np.concatenate([values for _, values in curves.values()])
     top = float(parts.max())
     bottom = float(np.clip(0.5 * means[means > 0].min(), 1e-7 * top, 0.01 * top))
     if error is not None:
-        _plot_band(axis, time, total, error, bottom)
-    for name, (edges, values) in curves.items():
+        _plot_band(axis, time[edges], merged_means(total, edges), error, edges, bottom)
+    for name, (own, values) in curves.items():
         label, colour = STYLES[name]
         ballistic = name == "ballistic"
         # Zeros lie below the axis, so that a single bin still shows as a spike.
         axis.stairs(
-            np.maximum(values, 0.01 * bottom), time[edges], baseline=None, label=label, color=colour,
+            np.maximum(values, 0.01 * bottom), time[own], baseline=None, label=label, color=colour,
             linewidth=1.4 if ballistic else 0.9, zorder=3 if ballistic else 2,
         )  # fmt: skip
-    arrival_line(axis, result, row, column, time)
+    arrival_line(axis, 1e9 * float(result.true_path()[row, column]) / result.pulse_speed, time)
     axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
     log_axis(axis, "y")
     axis.xaxis.minorticks_on()
@@ -182,14 +181,18 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
 
 
 def _plot_band(
-    axis: Axes, time: NDArray[np.float64], total: NDArray[np.float64], error: NDArray[np.float64], bottom: float
+    axis: Axes,
+    time: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    error: NDArray[np.float64],
+    edges: NDArray[np.intp],
+    bottom: float,
 ) -> None:
     """The sum of all light with its standard error, those of the bins of a group taken as independent."""
-    edges = merged_edges(total, error**2)
-    mean, spread = merged_means(total, edges), np.sqrt(np.add.reduceat(error**2, edges[:-1])) / np.diff(edges)
+    spread = np.sqrt(np.add.reduceat(error**2, edges[:-1])) / np.diff(edges)
     lower = np.maximum(mean - spread, 0.01 * bottom)
     axis.stairs(
-        np.maximum(mean + spread, 0.01 * bottom), time[edges], baseline=lower, fill=True, color="0.75", zorder=1,
+        np.maximum(mean + spread, 0.01 * bottom), time, baseline=lower, fill=True, color="0.75", zorder=1,
         label="all light ± standard error",
     )  # fmt: skip
 

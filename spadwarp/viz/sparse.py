@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import pairwise
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-__all__ = ["merged_edges", "merged_means", "typical_weight"]
+__all__ = ["merged_edges", "merged_means", "shared_edges", "typical_weight"]
 
 _ERROR = 1.0 / 3.0  # relative standard error at which a bin stands alone
 _NEIGHBOURS = 6  # bins on each side that share a weight
@@ -59,6 +62,44 @@ def merged_edges(values: NDArray[np.float64], variance: NDArray[np.float64]) -> 
         edges.append(int(stop))
     edges += list(range(edges[-1], len(values) + 1))
     return np.unique(edges)
+
+
+def shared_edges(
+    parts: NDArray[np.float64], variance: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], list[NDArray[np.intp]]]:
+    """Edges of groups for the sum of components of light, and for each component.
+
+    Groups of the sum, by `merged_edges`, do not go across the first or last light of a component. Where a component is
+    more than half of a group, it has the same groups; where it is less, groups that are wide enough for itself.
+
+    Args:
+        parts: `[component, T]`.
+        variance: Of their sum, `[T]`; each has a part of it as it has of the light.
+    """
+    total = parts.sum(axis=0)
+    lit = [np.flatnonzero(part) for part in parts if part.any()]
+    ends = sorted({0, len(total), *(int(end) for one in lit for end in (one[0], one[-1] + 1))})
+    edges = _joined(low + merged_edges(total[low:high], variance[low:high]) for low, high in pairwise(ends))
+    weight = np.divide(variance, total, out=np.zeros_like(total), where=total > 0)
+    return edges, [_own_edges(part, total, weight * part, edges) for part in parts]
+
+
+def _own_edges(
+    part: NDArray[np.float64], total: NDArray[np.float64], variance: NDArray[np.float64], edges: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    sums = (np.add.reduceat(values, edges[:-1]) for values in (part, 0.5 * total))
+    major = np.repeat(np.greater(*sums), np.diff(edges))
+    turns = [0, *(np.flatnonzero(np.diff(major)) + 1), len(part)]
+    return _joined(
+        edges[(edges >= low) & (edges <= high)]
+        if major[low]
+        else low + merged_edges(part[low:high], variance[low:high])
+        for low, high in pairwise(turns)
+    )
+
+
+def _joined(stretches: Iterable[NDArray[np.intp]]) -> NDArray[np.intp]:
+    return np.unique(np.concatenate(list(stretches)))
 
 
 def _cuts(values: NDArray[np.float64], variance: NDArray[np.float64], start: int, stop: int) -> list[int]:

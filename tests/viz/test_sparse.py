@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spadwarp.viz.sparse import merged_edges, merged_means, typical_weight
+from spadwarp.viz.sparse import merged_edges, merged_means, shared_edges, typical_weight
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -36,3 +36,16 @@ def test_the_weight_of_a_photon_is_found_on_a_slope(weight):
 def test_nothing_is_one_group_of_nothing():
     edges = merged_edges(np.zeros(8), np.zeros(8))
     assert merged_means(np.zeros(8), edges).sum() == 0 and edges[-1] == 8
+
+
+def test_the_larger_component_has_the_bins_of_the_sum_and_none_begins_before_its_light():
+    random, bins = np.random.default_rng(4), np.arange(300)
+    water = random.poisson(200 * np.exp(-bins / 30.0)) * 1.0
+    target = np.where(bins < 150, 0.0, random.poisson(80 * np.exp(-(bins - 150) / 20.0)))
+    parts = np.stack([water, target])
+    edges, (of_water, of_target) = shared_edges(parts, parts.sum(axis=0))
+    known = np.add.reduceat(target, edges[:-1]) > 0.5 * np.add.reduceat(parts.sum(axis=0), edges[:-1])
+    assert known.sum() > 20 and set(edges[:-1][known]) <= set(of_target) and set(edges[1:][known]) <= set(of_target)
+    assert 150 in edges and 150 in of_target
+    assert set(edges[edges <= 60]) <= set(of_water)
+    assert (np.diff(of_water)[-3:] > 1).any()  # beneath the target's light, its own wide groups
