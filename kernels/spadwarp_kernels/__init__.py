@@ -37,6 +37,7 @@ from .medium import (
     make_grid,
     make_layers,
     reflection_images,
+    voxel_values_kernel,
 )
 from .phase import (
     HENYEY_GREENSTEIN,
@@ -247,5 +248,6 @@ __all__ = [
     "u01_tail",
     "unshadowed",
     "update_surfaces",
+    "voxel_values_kernel",
     "write_poses",
 ]

@@ -211,6 +211,8 @@ def _not_covered(scene: Scene) -> list[str]:
         )
     if scene.medium.layers:
         problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
+    if scene.medium.grid is not None:
+        problems.append("medium.grid: the analytic simulator takes one water; simulate takes any")
     if chosen.backscatter == "single_scatter" and laser.profile == "collimated":
         problems.append(
             "analytic.backscatter = 'single_scatter' needs a diverging laser.profile, not 'collimated'; "

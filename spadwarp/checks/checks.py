@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from spadwarp.checks.daylight import check_daylight
+from spadwarp.checks.grid import check_grid, grid_summary
 from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
 from spadwarp.checks.optics import check_focus, check_ports, check_scan
@@ -32,6 +33,7 @@ _CHECKS = (
     check_spectrum,
     check_daylight,
     check_medium,
+    check_grid,
     check_statistics,
 )
 
@@ -62,12 +64,13 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     """Numbers that follow from a scene; lengths in m, None where there is no target in the view and the beam.
 
     `attenuation_length` and `albedo` are those of the water before the first layer; `layers` has those of each layer,
-    with its start. `focus_distance` is the depth that the lens images sharply, None for a pinhole. `optical_depth` is
-    one-way to the nearest visible point. `signal_per_pulse` is the expected number of unscattered target photons that
-    one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how many it receives; `samples_per_pixel` how
-    many of the traced photons reach a pixel's part of the target unscattered. `irradiance` is that of unscattered light
-    at the nearest visible point's range on the beam's axis, mean over time [W/m²]. `histogram_bytes` is one set of
-    tallies.
+    with its start; `grid` counts, edges, least and largest extinction and memory of the cells, and the optical depth
+    along the axis through their box, None without a grid. `focus_distance` is the depth that the lens images sharply,
+    None for a pinhole. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected
+    number of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how
+    many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered.
+    `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
+    [W/m²]. `histogram_bytes` is one set of tallies.
     Raises `MeshError`.
     """
     scene = as_scene(scene)
@@ -80,6 +83,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     return {
         **water(medium),
         "layers": [{"start": layer.start, **water(layer)} for layer in medium.layers],
+        "grid": grid_summary(scene),
         "target_range": survey.target_range,
         "target_arrival_ns": survey.target_arrival_ns,
         "optical_depth": survey.optical_depth,

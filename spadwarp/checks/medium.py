@@ -95,7 +95,11 @@ def _check_molecular_scattering(scene: Scene) -> Iterator[CheckMessage]:
 def _check_collisions(scene: Scene) -> Iterator[CheckMessage]:
     """Whether `max_collisions` or `weight_cutoff` ends histories that the longest path would let go on."""
     transport = scene.transport
-    mean = max(water.extinction for water in scene.medium.waters) * scene.path_limit  # along the longest path
+    mean = scene.medium.range.extinction * scene.path_limit  # along the longest path
+    if scene.medium.grid is not None:  # most of which is not in the densest cell
+        beam = scene.beam
+        far = [p + 0.5 * scene.path_limit * u for p, u in zip(beam.position, beam.axis, strict=True)]
+        mean = 2.0 * scene.optical_depth(beam.position, far)
     most, cutoff = mean + 3.0 * math.sqrt(mean), _cutoff_collisions(scene)
     values = {"path_collisions": mean, "cutoff_collisions": cutoff}
     if transport.max_collisions < min(most, cutoff):
@@ -121,7 +125,7 @@ def _cutoff_collisions(scene: Scene) -> float:
     if scene.medium.albedo == "lu2024":
         step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
     else:
-        albedo = max(water.scattering / water.extinction for water in scene.medium.waters)
+        albedo = scene.medium.range.albedo
         if albedo in (0.0, 1.0):
             return 1.0 if albedo == 0.0 else math.inf
         step = math.log(albedo)

@@ -64,6 +64,7 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
             + (f" from {water['start']:.4g} m on" if "start" in water else "")
             for water in (numbers, *numbers["layers"])
         ),
+        **_grid(numbers["grid"]),
         "target": f"{between(numbers['target_range'], 'm')}, {opt.count(faces)} faces",
         "optical depth": about(numbers["optical_depth"], "{:.3g} one way"),
         "returns": between(numbers["target_arrival_ns"], "ns"),
@@ -80,3 +81,14 @@ def _derived(numbers: Mapping[str, Any], faces: int) -> dict[str, str]:
         "sampling": about(numbers["samples_per_pixel"], "{:.3g} traced photons on what a pixel sees, unscattered"),
         "histograms": opt.in_bytes(numbers["histogram_bytes"]),
     }
+
+
+def _grid(numbers: Mapping[str, Any] | None) -> dict[str, str]:
+    """The row about cells of water."""
+    if numbers is None:
+        return {}
+    counts = " x ".join(map(str, numbers["cells"]))
+    edges = " x ".join(f"{edge:.3g}" for edge in numbers["size"])
+    low, high = numbers["extinction"]
+    text = f"{counts} cells in {edges} m, c = {low:.3g} to {high:.3g} 1/m, {opt.in_bytes(numbers['bytes'])}"
+    return {"grid": f"{text}; optical depth {numbers['optical_depth']:.3g} along the axis through its box"}

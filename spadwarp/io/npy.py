@@ -1,8 +1,11 @@
-"""NumPy's files of one array, whose header is compared with the file before anything is allocated."""
+"""NumPy's files of one array, and archives of some, whose headers are compared with the file before anything is
+allocated."""
 
 from __future__ import annotations
 
 import math
+import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.errors import FileError
 from spadwarp.io.paths import existing_file
 
-__all__ = ["read_npy"]
+__all__ = ["read_npy", "read_npz"]
 
 
 def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
@@ -46,6 +49,41 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
         raise
     except Exception as error:  # a damaged header is parsed by Python's own parser
         raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
+    """Those arrays of a `.npz` archive that have one of the names; real numbers or booleans; pickles are never loaded.
+
+    Args:
+        path: The file.
+        names: What to read; anything else in the archive is passed over.
+        largest: Allowed number of values of an array.
+
+    Raises:
+        FileError: No such file, not a `.npz` archive, shorter than a header says, of another type, or too large.
+    """
+    place = existing_file(path)
+    found: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(place) as archive:
+            for info in archive.infolist():
+                name = info.filename.removesuffix(".npy")
+                if name not in names:
+                    continue
+                with archive.open(info) as file:
+                    shape, _, kind = _header(file)
+                    needed = math.prod(shape) * kind.itemsize
+                    if kind.kind not in "biuf":
+                        raise FileError(f"{path}: {name} holds {kind}; numbers are needed")
+                    if math.prod(shape) > largest or needed > info.file_size:
+                        raise FileError(f"{path}: {name} {shape} is larger than the file, or than {largest} values")
+                with archive.open(info) as file:
+                    found[name] = np.lib.format.read_array(file, allow_pickle=False)
+    except FileError:
+        raise
+    except Exception as error:  # a damaged header is parsed by Python's own parser
+        raise FileError(f"{path}: damaged or not a .npz archive: {error}") from error
+    return found
 
 
 def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -310,6 +310,7 @@ class Result:
                 **scene.medium.phase_parameters,
                 "group_index": scene.medium.group_index,
                 **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
+                **({} if scene.medium.grid is None else {"grid": scene.medium.grid.shape or scene.medium.grid.file}),
             },
             "collected_fraction": dict(zip(COMPONENTS, map(float, fractions), strict=True)),
             "detections_per_pulse": float(

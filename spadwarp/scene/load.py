@@ -28,7 +28,12 @@ _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": 
 ENERGIES = ("pulse_energy", "average_power", "peak_power")
 
 # Tables within sections: (section, field) -> whose fields they have.
-_TABLES = {("camera", "port"): "port", ("laser", "port"): "port", ("domain", "outside_index"): "outside_index"}
+_TABLES = {
+    ("camera", "port"): "port",
+    ("laser", "port"): "port",
+    ("domain", "outside_index"): "outside_index",
+    ("medium", "grid"): "grid",
+}
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
 
@@ -59,6 +64,7 @@ _DISPLACES: dict[str, dict[str, tuple[str, ...]]] = {
         "filter_table": ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"),
     },
     "targets": {"builtin": ("mesh",), "mesh": ("builtin", "size")},
+    "grid": {"file": ("shape", "cells", "turbulence", "eddy_size", "seed"), "shape": ("file",)},
     "port": {
         "shape": ("distance", "normal", "radius", "offset"),
         "material": ("index", "group_index"),

@@ -6,11 +6,13 @@ import bisect
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
 from spadwarp.scene.coefficients import COEFFICIENTS
+from spadwarp.scene.grid import Grid
+from spadwarp.scene.grid_cells import grid_cells
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.layers import Layer, Water
 from spadwarp.scene.phase_fields import PHASE_FIELDS
@@ -18,6 +20,24 @@ from spadwarp.scene.preset import PHASE_TABLES, PRESETS, WATER_INDICES
 from spadwarp.scene.sections import Vector, listed
 from spadwarp.units import pulse_speed
 from spadwarp.water import water_optics
+
+
+class WaterRange(NamedTuple):
+    """Extremes over all water of a scene.
+
+    Attributes:
+        extinction: The largest [1/m].
+        scattering: The largest [1/m].
+        absorption: The least [1/m].
+        albedo: The largest, of "lu2024" none.
+        anisotropies: Mean cosines beside the medium's own, the least and the largest of a grid.
+    """
+
+    extinction: float
+    scattering: float
+    absorption: float
+    albedo: float
+    anisotropies: tuple[float, ...]
 
 
 class Medium(Water):
@@ -57,6 +77,8 @@ class Medium(Water):
     """other waters further along `layer_axis`, in its order"""
     layer_axis: Vector = (0.0, 0.0, 1.0)
     """direction across the layers, in the world; not 0"""
+    grid: Grid | None = None
+    """water that varies within a box, cell by cell; not with layers"""
     _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")
@@ -105,8 +127,23 @@ class Medium(Water):
                     f"layers[{i}].anisotropy = {layer.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
                     " layers share any other"
                 )
+        if self.grid is not None:
+            self._check_grid(self.grid)
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
+
+    def _check_grid(self, grid: Grid) -> None:
+        if self.layers:
+            raise ValueError(
+                f"grid does not go with layers, {len(self.layers)} given; cells can repeat them: write them to a file"
+            )
+        if self.albedo == "lu2024":
+            raise ValueError("grid does not go with albedo = 'lu2024', which has no cells; give the albedo a number")
+        if grid.anisotropy is not None and self.phase_function != "henyey_greenstein":
+            raise ValueError(
+                f"grid.anisotropy = {grid.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
+                " cells share any other"
+            )
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
@@ -173,9 +210,40 @@ class Medium(Water):
         """Itself and its layers, in the order of `layer_axis`."""
         return (self, *self.layers)
 
+    @property
+    def varies(self) -> bool:
+        """Whether the water differs from place to place."""
+        return bool(self.layers) or self.grid is not None
+
+    @property
+    def range(self) -> WaterRange:
+        """Extremes over the medium, its layers and its grid. Raises what `grid_cells` raises."""
+        waters = self.waters
+        found = WaterRange(
+            max(water.extinction for water in waters),
+            max(water.scattering for water in waters),
+            max(0.0, min(water.extinction - water.scattering for water in waters)),
+            max(water.scattering / max(water.extinction, 1e-30) for water in waters),
+            tuple(layer.anisotropy for layer in self.layers if layer.anisotropy is not None),
+        )
+        if self.grid is None:
+            return found
+        cells = grid_cells(self)
+        scattering = cells.scattering
+        g = cells.anisotropy
+        return WaterRange(
+            max(found.extinction, float(cells.extinction.max())),
+            max(found.scattering, float(scattering.max())),
+            max(0.0, min(found.absorption, float((cells.extinction - scattering).min()))),
+            max(found.albedo, float(cells.albedo.max())),
+            () if g is None else (float(g.min()), float(g.max())),
+        )
+
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds along the straight line between two points of the world [m]."""
         length = math.dist(begin, end)
+        if self.grid is not None:
+            return float(grid_cells(self).optical_depths(begin, end, self.extinction))
         if not self.layers or length == 0.0:
             return self.extinction * length
         scale = math.hypot(*self.layer_axis)

@@ -89,6 +89,8 @@ class Scene(BaseModel):
     def _daylight_in_one_water(self) -> Self:
         if self.daylight is not None and self.medium.layers:
             raise ValueError(f"medium.layers: {len(self.medium.layers)} given; daylight takes one water")
+        if self.daylight is not None and self.medium.grid is not None:
+            raise ValueError("medium.grid does not go with daylight, which takes one water: leave one of them out")
         return self
 
     @model_validator(mode="after")
@@ -138,6 +140,7 @@ class Scene(BaseModel):
         tables = self.to_dict()
         named = [tables[section].get(name, "") for section, name, _ in _FILE_FIELDS]
         named += [target.get("mesh", "") for target in tables.get("targets", ())]
+        named.append(tables["medium"].get("grid", {}).get("file", ""))
         return [Path(path) for path in named if Path(path).suffix]
 
     @property
@@ -171,7 +174,7 @@ class Scene(BaseModel):
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds along the straight line between two points of the camera frame [m]."""
-        if self.medium.layers and self.camera.is_posed:
+        if self.medium.varies and self.camera.is_posed:
             begin, end = to_world(self.camera, [begin, end]).tolist()
         return self.medium.optical_depth(begin, end)
 
@@ -336,4 +339,7 @@ def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     for section, name, ending in _FILE_FIELDS:
         if section in changed:
             changed[section] = absolute(changed[section], name, ending)
+    medium = changed.get("medium")
+    if isinstance(medium, Mapping) and "grid" in medium:
+        changed["medium"] = {**medium, "grid": absolute(medium["grid"], "file")}
     return changed

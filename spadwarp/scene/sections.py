@@ -47,6 +47,7 @@ Brown = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordina
 Bound = Annotated[float, Field(ge=-math.inf, le=math.inf, allow_inf_nan=True)]
 Corner = Annotated[tuple[Bound, Bound, Bound], _repeated(3)]
 Size = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e9)], ...], _repeated(1), Field(min_length=1, max_length=3)]
+Counts = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], _repeated(1), Field(min_length=1, max_length=3)]
 Scale = Annotated[tuple[Coordinate, Coordinate, Coordinate], _repeated(3)]
 
 

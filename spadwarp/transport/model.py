@@ -21,6 +21,7 @@ from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
 from spadwarp.transport.tally_unit import tally_scale
 
@@ -91,6 +92,8 @@ def build_model(
     )
     if scene.medium.layers:
         model = dataclasses.replace(model, layers=_layers(scene, device))
+    if scene.medium.grid is not None:
+        model = dataclasses.replace(model, layers=grid_layers(scene, device))
     if scene.scan.mode != "none":
         model = dataclasses.replace(model, scan=_scan(scene, device))
     if camera:
@@ -154,7 +157,7 @@ def _guiding(scene: Scene, max_path: float) -> Any:
     events are many, needs smaller ones; vessels do too, see `guided_part` of the kernel library.
     """
     beam = scene.beam
-    if scene.medium.layers:
+    if scene.medium.varies:
         far_point = [p + 0.5 * max_path * u for p, u in zip(beam.position, beam.axis, strict=True)]
         thickness = max(2.0 * scene.optical_depth(beam.position, far_point), 1e-6)
     else:
@@ -243,6 +246,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         port=_port_kind(camera_port(scene)),
         laser_port=_port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
+        grid=grid_tracking(scene),
     )
     return spec._replace(**choices)
 

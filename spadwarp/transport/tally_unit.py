@@ -73,10 +73,8 @@ def _phase_density(scene: Scene) -> Density:
 
 
 def _own_anisotropies(scene: Scene) -> list[float]:
-    """Of layers that share the phase function's form alone."""
-    if scene.medium.has_phase_table:
-        return []
-    return [layer.anisotropy for layer in scene.medium.layers if layer.anisotropy is not None]
+    """Of layers and cells that share the phase function's form alone."""
+    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
 
 
 def _backward(scene: Scene, density: Density) -> float:
@@ -98,7 +96,7 @@ def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> floa
 
 
 def _largest_albedo(scene: Scene) -> float:
-    return max(water.scattering / max(water.extinction, 1e-30) for water in scene.medium.waters)
+    return scene.medium.range.albedo
 
 
 def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
@@ -127,7 +125,7 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
     if (port := camera_port(scene)) is not None:
         nearest = max(nearest, port.nearest)
-    scattering = max(water.scattering for water in medium.waters)
+    scattering = medium.range.scattering
     absorption = _absorption(scene)
     reach = 0.5 * gate.bin_width * speed
     # The integral of 1/r^2 over the bin.
@@ -157,7 +155,7 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
 
 
 def _absorption(scene: Scene) -> float:
-    return max(0.0, min(water.extinction - water.scattering for water in scene.medium.waters))
+    return scene.medium.range.absorption
 
 
 def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
@@ -199,7 +197,7 @@ def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float], densit
     seen = (points @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)
     seen &= (along + away >= gate.start * speed) & (along + away <= gate.stop * speed)
     brightest = 0.0
-    scattering = max(water.scattering for water in scene.medium.waters)
+    scattering = scene.medium.range.scattering
     absorption = _absorption(scene)
     for distance, point, r in zip(along[seen], points[seen], away[seen], strict=True):
         one_minus_cosine = 1.0 + float(point @ laser.axis) / r

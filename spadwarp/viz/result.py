@@ -220,6 +220,8 @@ def _caption(result: Result) -> str:
     if medium.layers:
         extinctions = ", ".join(f"{water.extinction:.3g}" for water in medium.waters)
         water = f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
+    if medium.grid is not None:
+        water += f", with {medium.grid.shape or Path(str(medium.grid.file)).name}"
     photons = f"{result.photons:.3g}" if result.photons >= 1e6 else spaced(result.photons)
     if "e+" in photons:
         mantissa, power = photons.split("e+")

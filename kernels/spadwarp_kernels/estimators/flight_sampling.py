@@ -126,7 +126,7 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
     profile ``(..., layers, begin_point)``, the latter where the interval begins."""
     has_profile = profile is not None
-    depth_along, distance_to, extinction_at = profile or HOMOGENEOUS[:3]
+    depth_along, distance_to, extinction_at = (profile or HOMOGENEOUS)[:3]
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
     # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
     turn_of, along_of, slope = (

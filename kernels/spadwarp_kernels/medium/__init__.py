@@ -16,6 +16,7 @@ from .layers import (
     make_layers,
 )
 from .limits import EXIT_FACES, Limits, exit_distance
+from .voxels import voxel_values_kernel
 from .water import Medium, free_path
 
 __all__ = [
@@ -42,4 +43,5 @@ __all__ = [
     "make_grid",
     "make_layers",
     "reflection_images",
+    "voxel_values_kernel",
 ]

@@ -1,0 +1,228 @@
+"""Water cell by cell: against one water, layers and quadrature; the estimators against each other."""
+
+import math
+
+import h5py
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import erf
+
+import spadwarp
+from helpers.estimators import agreeing_cells, cells
+from helpers.scenes import scene
+from helpers.statistics_of_samples import equal_means_p
+from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.units import SPEED_OF_LIGHT
+
+pytestmark = pytest.mark.physics
+
+LAYERS = [
+    {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5},
+    {"start": 1.7, "extinction": 0.2, "albedo": 0.9},
+]
+TRACKING = ("regular", "delta")
+
+
+@pytest.fixture(scope="module")
+def one_water(tmp_path_factory):
+    """Cells of the medium's own water, in a box that stands askew."""
+    path = tmp_path_factory.mktemp("cells") / "one.npz"
+    np.savez(path, extinction=np.full((8, 9, 10), 0.5), albedo=np.full((8, 9, 10), 0.8), size=[1.0, 2.0, 1.5])
+    return {"file": str(path), "translation": [0.0, 0.0, 1.0], "rotation_deg": [10.0, 20.0, 30.0]}
+
+
+@pytest.fixture(scope="module")
+def layered_cells(tmp_path_factory):
+    """The layers as cells: from -6 m to 6 m along z, in steps of 0.1 m, and as far aside as light may come."""
+    z = np.arange(-6.0, 6.0 - 1e-9, 0.1) + 0.05
+    columns = {
+        name: np.where(z < 1.2, a, np.where(z < 1.7, b, c)) * np.ones((2, 3, 1))
+        for name, (a, b, c) in {
+            "extinction": (0.5, 1.5, 0.2),
+            "albedo": (0.8, 0.6, 0.9),
+            "anisotropy": (0.8, 0.5, 0.8),
+        }.items()
+    }
+    path = tmp_path_factory.mktemp("cells") / "layers.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            file[name] = values
+        file["size"] = [40.0, 40.0, 12.0]
+    return {"file": str(path)}
+
+
+@pytest.mark.parametrize("tracking", TRACKING)
+@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
+def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, device):
+    """The same random numbers, since no tentative collision is rejected: up to rounding, the same histories."""
+    plain, cellular = (
+        spadwarp.simulate(
+            scene(medium=medium, transport={"estimator": estimator}), photons=60_000, seed=3, device=device
+        )
+        for medium in ({}, {"grid": {**one_water, "tracking": tracking}})
+    )
+    assert cellular.tallies.any() and cellular.ledger_report()["exact"] and cellular.counters["invalid"] == 0
+    rtol = 2e-3 if device == "cpu" else 2e-2
+    np.testing.assert_allclose(
+        cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("estimator", ["analog", "guided"])
+def test_regular_tracking_of_cells_that_repeat_layers_has_their_histories(estimator, layered_cells, device):
+    layered, cellular = (
+        spadwarp.simulate(
+            scene(medium=medium, transport={"estimator": estimator}), photons=60_000, seed=3, device=device
+        )
+        for medium in ({"layers": LAYERS}, {"grid": {**layered_cells, "tracking": "regular"}})
+    )
+    assert cellular.counters["water_collisions"] == pytest.approx(layered.counters["water_collisions"], rel=1e-3)
+    # guided: other points of the same flights.
+    rtol = 2e-3 if estimator == "analog" else 0.05
+    total = [result.histogram.sum(axis=(0, 1)) for result in (cellular, layered)]
+    np.testing.assert_allclose(*total, rtol=rtol, atol=0.02 * total[1].max() if device != "cpu" else 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
+def test_cells_that_repeat_layers_have_their_expectation(estimator, layered_cells, device):
+    """By chance of 32 seeds; regular tracking has the histories of the layers, see above."""
+    photons = {"analog": 20_000, "next_event": 10_000, "guided": 8_000}[estimator]
+
+    def run(medium):
+        # What scatters next to the lens has no finite variance in next_event.
+        near = {"medium": medium, "transport": {"estimator": estimator}, "gate": {"start_ns": 4.0}}
+        return cells(scene(**near), device, photons)
+
+    layered = run({"layers": LAYERS})
+    found = run({"grid": {**layered_cells, "tracking": "delta"}})
+    assert equal_means_p(found, layered, 0.2) > 1e-3
+
+
+PLUME = {
+    "shape": "plume",
+    "size": [1.4, 1.4, 1.2],
+    "cells": 24,
+    "extinction": 6.0,
+    "albedo": 0.7,
+    "anisotropy": 0.6,
+    "turbulence": 0.5,
+    "seed": 5,
+    "translation": [0.0, 0.0, 1.2],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tracking", TRACKING)
+def test_estimators_agree_through_a_plume(tracking, device):
+    """In clear water, so that next_event has a finite variance."""
+    one = scene(medium={"extinction": 1e-3, "grid": {**PLUME, "tracking": tracking}})
+    assert 0.3 < one.optical_depth((0.0, 0.0, 0.0), (0.0, 0.1, 2.2)) < 3.0
+    few = {"analog": 30_000, "next_event": 12_000, "guided": 12_000}
+    found = agreeing_cells(one, device, photons=few if tracking == "delta" else {"guided": 12_000, "analog": 30_000})
+    assert (found["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("tracking", TRACKING)
+@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+def test_ballistic_light_is_weakened_by_the_cells_on_its_way(estimator, tracking, device):
+    """Pencil beam onto a plate: R/pi exp(-2 tau) A/d^2 to 1 %."""
+    one = scene(
+        medium={"grid": {**PLUME, "tracking": tracking}},
+        laser={"profile": "collimated", "position": [0.0, 0.0, 0.0]},
+        camera={"aperture_diameter": 0.02},
+        transport={"estimator": estimator},
+    )
+    depth = one.medium.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, 2.2))
+    assert depth > 1.2
+    result = spadwarp.simulate(one, photons=400_000, seed=3, device=device)
+    expected = 0.7 / math.pi * math.exp(-2.0 * depth) * math.pi * 0.01**2 / 2.2**2
+    assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.02)
+
+
+# Single scatter of a pencil beam at x = -0.1 m, in cells, against the integral along it
+
+
+def _cloud_depth(begin, end, sigma, centre, peak):
+    """∫ of an isotropic Gaussian along a straight line, in closed form."""
+    begin, end = np.array(begin), np.array(end)
+    length = np.linalg.norm(end - begin)
+    u = (end - begin) / length
+    along = (centre - begin) @ u
+    aside2 = ((centre - begin) ** 2).sum() - along**2
+    ends = erf((length - along) / (math.sqrt(2.0) * sigma)) - erf(-along / (math.sqrt(2.0) * sigma))
+    return peak * math.exp(-0.5 * aside2 / sigma**2) * sigma * math.sqrt(0.5 * math.pi) * ends
+
+
+def _brought(one, z, b, tau):
+    """By metre of the beam: b p exp(-tau) A cos(psi)/r²."""
+    r = np.hypot(0.1, z)
+    g = one.medium.anisotropy
+    p = (1.0 - g * g) / (4.0 * math.pi * (1.0 + g * g + 2.0 * g * z / r) ** 1.5)
+    return b * p * np.exp(-tau) * one.camera.aperture_area * (z / r) / r**2
+
+
+def _in_bins(one, edges):
+    """The integral over the cells themselves, by bins of path, of 8 000 points of the beam."""
+    water = grid_cells(one.medium)
+    ends = np.linspace(0.4, 3.0, 8001)
+    z = 0.5 * (ends[1:] + ends[:-1])
+    points = np.stack([np.full_like(z, -0.1), np.full_like(z, 1e-6), z], axis=1)
+    tau = water.optical_depths([-0.1, 1e-6, 0.0], points, one.medium.extinction)
+    tau += water.optical_depths([0.0, 0.0, 0.0], points, one.medium.extinction)
+    inside = water.at(points, 0.0) > 0.0
+    b = inside * 0.7 * (water.at(points, 0.0) - one.medium.extinction)
+    value = _brought(one, z, b, tau) * np.diff(ends)
+    return np.histogram(z + np.hypot(0.1, z), edges, weights=value)[0]
+
+
+def _measured(one, photons, seeds, device):
+    rows = [
+        spadwarp.simulate(one, photons=photons, seed=seed, device=device).component("backscatter").sum(axis=(0, 1))
+        for seed in range(seeds)
+    ]
+    return np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / math.sqrt(seeds)
+
+
+def _pencil(medium, edges, estimator):
+    gate = {
+        "start_ns": 1e9 * edges[0] / SPEED_OF_LIGHT,
+        "bin_width_ps": 1e12 * (edges[1] - edges[0]) / SPEED_OF_LIGHT,
+        "bins": len(edges) - 1,
+    }
+    return scene(
+        medium=medium,
+        laser={"profile": "collimated", "position": [-0.1, 0.0, 0.0]},
+        camera={"aperture_diameter": 0.01},
+        gate=gate,
+        targets=[],
+        transport={"estimator": estimator, "max_collisions": 1},
+    )
+
+
+@pytest.mark.parametrize("tracking", TRACKING)
+def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, device):
+    """Optical depth 2 on the axis. By bins that of the cells, in sum that of the cloud: 0.3 %, 4 standard errors."""
+    edges = np.arange(1.5, 4.01, 0.25)
+    sigma, centre, peak = 1.8 / 6.0, np.array([0.0, 0.0, 1.4]), 2.0 / (0.3 * math.sqrt(2.0 * math.pi))
+    cloud = {"shape": "cloud", "size": 1.8, "cells": 60, "extinction": peak, "albedo": 0.7, "tracking": tracking}
+    medium = {"extinction": 0.05, "albedo": 0.0, "grid": {**cloud, "translation": centre.tolist()}}
+    one = _pencil(medium, edges, "guided")
+    assert one.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, 4.0)) == pytest.approx(2.0 + 0.2, rel=0.01)
+
+    expected = _in_bins(one, edges)
+    mean, error = _measured(one, 150_000, 8, device)
+    assert (np.abs(mean - expected) < 4.0 * error + 0.003 * expected).all(), (mean - expected) / error
+    assert (error < 0.01 * expected).all()
+
+    def gaussian(z):
+        """Of the cloud without cells."""
+        point = np.array([-0.1, 0.0, z])
+        b = 0.7 * peak * math.exp(-0.5 * ((point - centre) ** 2).sum() / sigma**2)
+        tau = 0.05 * (z + math.hypot(0.1, z)) + _cloud_depth([-0.1, 0.0, 0.0], point, sigma, centre, peak)
+        return _brought(one, z, b, tau + _cloud_depth(point, [0.0, 0.0, 0.0], sigma, centre, peak))
+
+    first, last = ((path**2 - 0.01) / (2.0 * path) for path in edges[[0, -1]])
+    total = quad(gaussian, first, last, epsabs=1e-14, limit=200)[0]
+    assert mean.sum() == pytest.approx(total, rel=0.003, abs=4.0 * math.sqrt((error**2).sum()))
