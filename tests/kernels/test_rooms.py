@@ -24,6 +24,7 @@ ROOMS = (
     "source",
     "tally",
     "photon",
+    "derivatives",
     "estimators",
     "transport",
     "pixels",

@@ -21,7 +21,7 @@ from spadwarp_kernels.surface.ggx import ggx_brdf
 from spadwarp_kernels.surface.lambert import lambert_brdf
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, Scores, tally_index
 
 from .flight_sampling import make_sample_flight
 from .link import make_apparent_lens, make_link
@@ -46,6 +46,7 @@ class Request:
         component: Index into COMPONENTS.
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
         target: The pixel of a scan, else -1.
+        scores: Of the photon up to x.
     """
 
     wanted: bool
@@ -61,6 +62,7 @@ class Request:
     component: int
     slot: int
     target: int
+    scores: Scores
 
 
 @wp.struct
@@ -101,7 +103,7 @@ class ScoredPoint:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
-    reflecting, tracks = spec.reflecting, spec.grid is not None
+    reflecting, tracks, derives = spec.reflecting, spec.grid is not None, bool(spec.derivatives)
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
@@ -124,6 +126,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.slot = -1
                 q.target = s.target
                 q.component = FORWARD_SCATTERED
+                if wp.static(derives):
+                    q.scores = s.scores
                 if s.hit.face >= 0:
                     q.slot = s.hit.slot
                     if s.collisions == 1:

@@ -85,7 +85,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo = spec.varies and not spec.random_albedo
+    local_albedo, derives = spec.varies and not spec.random_albedo, bool(spec.derivatives)
 
     @wp.func
     def request_flight(s: PhotonState) -> Request:
@@ -105,6 +105,8 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1
         q.target = s.target
+        if wp.static(derives):
+            q.scores = s.scores
         return q
 
     return request_flight, make_event_request(spec, flights=True)

@@ -4,6 +4,8 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.derivatives.history import make_flight_scores
+from spadwarp_kernels.derivatives.request import make_turn_scores
 from spadwarp_kernels.intersect.box import segment_meets_box
 from spadwarp_kernels.medium.boundary import (
     flipped,
@@ -23,7 +25,8 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, deposit, tally_index
+from spadwarp_kernels.tally.scores import Derivatives, make_deposit
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Scores, tally_index
 
 from .contribution import Request, Scored, make_scattering
 from .link import make_link
@@ -31,11 +34,13 @@ from .link import make_link
 
 @wp.struct
 class Way:
-    """What is on the way of an image: the optical depth, whether nothing is in between, and rays traced for that."""
+    """What is on the way of an image: the optical depth, whether nothing is in between, rays traced for that, and the
+    scores at its end."""
 
     depth: float
     clear: bool
     shadow_queries: int
+    scores: Scores
 
 
 @wp.func
@@ -65,9 +70,11 @@ def _no_origin(limits: Limits) -> wp.vec3:
 
 @functools.cache
 def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
-    """The Warp function ``(x, v, length, reflections, medium, layers, limits, surfaces, seed) -> Way`` of the light
-    that leaves x along v, in the domain's axes, and is reflected so many times within that length."""
-    has_mesh, brute_force = spec.mesh, brute_force
+    """The Warp function ``(x, v, length, reflections, scores, medium, layers, limits, surfaces, derivatives, seed) ->
+    Way`` of the light that leaves x along v, in the domain's axes, and is reflected so many times within that
+    length."""
+    has_mesh, derives = spec.mesh, bool(spec.derivatives)
+    flight_scores = make_flight_scores(spec)
     water_extinction = spec.water.extinction
     turn_back, origin = (_from_domain, _origin) if spec.rotated_domain else (_same, _no_origin)
 
@@ -77,13 +84,16 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
         v: wp.vec3,
         length: float,
         reflections: int,
+        scores: Scores,
         medium: Medium,
         layers: Layers,
         limits: Limits,
         surfaces: Surfaces,
+        derivatives: Derivatives,
         seed: wp.uint64,
     ) -> Way:
         way = Way()
+        way.scores = scores
         way.clear = True
         begin = wp.vec3(x)
         along = wp.vec3(v)
@@ -97,6 +107,8 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
             start = turn_back(limits, begin - origin(limits))
             heading = turn_back(limits, along)
             way.depth += part * water_extinction(medium, layers, start, heading, part, seed + wp.uint64(k))
+            if wp.static(derives):
+                way.scores = flight_scores(way.scores, derivatives, layers, start, heading, part)
             if wp.static(has_mesh):
                 if way.clear and segment_meets_box(start, heading, part, surfaces.lower, surfaces.upper):
                     way.shadow_queries += 1
@@ -115,15 +127,16 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
 
 @functools.cache
 def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
-    """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan) -> Scored`` of an
-    event by way of one of `Boundary.images`; what stands in between has been looked for.
+    """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives) ->
+    Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked for.
 
     `flights`: whether requests may ask for a point of a flight, which is not scored by way of reflections: events are.
     """
-    confocal, needs_way = spec.confocal, spec.mesh or spec.varies
+    confocal, needs_way, derives = spec.confocal, spec.mesh or spec.varies, bool(spec.derivatives)
     image_of = spec.lens.project
     scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
     link_to, value_of = make_link(spec)
+    flight_scores, turn_scores = make_flight_scores(spec), make_turn_scores(spec)
     turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)
 
     @wp.func
@@ -137,6 +150,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         limits: Limits,
         surfaces: Surfaces,
         scan: Scan,
+        derivatives: Derivatives,
     ) -> Scored:
         found = Scored()
         if wp.static(flights):
@@ -159,10 +173,39 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         scattering = scattering_density(request, request.x, turn_back(limits, heading), medium, layers, surfaces)
         scattering *= image_reflectance(limits.boundary, image, along)
         extinction = float(medium.extinction)
+        if wp.static(derives):
+            found.contribution.scores = turn_scores(
+                request.scores,
+                request.x,
+                request.u,
+                turn_back(limits, heading),
+                request.slot,
+                derivatives,
+                medium,
+                layers,
+                surfaces,
+            )
+            if wp.static(not needs_way):
+                found.contribution.scores = flight_scores(
+                    found.contribution.scores, derivatives, layers, request.x, request.u, link.water
+                )
         if wp.static(needs_way):
             if not scattering <= 0.0:
                 seed = join_words(request.first, wp.uint32(number + 1) << wp.uint32(8))
-                way = way_of(x, heading, link.water, reflections_of(image), medium, layers, limits, surfaces, seed)
+                way = way_of(
+                    x,
+                    heading,
+                    link.water,
+                    reflections_of(image),
+                    found.contribution.scores,
+                    medium,
+                    layers,
+                    limits,
+                    surfaces,
+                    derivatives,
+                    seed,
+                )
+                found.contribution.scores = way.scores
                 found.shadow_queries = way.shadow_queries
                 extinction = way.depth / link.water
                 scattering = wp.where(way.clear, scattering, 0.0)
@@ -187,9 +230,11 @@ class MirroredScores:
 
 @functools.cache
 def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
-    """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, tally, ledger, pending_add,
-    thread, scale) -> MirroredScores`` that scores an event by way of all images; arguments as of `make_score_image`."""
+    """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives, tally,
+    gradients, ledger, pending_add, thread, scale) -> MirroredScores`` that scores an event by way of all images;
+    arguments as of `make_score_image`."""
     score_image = make_score_image(spec, flights, brute_force)
+    deposit = make_deposit(len(spec.derivatives))
 
     @wp.func
     def score_images(
@@ -201,7 +246,9 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         limits: Limits,
         surfaces: Surfaces,
         scan: Scan,
+        derivatives: Derivatives,
         tally: wp.array(dtype=wp.int64),
+        gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         pending_add: wp.vec2l,
         thread: int,
@@ -211,11 +258,20 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         scores.pending_add = pending_add
         if request.wanted:
             for number in range(limits.boundary.images.shape[0]):
-                found = score_image(request, number, medium, layers, camera, gate, limits, surfaces, scan)
+                found = score_image(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives)
                 scores.shadow_queries += found.shadow_queries
                 if not found.contribution.value <= 0.0:  # NaN is counted as such
                     scores.contributions += 1
-                    scores.pending_add = deposit(tally, ledger, scores.pending_add, thread, scale, found.contribution)
+                    scores.pending_add = deposit(
+                        tally,
+                        gradients,
+                        ledger,
+                        scores.pending_add,
+                        thread,
+                        scale,
+                        derivatives,
+                        found.contribution,
+                    )
         return scores
 
     return score_images

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
-from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_size, queue_vector
+from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_scores, queue_size, queue_vector
 
 from .contribution import Request
 
@@ -14,13 +14,15 @@ _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
 
 
 @functools.cache
-def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
+def make_queue(flights: bool, used: bool, derivatives: int = 0) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(index, size) -> Request``, for any lane.
 
     Args:
         flights: Whether requests have an interval and a point of the lens.
         used: Whether there is a queue at all; else `push` does nothing.
+        derivatives: How many scores requests have.
     """
+    score_vectors = -(-derivatives // 4)
 
     @wp.func
     def write(entry: int, request: Request):
@@ -43,6 +45,10 @@ def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
                 entry + 3 * QUEUE_ENTRIES,
                 wp.vec4(request.interval[0], request.interval[1], request.lens[0], request.lens[1]),
             )
+        for i in range(wp.static(score_vectors)):
+            a = request.scores
+            part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
+            queue_scores(True, entry + i * QUEUE_ENTRIES, part)
 
     @wp.func
     def push(request: Request):
@@ -73,6 +79,10 @@ def make_queue(flights: bool, used: bool) -> tuple[wp.Function, wp.Function]:
             d = queue_vector(False, entry + 3 * QUEUE_ENTRIES, wp.vec4())
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
+        for i in range(wp.static(score_vectors)):
+            part = queue_scores(False, entry + i * QUEUE_ENTRIES, wp.vec4())
+            for k in range(4):
+                request.scores[4 * i + k] = part[k]
         return request
 
     return push, pop

@@ -61,7 +61,7 @@ def layer_index(layers: Layers, along: float) -> int:
 
 
 @wp.func
-def _boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: float) -> float:
+def boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: float) -> float:
     """Distance [m] from `along`, at `slope` per metre, to the end of a layer; 1e30 where there is none."""
     ahead = layer + step
     if slope == 0.0 or ahead < 0 or ahead >= layers.start.shape[0]:
@@ -79,14 +79,14 @@ def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi
     extinction = float(layers.extinction[layer])
     depth = -wp.log(xi)
     begin = float(0.0)  # of the stretch of this extinction
-    boundary = _boundary_ahead(layers, layer, step, along, slope)
+    boundary = boundary_ahead(layers, layer, step, along, slope)
     while boundary < 1.0e30 and extinction * (boundary - begin) < depth:
         layer += step
         if layers.extinction[layer] != extinction:
             depth -= extinction * (boundary - begin)
             begin = boundary
             extinction = layers.extinction[layer]
-        boundary = _boundary_ahead(layers, layer, step, along, slope)
+        boundary = boundary_ahead(layers, layer, step, along, slope)
     return begin + depth / extinction
 
 
@@ -100,14 +100,14 @@ def layered_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, l
     extinction = float(layers.extinction[layer])
     depth = float(0.0)
     begin = float(0.0)
-    boundary = _boundary_ahead(layers, layer, step, along, slope)
+    boundary = boundary_ahead(layers, layer, step, along, slope)
     while boundary < length:
         layer += step
         if layers.extinction[layer] != extinction:
             depth += extinction * (boundary - begin)
             begin = boundary
             extinction = layers.extinction[layer]
-        boundary = _boundary_ahead(layers, layer, step, along, slope)
+        boundary = boundary_ahead(layers, layer, step, along, slope)
     if begin == 0.0:
         return extinction
     return (depth + extinction * (length - begin)) / length

@@ -11,6 +11,7 @@ from .henyey_greenstein import (
     HENYEY_GREENSTEIN,
     HENYEY_GREENSTEIN_GUIDE,
     henyey_greenstein_pdf,
+    henyey_greenstein_score,
     sample_henyey_greenstein,
 )
 from .phase_function import Guiding, PhaseFunction, PhaseGuide
@@ -28,6 +29,7 @@ __all__ = [
     "fournier_forand_density",
     "henyey_greenstein_density",
     "henyey_greenstein_pdf",
+    "henyey_greenstein_score",
     "interpolated_density",
     "make_phase_tables",
     "sample_henyey_greenstein",

@@ -22,6 +22,14 @@ def henyey_greenstein_pdf(t: float, g: float) -> float:
 
 
 @wp.func
+def henyey_greenstein_score(t: float, g: float) -> float:
+    """d ln p/dg of the Henyey-Greenstein density at t = 1 - cos(theta) in [0, 2], for g in (-1, 1); nothing cancels at
+    the forward peak."""
+    d = 1.0 - g
+    return -2.0 * g / (d * (1.0 + g)) - 3.0 * (t - d) / (d * d + 2.0 * g * t)
+
+
+@wp.func
 def sample_henyey_greenstein(xi: float, g: float) -> float:
     """t = 1 - cos(theta) drawn from Henyey-Greenstein for uniform xi in [0, 1); small xi is forward
     (eq 14, rearranged).

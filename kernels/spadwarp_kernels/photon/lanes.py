@@ -88,6 +88,22 @@ def queue_vector(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
     ...
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 scores[2 * 64 * {BLOCK_SIZE // 32}];
+    float4* mine = scores + 128u * (threadIdx.x >> 5u);
+    if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
+    const float4 held = mine[entry];
+    return wp::vec4(held.x, held.y, held.z, held.w);
+#else
+    return value;
+#endif
+""")
+def queue_scores(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
+    """As `queue_vector`, for the 2 x QUEUE_ENTRIES vectors of scores."""
+    ...
+
+
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 

@@ -16,6 +16,7 @@ class Records:
         path: Geometric path [m].
         collisions: Events, surfaces included.
         reason: Ledger entry that took the rest of the weight.
+        scores: Derivatives of the logarithm of what the history has met, [photons, derivatives]; empty without them.
     """
 
     position: wp.array(dtype=wp.vec3)
@@ -24,11 +25,13 @@ class Records:
     path: wp.array(dtype=float)
     collisions: wp.array(dtype=int)
     reason: wp.array(dtype=int)
+    scores: wp.array2d(dtype=float)
 
 
-def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
-    """Room for the terminal states of `count` photons; raises `ArgumentError` for a negative count."""
-    count = check_integer("count", count, 0)
+def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int = 0) -> Records:
+    """Room for the terminal states of `count` photons, and so many scores each; raises `ArgumentError` for negative
+    numbers."""
+    count, derivatives = check_integer("count", count, 0), check_integer("derivatives", derivatives, 0)
     device = check_device("device", device)
     records = Records()
     records.position = wp.zeros(count, dtype=wp.vec3, device=device)
@@ -37,4 +40,5 @@ def make_records(count: int, *, device: wp.DeviceLike = None) -> Records:
     records.path = wp.zeros(count, dtype=float, device=device)
     records.collisions = wp.zeros(count, dtype=int, device=device)
     records.reason = wp.zeros(count, dtype=int, device=device)
+    records.scores = wp.zeros((count, derivatives), dtype=float, device=device)
     return records

@@ -40,6 +40,8 @@ class TransportSpec(NamedTuple):
         laser_port: The same of the laser and `Laser.port`.
         grid: The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING;
             None: there is no grid.
+        derivatives: Kinds of the parameters by which the histogram is differentiated, each one of DERIVATIVES and
+            described in `Model.derivatives`; at most MOST_DERIVATIVES.
     """
 
     estimator: str = "next_event"
@@ -63,6 +65,7 @@ class TransportSpec(NamedTuple):
     port: PortKind | None = None
     laser_port: PortKind | None = None
     grid: Water | None = None
+    derivatives: tuple[str, ...] = ()
 
     @property
     def water(self) -> Water:

@@ -7,7 +7,7 @@ from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.surface.trace import SurfaceHit
 from spadwarp_kernels.tally.ledger import to_ledger
-from spadwarp_kernels.tally.tally import Contribution
+from spadwarp_kernels.tally.tally import Contribution, Scores
 
 # What a thread does next: a flight, the event at its end, the scattering there, a photon of its own, the end of one; or
 # no photons are left.
@@ -148,6 +148,7 @@ class PhotonState:
         collisions, surface_count: Events so far, and those at surfaces.
         reason: Ledger entry of the history's end; -1 after an event that is not the last.
         bounces: Reflections by faces of the domain, which `collisions` counts too.
+        scores: Of the flights and events so far; 0 without derivatives.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.
@@ -176,6 +177,7 @@ class PhotonState:
     surface_count: int
     reason: int
     bounces: Bounces
+    scores: Scores
     target: int
     view: wp.vec4
     # Its next event:

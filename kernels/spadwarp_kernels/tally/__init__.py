@@ -2,20 +2,26 @@
 
 from .batches import Batches
 from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
-from .tally import COMPONENTS, Contribution, deposit, has_overflowed, tally_index, to_fixed_point
+from .scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives, make_derivatives
+from .tally import COMPONENTS, Contribution, Scores, deposit, has_overflowed, tally_index, to_fixed_point
 
 __all__ = [
     "COMPONENTS",
     "COUNTERS",
+    "DERIVATIVES",
     "LEDGER_ENTRIES",
     "LEDGER_SLOTS",
     "LEDGER_UNIT",
     "LEDGER_WIDTH",
+    "MOST_DERIVATIVES",
     "Batches",
     "Contribution",
+    "Derivatives",
+    "Scores",
     "add_to_ledger",
     "deposit",
     "has_overflowed",
+    "make_derivatives",
     "tally_index",
     "to_fixed_point",
     "to_ledger",

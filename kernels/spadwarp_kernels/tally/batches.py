@@ -39,7 +39,8 @@ def close_batch_kernel(
             atomic_add_int64(sums, component * _SLOTS + voxel % _SLOTS, batch[index])
         total[index] = total[index] + batch[index]
         batch[index] = wp.int64(0)
-    # t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with t < 2^63.
+    # Derivatives have signs. t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with |t| < 2^63.
+    t = wp.abs(t)
     low = wp.uint64(t) & _LOW32
     high = wp.uint64(t) >> wp.uint64(32)
     middle = wp.uint64(2) * low * high

@@ -13,6 +13,10 @@ COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
 BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
 
 
+Scores = wp.types.vector(length=8, dtype=float)
+"""Derivatives of the logarithm of a photon's light with respect to the parameters of a spec, in its order."""
+
+
 @wp.struct
 class Contribution:
     """What a photon adds to the tally.
@@ -21,18 +25,20 @@ class Contribution:
         value: Fraction of the emitted light; 0 for nothing.
         index: Of the voxel, see `tally_index`.
         rounding_sample: Uniform in [0, 1), see `to_fixed_point`.
+        scores: By which the value is multiplied for its derivatives; 0 without them.
     """
 
     value: float
     index: int
     rounding_sample: float
+    scores: Scores
 
 
 # Index of light that has come to the lens by more reflections than count.
 TOO_LONG = wp.constant(-4)
 
 # Largest single contribution, in tally units, 2^58: what is above it is clipped and counted.
-_DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
+DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
 
 
 @wp.func_native("""
@@ -60,9 +66,9 @@ def to_fixed_point(value: float, scale: float, rounding_sample: float) -> wp.int
     -1 for what is clipped and -2 for what is not a number.
     """
     units = value * scale
-    if units <= _DEPOSIT_LIMIT:
+    if units <= DEPOSIT_LIMIT:
         return wp.int64(units + rounding_sample)
-    if units > _DEPOSIT_LIMIT:
+    if units > DEPOSIT_LIMIT:
         return wp.int64(-1)
     return wp.int64(-2)
 
@@ -72,15 +78,15 @@ VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
 
 
 @wp.kernel(enable_backward=False)
-def find_overflow_kernel(tally: wp.array(dtype=wp.int64), found: wp.array(dtype=int)):
+def find_overflow_kernel(tally: wp.array(dtype=wp.int64), least: wp.int64, found: wp.array(dtype=int)):
     """Launch: voxels."""
     voxel = wp.tid()
-    if tally[voxel] < wp.int64(0) or tally[voxel] >= VOXEL_LIMIT:
+    if tally[voxel] < least or tally[voxel] >= VOXEL_LIMIT:
         found[0] = 1
 
 
-def has_overflowed(tally: wp.array) -> bool:
-    """Whether a voxel has left [0, 2^62); waits for the device.
+def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
+    """Whether a voxel has left [0, 2^62), or with `signed` (-2^62, 2^62); waits for the device.
 
     Asked often enough, before a voxel can go round, this leaves no overflow unnoticed.
 
@@ -89,7 +95,8 @@ def has_overflowed(tally: wp.array) -> bool:
     """
     check_array("tally", tally, wp.int64, (None,))
     found = wp.zeros(1, dtype=int, device=tally.device)
-    wp.launch(find_overflow_kernel, dim=tally.size, inputs=[tally], outputs=[found], device=tally.device)
+    least = wp.int64(1 - (1 << 62) if signed else 0)
+    wp.launch(find_overflow_kernel, dim=tally.size, inputs=[tally, least], outputs=[found], device=tally.device)
     return bool(found.numpy()[0])
 
 

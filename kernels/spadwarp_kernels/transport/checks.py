@@ -24,6 +24,7 @@ from spadwarp_kernels.medium.grid import Grid
 from spadwarp_kernels.medium.layers import Layers, Water
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.phase.tabulated import TABULATED
 from spadwarp_kernels.photon.records import Records
@@ -37,6 +38,7 @@ from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
+from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 
 if TYPE_CHECKING:
     from .launch import Data, Model
@@ -52,6 +54,7 @@ _STRUCTS = {
     "surfaces": Surfaces,
     "layers": Layers,
     "scan": Scan,
+    "derivatives": Derivatives,
 }
 _MEDIUM = {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
 _GUIDING = {
@@ -87,6 +90,23 @@ def check_spec(spec: Any) -> None:
         raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
     if spec.reflecting and not spec.bounded:
         raise ArgumentError("spec.reflecting = True needs spec.bounded = True")
+    _check_kinds(spec)
+
+
+def _check_kinds(spec: TransportSpec) -> None:
+    """Of the derivatives, which exist for the spec's water and surfaces."""
+    if not isinstance(spec.derivatives, tuple) or len(spec.derivatives) > MOST_DERIVATIVES:
+        raise ArgumentError(
+            f"spec.derivatives = {spec.derivatives!r} is not a tuple of at most {MOST_DERIVATIVES} names"
+        )
+    for p, kind in enumerate(spec.derivatives):
+        check_choice(f"spec.derivatives[{p}]", kind, DERIVATIVES)
+    if spec.derivatives and spec.random_albedo:
+        raise ArgumentError("spec.derivatives go without spec.random_albedo, which has no scattering coefficient")
+    if "anisotropy" in spec.derivatives and spec.phase.name != HENYEY_GREENSTEIN.name:
+        raise ArgumentError("spec.derivatives: anisotropy needs spec.phase = HENYEY_GREENSTEIN")
+    if "reflectance" in spec.derivatives and not spec.mesh:
+        raise ArgumentError("spec.derivatives: reflectance needs spec.mesh = True")
 
 
 def check_model(model: Any) -> None:
@@ -123,6 +143,8 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
         check_fields("model.guiding", model.guiding, _GUIDING)
     if spec.confocal:
         _check_scan(model, estimator)
+    if spec.derivatives:
+        _check_derivatives(spec, model)
     _check_data(spec, model, data, estimator, photon_count)
 
 
@@ -233,6 +255,19 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
         check_array("model.surfaces.roughness", surfaces.roughness, wp.float32, (faces,), device)
 
 
+def _check_derivatives(spec: TransportSpec, model: Model) -> None:
+    derivatives, device = model.derivatives, model.device
+    for p, kind in enumerate(spec.derivatives):
+        check_number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
+        check_number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
+    if spec.layered:
+        count = model.layers.start.size
+        check_array("model.derivatives.waters", derivatives.waters, wp.int32, (count,), device)
+    if "reflectance" in spec.derivatives:
+        count = model.surfaces.order.size
+        check_array("model.derivatives.faces", derivatives.faces, wp.int32, (count,), device)
+
+
 def _check_scan(model: Model, estimator: Estimator) -> None:
     scan, camera = model.scan, model.camera
     most = camera.width * camera.height if estimator.scores else 2**31 - 1
@@ -246,18 +281,22 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
     device = model.device
     size = check_integer("bins of the tally", model.tally_size, 1) if estimator.scores else None
     check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
+    if spec.derivatives and size is not None:
+        size = check_integer("bins of data.gradients", size * len(spec.derivatives), 1)
+        check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)
     if spec.stepped or data.offset is not None:
         check_array("data.offset", data.offset, wp.uint64, (1,), device)
     check_struct("data.records", data.records, Records)
     if spec.records:
-        for name in Records.vars:
-            array = check_array(
-                f"data.records.{name}", getattr(data.records, name), Records.vars[name].type.dtype, (None,), device
-            )
-            if array.size < photon_count:
+        for name, var in Records.vars.items():
+            if name == "scores" and not spec.derivatives:
+                continue
+            shape = (None, len(spec.derivatives)) if name == "scores" else (None,)
+            array = check_array(f"data.records.{name}", getattr(data.records, name), var.type.dtype, shape, device)
+            if array.shape[0] < photon_count:
                 raise ArgumentError(
-                    f"data.records.{name} has room for {array.size} photons; spec.records = True needs {photon_count}, "
-                    "see record_count of make_data"
+                    f"data.records.{name} has room for {array.shape[0]} photons; spec.records = True needs "
+                    f"{photon_count}, see record_count of make_data"
                 )

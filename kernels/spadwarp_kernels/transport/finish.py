@@ -28,7 +28,7 @@ from spadwarp_kernels.tally.ledger import (
 def make_finish(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, out, ledger, thread) -> Weight``: writes the photon's record, and the ledger entry that
     takes the rest of its weight."""
-    records = spec.records
+    records, derivatives = spec.records, len(spec.derivatives)
 
     @wp.func
     def finish(s: PhotonState, out: Records, ledger: wp.array(dtype=wp.int64), thread: int) -> Weight:
@@ -39,6 +39,8 @@ def make_finish(spec: TransportSpec) -> wp.Function:
             out.path[s.photon] = s.path
             out.collisions[s.photon] = s.collisions
             out.reason[s.photon] = s.reason
+            for p in range(wp.static(derivatives)):
+                out.scores[s.photon, p] = s.scores[p]
         weight = s.weight
         rest = to_ledger(weight.value)
         weight.absorbed_water += weight.ledger - rest

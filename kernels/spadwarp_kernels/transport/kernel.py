@@ -14,7 +14,9 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.derivatives.history import make_flight_scores
 from spadwarp_kernels.estimators.contribution import Asked
+from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
@@ -59,7 +61,8 @@ from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
-from spadwarp_kernels.tally.tally import TOO_LONG, deposit
+from spadwarp_kernels.tally.scores import Derivatives, make_deposit
+from spadwarp_kernels.tally.tally import TOO_LONG, Scores
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
@@ -91,9 +94,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """
     check_spec(spec)
     estimator = make_estimator(spec)
-    cross, score = estimator.cross, estimator.score
+    cross, score = make_derived_cross(spec, estimator.cross), make_derived_score(spec, estimator.score)
     request_flight, request_event = estimator.request_flight, estimator.request_event
-    crosses, flights, scores = cross is not None, request_flight is not None, score is not None
+    crosses, flights, scores = estimator.cross is not None, request_flight is not None, estimator.score is not None
     has_mesh, random_albedo, confocal = spec.mesh, spec.random_albedo, spec.confocal
     reflecting = spec.reflecting
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
@@ -107,7 +110,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
-    push, pop = make_queue(flights, queues)
+    push, pop = make_queue(flights, queues, len(spec.derivatives))
+    deposit, flight_scores = make_deposit(len(spec.derivatives)), make_flight_scores(spec)
     score_images = make_score_images(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
@@ -129,6 +133,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         guiding: Guiding,
         surfaces: Surfaces,
         scan: Scan,
+        derivatives: Derivatives,
         # Photons:
         seed: wp.uint64,
         keys: RoundKeys,
@@ -137,6 +142,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         # Data out:
         scale: float,
         tally: wp.array(dtype=wp.int64),
+        gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         out: Records,
         cursor: wp.array(dtype=int),
@@ -187,13 +193,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.flight.interval = wp.vec2(0.0, 0.0)
                     if round == 1 and arrives(s):
                         if wp.static(crosses):
-                            crossing = cross(s, camera, gate, limits)
+                            crossing = cross(s, camera, gate, limits, layers, derivatives)
                             if wp.static(reflecting):
                                 s.bounces.dropped += wp.where(crossing.index == TOO_LONG, 1, 0)
                             if not crossing.value <= 0.0:
                                 s.contributions += 1
-                                s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, crossing)
+                                s.pending_add = deposit(
+                                    tally, gradients, ledger, s.pending_add, thread, scale, derivatives, crossing
+                                )
                         end = collide(s, medium, layers, limits)
+                        s.scores = flight_scores(s.scores, derivatives, layers, s.x, s.u, end.distance)
                         s.x = end.x
                         s.path += end.distance
                         s.reason = end.reason
@@ -221,7 +230,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 first = wp.max(queued - 32, 0)
                                 asked.request = pop(first + lane, queued)
                                 queued = queue_size(SET_SIZE, first)
-                            found = score(asked.request, medium, layers, camera, gate, surfaces, scan)
+                            found = score(asked.request, medium, layers, camera, gate, surfaces, scan, derivatives)
                             if asked.request.wanted and not found.contribution.value <= 0.0:  # NaN is counted as such
                                 s.contributions += 1
                                 found = look(found, camera, surfaces)
@@ -229,7 +238,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 if found.seen:
                                     c = found.contribution
                                     if not c.value <= 0.0:
-                                        s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, c)
+                                        s.pending_add = deposit(
+                                            tally, gradients, ledger, s.pending_add, thread, scale, derivatives, c
+                                        )
                                 else:
                                     s.ray = SHADOW_RAY
                                     s.origin = found.origin
@@ -237,20 +248,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.pending = found.contribution
                             if wp.static(reflecting):
                                 more = score_images(
-                                    asked.request,
-                                    medium,
-                                    layers,
-                                    camera,
-                                    gate,
-                                    limits,
-                                    surfaces,
-                                    scan,
-                                    tally,
-                                    ledger,
-                                    s.pending_add,
-                                    thread,
-                                    scale,
-                                )
+                                    asked.request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
+                                    tally, gradients, ledger, s.pending_add, thread, scale
+                                )  # fmt: skip
                                 s.contributions += more.contributions
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
@@ -258,11 +258,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
                     id = base + wp.uint64(s.photon)
-                    new = scatter(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread)
+                    new = scatter(
+                        s, medium, layers, camera, limits, surfaces, guiding, derivatives, keys, id, ledger, thread
+                    )
                     s.u = new.u
                     s.weight = new.weight
                     s.analog_weight = new.analog_weight
                     s.surface_count = new.surface_count
+                    s.scores = new.scores
                     s.absorbed_surface += new.absorbed_surface
                     s.directed += new.directed
                     s.reason = new.reason
@@ -307,6 +310,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.path = start.path
                             s.collisions = 0
                             s.surface_count = 0
+                            s.scores = Scores()
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)
@@ -361,7 +365,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     else:
                         s.shadow_queries += 1
                         if s.walk.found < 0:
-                            s.pending_add = deposit(tally, ledger, s.pending_add, thread, scale, s.pending)
+                            s.pending_add = deposit(
+                                tally, gradients, ledger, s.pending_add, thread, scale, derivatives, s.pending
+                            )
                     s.ray = NO_RAY
 
         flush(s, tally, ledger, thread)

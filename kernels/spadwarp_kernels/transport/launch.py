@@ -27,6 +27,7 @@ from spadwarp_kernels.tally.ledger import (
     OUTSIDE_SHIFT,
     PORT_ENTRY,
 )
+from spadwarp_kernels.tally.scores import MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel
 
 from .checks import check_launch, check_model, check_spec
@@ -45,6 +46,7 @@ class Model:
         scale: Tally units per emitted photon.
         layers: Of a layered spec, from `make_layers`; empty otherwise.
         scan: Raster of a confocal spec; empty otherwise.
+        derivatives: The parameters of a spec with derivatives, from `make_derivatives`.
 
     Raises:
         ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
@@ -62,6 +64,7 @@ class Model:
     scale: float
     layers: Layers = field(default_factory=Layers)
     scan: Scan = field(default_factory=Scan)
+    derivatives: Derivatives = field(default_factory=Derivatives)
 
     def __post_init__(self) -> None:
         check_model(self)
@@ -84,6 +87,7 @@ class Data:
             stream.
         offset: uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on.
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
+        gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives; None without them.
     """
 
     tally: wp.array
@@ -92,13 +96,22 @@ class Data:
     cursor: wp.array
     offset: wp.array | None = None
     reflecting: bool = False
+    gradients: wp.array | None = None
 
 
-def make_data(model: Model, *, tally: wp.array | None = None, record_count: int = 0, histogram: bool = True) -> Data:
+def make_data(
+    model: Model,
+    *,
+    tally: wp.array | None = None,
+    record_count: int = 0,
+    histogram: bool = True,
+    derivatives: int = 0,
+) -> Data:
     """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to.
 
     `histogram=False` makes none, for an estimator that scores nothing; `record_count` is the number of photons of the
-    largest launch, where `spec.records` asks for their records. Raises `ArgumentError`.
+    largest launch, where `spec.records` asks for their records; `derivatives` is how many the spec has. Raises
+    `ArgumentError`.
     """
     check_kind("model", model, Model)
     size = check_integer("bins of the tally", model.tally_size, 0) if histogram else 1
@@ -106,13 +119,16 @@ def make_data(model: Model, *, tally: wp.array | None = None, record_count: int 
         tally = wp.zeros(size, dtype=wp.int64, device=model.device)
     else:
         check_array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
+    derivatives = check_integer("derivatives", derivatives, 0, MOST_DERIVATIVES)
+    signed = check_integer("bins of data.gradients", size * derivatives, 0)
     return Data(
         tally=tally,
         ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
-        records=make_records(record_count, device=model.device),
+        records=make_records(record_count, device=model.device, derivatives=derivatives),
         cursor=wp.zeros(1, dtype=int, device=model.device),
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
         reflecting=any((*model.limits.boundary.low, *model.limits.boundary.high)),
+        gradients=wp.zeros(signed, dtype=wp.int64, device=model.device) if histogram and derivatives else None,
     )
 
 
@@ -167,13 +183,14 @@ def launch_transport(
             model.guiding,
             model.surfaces,
             model.scan,
+            model.derivatives,
             seed,
             round_keys(seed),
             first_id,
             photon_count,
             model.scale,
         ],
-        outputs=[data.tally, data.ledger, data.records, data.cursor, data.offset],
+        outputs=[data.tally, data.gradients, data.ledger, data.records, data.cursor, data.offset],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )

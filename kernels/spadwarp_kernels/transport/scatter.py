@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.derivatives.history import make_event_scores
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
 from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
@@ -20,6 +21,8 @@ from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
+from spadwarp_kernels.tally.scores import Derivatives
+from spadwarp_kernels.tally.tally import Scores
 
 
 @wp.struct
@@ -40,6 +43,7 @@ class Scattering:
         surface_count: Events at surfaces so far.
         absorbed_surface, directed: For the ledger, in its units.
         reason: Ledger entry that ends the history here, or after the flight of its last event's light; else -1.
+        scores: See `PhotonState`.
     """
 
     u: wp.vec3
@@ -49,6 +53,7 @@ class Scattering:
     absorbed_surface: wp.int64
     directed: wp.int64
     reason: int
+    scores: Scores
 
 
 @functools.cache
@@ -188,6 +193,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         new.u = s.u
         new.weight = reweigh(s.weight, part)
         new.surface_count = s.surface_count
+        new.scores = s.scores
         new.reason = s.reason
         # The light of an event that was the last is accounted for by what has ended the history.
         add_to_ledger(ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason), new.weight.taken)
@@ -203,14 +209,15 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
 
 @functools.cache
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
-    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, keys, id, ledger, thread) ->
-    Scattering``.
+    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, keys, id, ledger, thread)
+    -> Scattering``.
 
     `flies_on`: see `make_flies`.
     """
     has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
     survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
+    derives, event_scores = bool(spec.derivatives), make_event_scores(spec)
 
     @wp.func
     def scatter(
@@ -221,6 +228,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         limits: Limits,
         surfaces: Surfaces,
         guiding: Guiding,
+        derivatives: Derivatives,
         keys: RoundKeys,
         id: wp.uint64,
         ledger: wp.array(dtype=wp.int64),
@@ -233,6 +241,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         new.u = s.u
         new.weight = s.weight
         new.surface_count = s.surface_count
+        new.scores = s.scores
         new.reason = -1
         on_surface = False
         survival = survive(s, surfaces)
@@ -256,6 +265,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 reflected = sample_reflection(s.u, s.hit.normal, roughness, survival.lobe, draw)
         heading = turn(s, reflected, survival.lobe, medium, layers, camera, surfaces, guiding, keys, id)
         new.u = heading.u
+        if wp.static(derives):
+            new.scores = event_scores(
+                s.scores, derivatives, medium, layers, surfaces, s.hit.face, s.hit.normal, s.x, s.u, new.u
+            )
         if wp.static(directed):
             new.weight = reweigh(new.weight, heading.factor)
             new.directed = new.weight.taken

@@ -1,0 +1,39 @@
+"""Scores of a photon that enters the aperture itself."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.tally.scores import Derivatives
+from spadwarp_kernels.tally.tally import Scores
+
+from .history import make_flight_scores
+
+
+@wp.func
+def _to_lens(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
+    return -x[2] / u[2]
+
+
+@functools.cache
+def make_crossing_scores(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, camera, layers, derivatives) -> Scores`` of a photon whose flight leads to the lens."""
+    flight_scores, to_lens = make_flight_scores(spec), _to_lens
+    if spec.port is not None:
+        leave = spec.port.leave
+
+        @wp.func
+        def to_port(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
+            return leave(camera.port, x, u).water
+
+        to_lens = to_port
+
+    @wp.func
+    def crossing_scores(s: PhotonState, camera: Camera, layers: Layers, derivatives: Derivatives) -> Scores:
+        return flight_scores(s.scores, derivatives, layers, s.x, s.u, to_lens(camera, s.x, s.u))
+
+    return crossing_scores

@@ -1,0 +1,81 @@
+"""Contributions with their scores: what an estimator brings, for a spec with derivatives."""
+
+import functools
+
+import warp as wp
+
+from spadwarp_kernels.derivatives.crossing import make_crossing_scores
+from spadwarp_kernels.derivatives.request import make_request_scores
+from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.tally.scores import Derivatives
+from spadwarp_kernels.tally.tally import Contribution
+
+from .contribution import Request, Scored
+
+
+@functools.cache
+def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Function | None:
+    """The Warp function ``(s, camera, gate, limits, layers, derivatives) -> Contribution``: `Estimator.cross`, with
+    scores."""
+    if cross is None:
+        return None
+    derives, crossing_scores = bool(spec.derivatives), make_crossing_scores(spec)
+
+    @wp.func
+    def derived_cross(
+        s: PhotonState, camera: Camera, gate: Gate, limits: Limits, layers: Layers, derivatives: Derivatives
+    ) -> Contribution:
+        c = cross(s, camera, gate, limits)
+        if wp.static(derives):
+            if c.value > 0.0:
+                c.scores = crossing_scores(s, camera, layers, derivatives)
+        return c
+
+    return derived_cross
+
+
+@functools.cache
+def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Function | None:
+    """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan, derivatives) -> Scored``:
+    `Estimator.score`, with scores."""
+    if score is None:
+        return None
+    derives, request_scores = bool(spec.derivatives), make_request_scores(spec)
+
+    @wp.func
+    def derived_score(
+        request: Request,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        gate: Gate,
+        surfaces: Surfaces,
+        scan: Scan,
+        derivatives: Derivatives,
+    ) -> Scored:
+        found = score(request, medium, layers, camera, gate, surfaces, scan)
+        if wp.static(derives):
+            if found.contribution.value > 0.0:
+                found.contribution.scores = request_scores(
+                    request.scores,
+                    request.x,
+                    request.u,
+                    request.slot,
+                    found.origin,
+                    found.lens,
+                    derivatives,
+                    medium,
+                    layers,
+                    surfaces,
+                )
+        return found
+
+    return derived_score
