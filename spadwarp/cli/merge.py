@@ -38,7 +38,7 @@ def merge(
     from spadwarp.run import RUN_FILES, bytes_needed, write_run
 
     result = spadwarp.merge(opt.load_run(place) for place in runs)
-    needed = bytes_needed(result.scene, batches=result.batch_size > 0)
+    needed = bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))
     outputs = opt.check_outputs(
         out, RUN_FILES, json=json_path, inputs=(*runs, *result.scene.files), overwrite=overwrite, needed=needed
     )

@@ -56,6 +56,16 @@ def simulate(
             "largest number of photons, rounded up to whole batches.",
         ),
     ] = None,
+    derivatives: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="Also the derivatives of the histogram by these parameters, 8 at most: medium.absorption, "
+            "medium.scattering, medium.anisotropy, medium.layers[0].scattering, targets[0].reflectance, ...; short, "
+            "absorption, where one alone can be meant.",
+            show_default=False,
+        ),
+    ] = None,
     resume: Annotated[
         Path | None,
         typer.Option(
@@ -101,6 +111,7 @@ def simulate(
       spadwarp simulate configs/scenes/harbour_5m.toml --mesh bust.stl --device cuda:0 \\
           --photons 2e9 --seed 7 --out run1/ --set medium.extinction=0.9
       spadwarp simulate configs/scenes/plane_5m.toml --relative-error 0.02 --photons 1e8 --out run2/
+      spadwarp simulate configs/scenes/plane_5m.toml --derivatives absorption,scattering --out run5/
       spadwarp simulate --resume run1/ --photons 4e9
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e10 --device cuda:all --out run3/
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --engine ray --ray-address auto --out run4/
@@ -112,6 +123,7 @@ def simulate(
     if resume is not None:
         given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
         more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records}
+        more |= {"--derivatives": derivatives}
         if clash := [name for name, value in (given | more).items() if value]:
             raise typer.BadParameter(f"goes without {', '.join(clash)}: the run has them", param_hint="--resume")
         out = resume if resume.is_dir() else resume.parent
@@ -124,14 +136,13 @@ def simulate(
         photons = None
     if records:
         _check_records(scene, whole=not (first_photon or shard_text))
-    _report_repeated(device)
+    _warn(scene, device)
     shard = opt.read_part(shard_text, "--shard")
     engine = opt.read_engine(engine_name, ray_address, workers)
-    for message in spadwarp.check(scene):
-        if message.level == "warning":
-            complain(str(message))
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
-    needed = run.bytes_needed(scene, batches=batches, records=records, checkpoint=checkpoint > 0)
+    names = _parameters(scene, derivatives, earlier)
+    sizes: dict[str, Any] = {"batches": batches, "records": records, "checkpoint": checkpoint > 0}
+    needed = run.bytes_needed(scene, derivatives=len(names), **sizes)
     inputs = (scene_path, *scene.files)
     options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
     outputs = _outputs(out, resume=earlier is not None, **options)
@@ -151,6 +162,7 @@ def simulate(
             resume=earlier,
             checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
             checkpoint_every=checkpoint,
+            derivatives=names,
         )
     device = opt.one_device(device, engine)
     files = run.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
@@ -167,7 +179,18 @@ def simulate(
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
 
 
-def _report_repeated(device: str | None) -> None:
+def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:
+    """By which the histogram is differentiated."""
+    if names is None:
+        return () if earlier is None else tuple(earlier.derivatives)
+    return spadwarp.transport.resolve_derivatives(scene, [name.strip() for name in names.split(",")])
+
+
+def _warn(scene: Scene, device: str | None) -> None:
+    """Of what the scene's check finds, and of devices that are named twice."""
+    for message in spadwarp.check(scene):
+        if message.level == "warning":
+            complain(str(message))
     names = (device or "").split(",")
     for name in sorted({name for name in names if names.count(name) > 1}):
         complain(f"warning: --device: {name} is named more than once: the same bits, no sooner, with more memory")
@@ -263,6 +286,8 @@ def described(result: Result, files: RunFiles) -> str:
             f"{np.isfinite(truth).sum()} of {frame.size} pixels, {np.nanmin(truth):.2f} to {np.nanmax(truth):.2f} m; "
             f"median error of the depth {1000 * error:.3g} mm"
         )
+    if result.derivatives:
+        lines["derivatives"] = "by " + ", ".join(result.derivatives)
     if _has_errors(result) and math.isfinite(result.relative_error):
         lines["error"] = (
             f"{100 * result.relative_error:.3g} % in the bins that decide the depth, or less, in 95 % of "

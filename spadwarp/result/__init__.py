@@ -1,6 +1,7 @@
 """The result of a simulation as plain data, its files, the sum of results, and truth maps from other programs."""
 
 from spadwarp.result.batch_moments import ComponentError, component_errors, dominance_warnings
+from spadwarp.result.derivatives import DerivativeTallies
 from spadwarp.result.file import (
     ResultLike,
     as_result,
@@ -21,6 +22,7 @@ __all__ = [
     "EXR_PRESETS",
     "Component",
     "ComponentError",
+    "DerivativeTallies",
     "ExrPreset",
     "Result",
     "ResultLike",

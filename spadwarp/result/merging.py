@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 from spadwarp.limits import shown
 from spadwarp.result.batch_moments import joined_moments
+from spadwarp.result.derivatives import DerivativeTallies, add_moments
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.photon_ids import Range, joined
 from spadwarp.result.result import Result, Truth, physics_of
@@ -29,13 +30,20 @@ class Tallies:
     counters: dict[str, int]
     second_moment: NDArray[np.uint64] | None = None
     batch_moments: Mapping[str, int] = field(default_factory=dict)
+    derivative_tallies: DerivativeTallies | None = None
 
     @classmethod
     def of(cls, result: Tallies | Result) -> Tallies:
         """A copy, with arrays of its own."""
         second_moment = None if result.second_moment is None else result.second_moment.copy()
+        derivatives = None if result.derivative_tallies is None else result.derivative_tallies.copy()
         return cls(
-            result.tallies.copy(), dict(result.ledger), dict(result.counters), second_moment, result.batch_moments
+            result.tallies.copy(),
+            dict(result.ledger),
+            dict(result.counters),
+            second_moment,
+            result.batch_moments,
+            derivatives,
         )
 
     def add(self, other: Tallies | Result) -> None:
@@ -49,10 +57,10 @@ class Tallies:
         self.counters = {name: self.counters.get(name, 0) + other.counters.get(name, 0) for name in names}
         if self.second_moment is not None:
             assert other.second_moment is not None
-            low, high = self.second_moment
-            low += other.second_moment[0]
-            high += other.second_moment[1]
-            high += low < other.second_moment[0]  # the carry
+            add_moments(self.second_moment, other.second_moment)
+        if self.derivative_tallies is not None:
+            assert other.derivative_tallies is not None
+            self.derivative_tallies.add(other.derivative_tallies)
         # Older results have none, and their sum with others has none.
         known = self.batch_moments and other.batch_moments
         self.batch_moments = joined_moments(self.batch_moments, other.batch_moments) if known else {}
@@ -82,6 +90,7 @@ def merge(results: Iterable[ResultLike]) -> Result:
             ("seed", first.seed, other.seed),
             ("tally unit", first.unit, other.unit),
             ("batch size", first.batch_size, other.batch_size),
+            ("list of derivatives", tuple(first.derivatives), tuple(other.derivatives)),
         ):
             if a != b:
                 detail = f" ({a} and {b})"

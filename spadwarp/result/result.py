@@ -14,6 +14,13 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.batch_moments import dominance_warnings
+from spadwarp.result.derivatives import (
+    DerivativeTallies,
+    check_derivatives,
+    derivative_errors,
+    derivative_values,
+    standard_error,
+)
 from spadwarp.scene.sight import lines_of_sight
 
 if TYPE_CHECKING:
@@ -84,6 +91,7 @@ class Result:
             all components; None without batches.
         batch_moments: By component, over batches of its tally summed over voxels: `…_squares` (their sum),
             `…_smallest` and `…_largest`; empty without batches, and in results of older versions.
+        derivative_tallies: Of the derivatives that were asked for; None if there are none.
     """
 
     scene: Scene
@@ -104,6 +112,7 @@ class Result:
     batch_moments: Mapping[str, int] = field(default_factory=dict)
     requested: tuple[int, int] = (0, 0)
     focus_distance: float | None = None
+    derivative_tallies: DerivativeTallies | None = None
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
@@ -127,6 +136,8 @@ class Result:
                 raise ArgumentError(f"second_moment is {found.dtype} {found.shape}; uint64 {expected} is needed")
             if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
                 raise ArgumentError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
+        if self.derivative_tallies is not None:
+            check_derivatives(self.derivative_tallies, shape, self.second_moment is not None)
         for name in ("unit", "ledger_unit"):
             value = getattr(self, name)
             if not (value > 0 and math.frexp(value)[0] == 0.5):
@@ -178,6 +189,12 @@ class Result:
     def _fraction(self, tallies: NDArray[np.int64]) -> NDArray[np.float64]:
         return tallies * self.tally_value[..., None]
 
+    @property
+    def derivatives(self) -> Mapping[str, NDArray[np.float64]]:
+        """Parameter → ∂histogram/∂parameter by component, float64 `[3, H, W, T]`; of those that `simulate` was asked
+        for, "medium.absorption" [per 1/m] and others, with all other parameters fixed."""
+        return derivative_values(self)
+
     # Errors
 
     @cached_property
@@ -190,10 +207,13 @@ class Result:
         if self.second_moment is None or self.photons < 2 * self.batch_size:
             raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
         count = self.photons // self.batch_size
-        total = self.tallies.sum(axis=0).astype(np.float64)
-        second_moment = self.second_moment[1] * 2.0**64 + self.second_moment[0]
-        variance = np.maximum(second_moment - total**2 / count, 0.0) / (count - 1)
-        return np.sqrt(count * variance) * self.tally_value[..., None]
+        return standard_error(self.tallies, self.second_moment, count) * self.tally_value[..., None]
+
+    @property
+    def derivative_errors(self) -> Mapping[str, NDArray[np.float64]]:
+        """Parameter → standard error of its derivative, of all components together, float64 `[H, W, T]`; raises as
+        `standard_error` does."""
+        return derivative_errors(self)
 
     @property
     def relative_error(self) -> float:
@@ -325,6 +345,7 @@ class Result:
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
+            **({"derivatives": list(self.derivatives)} if self.derivatives else {}),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }

@@ -1,5 +1,6 @@
 """Photon transport: a scene in, a `Result`, truth maps or photon records out."""
 
+from spadwarp.transport.derivatives import derivative_names, resolve_derivatives
 from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
 from spadwarp.transport.simulation import Progress, provenance, simulate
 from spadwarp.transport.tally_unit import PHOTON_CAPACITY, photon_capacity, tally_scale
@@ -9,9 +10,11 @@ __all__ = [
     "PHOTON_CAPACITY",
     "PhotonRecords",
     "Progress",
+    "derivative_names",
     "load_records",
     "photon_capacity",
     "provenance",
+    "resolve_derivatives",
     "save_records",
     "simulate",
     "tally_scale",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.errors import DeviceError, SpadwarpError, kernel_errors
-from spadwarp.result import COMPONENTS, Tallies
+from spadwarp.result import COMPONENTS, DerivativeTallies, Tallies
 from spadwarp.result.batch_moments import joined_moments, moments_of
 from spadwarp.result.merging import OVERFLOW
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
@@ -33,6 +33,7 @@ class DeviceWorker:
         batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         tallies: The caller's own, to be filled.
         histogram: False: none is made, for records of photons without a camera.
+        derivatives: Names of those of the spec.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class DeviceWorker:
         batch_size: int = 0,
         tallies: Any = None,
         histogram: bool = True,
+        derivatives: tuple[str, ...] = (),
     ) -> None:
         camera, gate = model.camera, model.gate
         self._shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
@@ -53,10 +55,17 @@ class DeviceWorker:
         self.model, self.threads, self.launch_size = model, threads, launch_size
         self._spec, self._seed, self._batch_size = spec, seed, batch_size
         with device_errors(model.device):
-            self.data = sk.make_data(model, tally=None if batch_size else own, histogram=histogram)
+            self.data = sk.make_data(
+                model, tally=None if batch_size else own, histogram=histogram, derivatives=len(derivatives)
+            )
             self._batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
+            gradients = self._gradients = self.data.gradients
+            self._gradient_batches = None
+            if batch_size and gradients is not None:
+                self._gradient_batches = sk.Batches(gradients, len(COMPONENTS))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)
+        self._names = derivatives
         self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
         self._moments: dict[str, int] = {}
 
@@ -80,24 +89,25 @@ class DeviceWorker:
         """
         if self._batches is None:
             traced = self._trace(block, stopped, report)
-            self._check_overflow(self.data.tally)
+            self._check_overflow(self.data.tally, self._gradients)
             return traced
         done: list[Range] = []
         for first in range(*block, self._batch_size):
             batch = first, first + self._batch_size
             if self._trace(batch, stopped, report) != (batch,):
-                self.data.tally.zero_()
-                self.data.ledger.zero_()
+                self._empty([self.data.tally, self.data.ledger, self._gradients])
                 break
             self._close_batch()
             done.append(batch)
-        self._check_overflow(self._batches.total)
+        self._check_overflow(self._batches.total, self._gradient_batches.total if self._gradient_batches else None)
         return joined(done)
 
-    def _check_overflow(self, tally: wp.array) -> None:
+    def _check_overflow(self, tally: wp.array, gradients: wp.array | None) -> None:
         """After every block of photons, long before an integer could go round and look right again."""
         with device_errors(self.model.device):
             overflowed = sk.has_overflowed(tally)
+            if gradients is not None:
+                overflowed = overflowed or sk.has_overflowed(gradients, signed=True)
         if overflowed:
             raise SpadwarpError(OVERFLOW)
 
@@ -139,6 +149,8 @@ class DeviceWorker:
         assert self._batches is not None
         with device_errors(self.model.device):
             self._batches.close(self.data.tally)
+            if self._gradients is not None and self._gradient_batches is not None:
+                self._gradient_batches.close(self._gradients)
             moments = moments_of(COMPONENTS, self._batches.take_sums())
             batch = sk.read_ledger(self.data)
             self.data.ledger.zero_()
@@ -155,16 +167,39 @@ class DeviceWorker:
                 halves = self._batches.second_moment
                 second_moment = np.stack([half.numpy().reshape(self._shape[1:]) for half in halves])
             ledger, counters = self._closed or sk.read_ledger(self.data)
-            return Tallies(total.numpy().reshape(self._shape), ledger, counters, second_moment, dict(self._moments))
+            return Tallies(
+                total.numpy().reshape(self._shape),
+                ledger,
+                counters,
+                second_moment,
+                dict(self._moments),
+                self._derivative_tallies(),
+            )
+
+    def _derivative_tallies(self) -> DerivativeTallies | None:
+        """The device has the parameters of a voxel side by side, the result an array for each."""
+        if self._gradients is None:
+            return None
+        batches, shape = self._gradient_batches, (*self._shape, len(self._names))
+        total = self._gradients if batches is None else batches.total
+        moments = None
+        if batches is not None:
+            moments = np.stack([np.moveaxis(half.numpy().reshape(shape[1:]), -1, 0) for half in batches.second_moment])
+        units = tuple(1.0 / float(self.model.derivatives.scale[p]) for p in range(len(self._names)))
+        return DerivativeTallies(self._names, np.moveaxis(total.numpy().reshape(shape), -1, 0), units, moments)
 
     def clear(self) -> None:
         """Empties the tallies."""
         self._closed, self._moments = None, {}
-        arrays = [self.data.tally, self.data.ledger]
-        if self._batches is not None:
-            arrays += [self._batches.total, *self._batches.second_moment]
+        self._empty([self.data.tally, self.data.ledger, self._gradients])
+        for batches in (self._batches, self._gradient_batches):
+            if batches is not None:
+                self._empty([batches.total, *batches.second_moment])
+
+    def _empty(self, arrays: Sequence[wp.array | None]) -> None:
         for array in arrays:
-            array.zero_()
+            if array is not None:
+                array.zero_()
 
 
 def _added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

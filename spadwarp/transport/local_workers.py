@@ -65,15 +65,14 @@ class LocalWorkers:
         copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
         began = time.perf_counter()
         models = []
-        spec = transport_spec(plan.scene, plan.mesh)
+        spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
+        choices: dict[str, Any] = {"copies": copies, "scale": plan.scale, "kept": kept, "derivatives": plan.derivatives}
         with ThreadPoolExecutor(1) as beside:
             # It may have to be compiled, which takes as long as all that is done meanwhile.
             loading = beside.submit(_load_transport_kernel, spec, devices)
             for device in devices:
                 with device_errors(device):
-                    models.append(
-                        build_model(plan.scene, device, plan.mesh, copies=copies, scale=plan.scale, kept=kept)
-                    )
+                    models.append(build_model(plan.scene, device, plan.mesh, **choices))
             with device_errors(devices[0]):
                 self._truth = trace_truth(plan.scene, models[0])
             built = time.perf_counter()
@@ -83,6 +82,7 @@ class LocalWorkers:
             "launch_size": size,
             "threads": threads,
             "batch_size": plan.batch_size,
+            "derivatives": plan.derivatives,
         }
         self.workers = [DeviceWorker(model, spec, tallies=tallies, **settings) for model in models]
         self.timing = {"setup": built - began, "compile": time.perf_counter() - built}

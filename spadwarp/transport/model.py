@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
 from spadwarp.transport.tally_unit import tally_scale
@@ -48,6 +50,7 @@ def build_model(
     copies: float = 1,
     scale: float | None = None,
     kept: KeptMeshes | None = None,
+    derivatives: Sequence[str] = (),
 ) -> sk.Model:
     """The scene on a device.
 
@@ -59,6 +62,7 @@ def build_model(
         scale: Tally units per emitted photon; None: `tally_scale(scene, mesh)`.
         kept: Meshes of earlier scenes on their devices; one of the same faces is refitted and not built anew.
         camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
+        derivatives: Full names of parameters, from `resolve_derivatives`.
 
     Raises:
         ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
@@ -96,8 +100,10 @@ def build_model(
         model = dataclasses.replace(model, layers=grid_layers(scene, device))
     if scene.scan.mode != "none":
         model = dataclasses.replace(model, scan=_scan(scene, device))
+    if derivatives:
+        model = dataclasses.replace(model, derivatives=make_derivatives(scene, derivatives, mesh, scale, device))
     if camera:
-        _check_size(scene, model, copies)
+        _check_size(scene, model, copies, len(derivatives))
     return model
 
 
@@ -226,8 +232,8 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
     )
 
 
-def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> Any:
-    """The compile-time choices of a scene; `choices` override them."""
+def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
+    """The compile-time choices of a scene and of the derivatives asked for; `choices` override them."""
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
@@ -247,6 +253,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, **choices: Any) -> A
         laser_port=_port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
         grid=grid_tracking(scene),
+        derivatives=derivative_kinds(scene, derivatives),
     )
     return spec._replace(**choices)
 
@@ -341,15 +348,19 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _check_size(scene: Scene, model: sk.Model, copies: float) -> None:
+def _check_size(scene: Scene, model: sk.Model, copies: float, derivatives: int) -> None:
     """Refuses what cannot fit before anything is computed."""
     camera, size = scene.camera, model.tally_size
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    if derivatives and size * derivatives >= 2**31:
+        raise config_error(
+            scene, f"{shape} x {derivatives} derivatives = {size * derivatives} is outside [1, {2**31 - 1}]"
+        )
     if size >= 2**31:
         raise config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")
     cuda = model.device.is_cuda
     # On the CPU counts on the device, their copy in the result, and the total of the components.
-    needed = (8 if cuda else 16) * size * copies / 2**30
+    needed = (8 if cuda else 16) * size * (1 + derivatives) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
     if available is not None and needed > available / 2**30:
         raise DeviceError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from spadwarp.result import Result
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.result.result import physics_of
 from spadwarp.scene import Scene
+from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.transport.tally_unit import scale_and_capacity
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ class Plan:
         batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         scale: Tally units per emitted photon.
         launch_size: Photons in one launch; None: what suits the device.
+        derivatives: Full names of the parameters by which the histogram is differentiated.
     """
 
     scene: Scene
@@ -51,6 +54,7 @@ class Plan:
     scale: float
     batch_size: int = 0
     launch_size: int | None = None
+    derivatives: tuple[str, ...] = ()
 
 
 def make_plan(
@@ -64,6 +68,7 @@ def make_plan(
     relative_error: float | None,
     resume: Result | None,
     launch_size: int | None,
+    derivatives: Iterable[str] | None = None,
 ) -> Plan:
     """The plan for the arguments of `simulate`.
 
@@ -84,6 +89,14 @@ def make_plan(
         photons = count([resume.requested]) if photons is None else photons
         if photons <= resume.photons:
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
+    if derivatives is None:
+        names = () if resume is None else tuple(resume.derivatives)
+    else:
+        names = resolve_derivatives(scene, derivatives)
+    if resume is not None and names != tuple(resume.derivatives):
+        raise ConfigError(
+            f"derivatives: the run to resume has {', '.join(resume.derivatives) or 'none'}, not {', '.join(names)}"
+        )
     photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed
     batch_size = 0
@@ -103,7 +116,7 @@ def make_plan(
     ids = first_photon, first_photon + photons
     if shard is not None:
         ids = shard_of(ids, shard, batch_size or 1)
-    return Plan(scene, mesh, seed, ids, scale, batch_size, launch_size)
+    return Plan(scene, mesh, seed, ids, scale, batch_size, launch_size, names)
 
 
 def _check_capacity(photons: int, capacity: int) -> None:

@@ -7,7 +7,7 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -57,6 +57,7 @@ def simulate(
     checkpoint_every: float = 60.0,
     tallies: Any = None,
     kept: dict[str, Any] | None = None,
+    derivatives: Iterable[str] | None = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
@@ -92,6 +93,10 @@ def simulate(
             device, without `resume`.
         kept: A dict, empty at first, for runs of a scene that moves: it keeps the mesh on its devices, and where only
             vertices moved its tree is refitted and not built anew. Without `engine`.
+        derivatives: Parameters by which the histogram is differentiated, for `Result.derivatives`, 8 at most:
+            "medium.absorption", "medium.scattering", "medium.anisotropy", "medium.layers[1].scattering",
+            "targets[0].reflectance"; short, "absorption", where one parameter alone can be meant. By default none, or
+            those of the run to resume. The photons and their histogram stay the same to the bit.
 
     Returns:
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
@@ -116,6 +121,7 @@ def simulate(
         relative_error=relative_error,
         resume=resume,
         launch_size=launch_size,
+        derivatives=derivatives,
     )
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())
