@@ -30,9 +30,18 @@ def parameters_of(spec: TransportSpec, *kinds: str) -> int:
     return sum(1 << p for p, kind in enumerate(spec.derivatives) if kind in kinds)
 
 
+@wp.func
+def _unchanged(
+    scores: Scores, derivatives: Derivatives, layers: Layers, x: wp.vec3, u: wp.vec3, length: float
+) -> Scores:
+    return scores
+
+
 @functools.cache
 def make_flight_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, derivatives, layers, x, u, length) -> Scores`` after a way in the water."""
+    if not spec.derivatives:
+        return _unchanged
     count, layered = len(spec.derivatives), spec.layered
     on_path = parameters_of(spec, "absorption", "scattering")
 

@@ -126,6 +126,21 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
 
 
 @functools.cache
+def make_leaving_scores(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(request, v, derivatives, medium, layers, surfaces) -> Scores`` of light that the event of a
+    request sends along v."""
+    turn_scores = make_turn_scores(spec)
+
+    @wp.func
+    def leaving_scores(
+        q: Request, v: wp.vec3, derivatives: Derivatives, medium: Medium, layers: Layers, surfaces: Surfaces
+    ) -> Scores:
+        return turn_scores(q.scores, q.x, q.u, v, q.slot, derivatives, medium, layers, surfaces)
+
+    return leaving_scores
+
+
+@functools.cache
 def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives) ->
     Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked for.
@@ -136,7 +151,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
     image_of = spec.lens.project
     scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
     link_to, value_of = make_link(spec)
-    flight_scores, turn_scores = make_flight_scores(spec), make_turn_scores(spec)
+    flight_scores, leaving_scores = make_flight_scores(spec), make_leaving_scores(spec)
     turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)
 
     @wp.func
@@ -174,17 +189,8 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         scattering *= image_reflectance(limits.boundary, image, along)
         extinction = float(medium.extinction)
         if wp.static(derives):
-            found.contribution.scores = turn_scores(
-                request.scores,
-                request.x,
-                request.u,
-                turn_back(limits, heading),
-                request.slot,
-                derivatives,
-                medium,
-                layers,
-                surfaces,
-            )
+            v = turn_back(limits, heading)
+            found.contribution.scores = leaving_scores(request, v, derivatives, medium, layers, surfaces)
             if wp.static(not needs_way):
                 found.contribution.scores = flight_scores(
                     found.contribution.scores, derivatives, layers, request.x, request.u, link.water
