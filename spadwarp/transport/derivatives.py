@@ -48,16 +48,17 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
     medium = scene.medium
     everywhere = 'albedo = "lu2024" draws the scattering anew at every collision' if medium.albedo == "lu2024" else ""
     found: list[Parameter] = []
+    in_water = everywhere or ("the grid's water differs from cell to cell" if medium.grid is not None else "")
     for k, water in enumerate(medium.waters):
         place = "medium" if k == 0 else f"medium.layers[{k - 1}]"
         for kind in ("absorption", "scattering"):
             value = float(getattr(water, kind))
             nothing = kind == "scattering" and value <= 0.0
-            problem = everywhere or ("its value is 0, where light that is scattered has no slope" if nothing else "")
+            problem = in_water or ("its value is 0, where light that is scattered has no slope" if nothing else "")
             found.append(Parameter(f"{place}.{kind}", kind, value, (k,), problem=problem))
         own = water.anisotropy
         inherits = [i for i, other in enumerate(medium.waters) if i and other.anisotropy is None] if k == 0 else []
-        problem = everywhere
+        problem = in_water
         if medium.has_phase_table:
             law = medium.phase_function if medium.molecular_share == 0.0 else "of chlorophyll's particles and water"
             problem = problem or f'it goes with phase_function = "henyey_greenstein" only, not with {law}'

@@ -103,8 +103,8 @@ def _check_kinds(spec: TransportSpec) -> None:
         check_choice(f"spec.derivatives[{p}]", kind, DERIVATIVES)
     if spec.derivatives and spec.random_albedo:
         raise ArgumentError("spec.derivatives go without spec.random_albedo, which has no scattering coefficient")
-    if spec.derivatives and spec.grid is not None:
-        raise ArgumentError("spec.derivatives go without spec.grid")
+    if spec.grid is not None and {*spec.derivatives} - {"reflectance"}:
+        raise ArgumentError("spec.derivatives: with spec.grid, whose water has no one value, they are of reflectance")
     if "anisotropy" in spec.derivatives and spec.phase.name != HENYEY_GREENSTEIN.name:
         raise ArgumentError("spec.derivatives: anisotropy needs spec.phase = HENYEY_GREENSTEIN")
     if "reflectance" in spec.derivatives and not spec.mesh:
