@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from spadwarp.analytic.exposure_proposal import Exposure, Progress, Question, propose_exposure
-from spadwarp.analytic.eye_safety import axis_fluence
 from spadwarp.analytic.gate_proposal import propose_gate, target_span
 from spadwarp.analytic.largest_range import largest_range as find_largest_range
 from spadwarp.analytic.largest_range import with_plane
+from spadwarp.analytic.optics import beam_axis_fluence
+from spadwarp.analytic.photon_budget import axis_line
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Method
 from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.scene import SceneLike, as_scene
-from spadwarp.scene.sight import refuse_ports
 from spadwarp.units import quantity, range_from_time
 
 __all__ = ["Proposal", "plan"]
@@ -31,8 +31,8 @@ class Proposal(Exposure):
         time: Longest time for a depth frame [s].
         method: Estimator whose floor counts.
         target_range: Least and largest range of the target [m].
-        optical_depth: To the nearest of it, one way, along the axis.
-        gate_range: Ranges at the ends of the gate, laser at the lens [m].
+        optical_depth: Of the water before the nearest of it, one way, along the axis.
+        gate_range: Ranges at the ends of the gate, laser at the lens and behind its port [m].
         unambiguous_range: At the proposed repetition rate [m].
         largest_rate: Repetition rate up to which the gate ends before the next pulse [Hz].
         irradiance: On the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²].
@@ -83,13 +83,6 @@ class Proposal(Exposure):
             "eye": dataclasses.asdict(self.eye),
             "pilot": dataclasses.asdict(self.pilot),
         }
-
-
-_WITHOUT_PORT = (
-    "plan without it, with the angles in water: behind a flat port, divide the sines of half of "
-    "camera.horizontal_fov_deg and of laser.half_angle_deg by the water's index; behind a centred dome, keep them. "
-    "Then add the port and put the angles in air back; `spadwarp check` prints the view in water"
-)
 
 
 def _number(name: str, value: Any, unit: str) -> float:
@@ -148,7 +141,6 @@ def plan(
         ArgumentError: An argument out of range.
     """
     scene = as_scene(scene)
-    refuse_ports(scene, "`plan`", _WITHOUT_PORT)
     depth_error, margin = _number("depth_error", depth_error, "m"), _number("margin", margin, "m")
     time, eye_exposure = _number("time", time, "s"), _number("eye_exposure", eye_exposure, "s")
     eye_distance = None if eye_distance is None else _number("eye_distance", eye_distance, "m")
@@ -167,12 +159,16 @@ def plan(
     question = Question(depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device)
     gate = propose_gate(scene, span, margin)
     exposure = propose_exposure(scene, gate, question, photons, progress)
-    optical_depth = scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, span[0]))
+    line = axis_line(scene)
+    begin, end = ([float(x) for x in point[0]] for point in (line.start, line.points(span[0])))
+    optical_depth = scene.optical_depth(begin, end)
     farthest = (math.nan, "")
     if largest_range:
         farthest = find_largest_range(exposure.scene, 0.5 * sum(span), question, max(photons // 8, 1), progress)
     index, chosen = scene.medium.group_index, exposure.scene
-    fluence = axis_fluence(chosen.laser, span[0]) * math.exp(-optical_depth)
+    fluence = beam_axis_fluence(chosen, span[0]) * math.exp(-optical_depth)
+    # With the laser at the lens, the way through the port takes longer or shorter than the same length of water.
+    behind = float(line.lead[0] - line.delay[0])
     return Proposal(
         **vars(exposure),
         depth_error=depth_error,
@@ -180,8 +176,8 @@ def plan(
         method=method,
         target_range=span,
         optical_depth=optical_depth,
-        gate_range=(range_from_time(chosen.gate.start, index), range_from_time(chosen.gate.stop, index)),
-        unambiguous_range=range_from_time(1.0 / chosen.laser.repetition_rate, index),
+        gate_range=tuple(range_from_time(end, index) + behind for end in (chosen.gate.start, chosen.gate.stop)),
+        unambiguous_range=range_from_time(1.0 / chosen.laser.repetition_rate, index) + behind,
         largest_rate=gate.largest_rate,
         irradiance=fluence * chosen.laser.pulse_energy * chosen.laser.repetition_rate,
         largest_range=farthest[0],

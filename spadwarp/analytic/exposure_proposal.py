@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spadwarp.analytic.eye_safety import EyeLimit, eye_limit
+from spadwarp.analytic.eye_safety import EyeLimit
 from spadwarp.analytic.gate_proposal import GateProposal
+from spadwarp.analytic.optics import scene_eye_limit
 from spadwarp.analytic.photon_budget import OUTLIERS
 from spadwarp.analytic.pilot import Pilot, measure, trace, window
 from spadwarp.device import pick_device
@@ -101,7 +102,7 @@ def propose_exposure(
     small = window(scene, question.device)
     runs = trace(small, photons, question.seed, question.device, progress)
     pilot = measure(runs, scene, question.device, even=even)
-    eye = eye_limit(scene.laser, distance=question.eye_distance or 0.1, exposure=question.eye_exposure)
+    eye = scene_eye_limit(scene, distance=question.eye_distance or 0.1, exposure=question.eye_exposure)
     piled = laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
     allowed = {"pile-up": piled} | ({} if question.eye_distance is None else {"eye": eye.pulse_energy})
     lowest = min(allowed, key=allowed.__getitem__)

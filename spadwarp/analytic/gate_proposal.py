@@ -10,7 +10,7 @@ import numpy as np
 from spadwarp.analytic.model import source_name
 from spadwarp.errors import ConfigError
 from spadwarp.frames import detector_response
-from spadwarp.scene.geometry import path_from_range, pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
 from spadwarp.units import time_from_path, time_from_range
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["GateProposal", "propose_gate", "target_span"]
 
 _MOST_BINS = 1_000_000
+_LEAST = 1e-6  # Beyond a port [m]
 
 
 class GateProposal(NamedTuple):
@@ -46,15 +47,15 @@ def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate
 
     The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
     """
-    view = pixel_directions(scene.camera).reshape(-1, 3)
-    index = scene.medium.group_index
-    times = [time_from_path(path_from_range(np.float64(r), view, scene.beam.position), index) for r in span]
+    lines, index = lines_of_sight(scene).flat(), scene.medium.group_index
+    # A pixel whose light does not get through the port has no time; one that is still in the port has that of its end.
+    times = [time_from_path(lines.path_from_range(np.maximum(r, lines.lead + _LEAST)), index) for r in span]
     spread = time_from_range(margin, index)
     before, after = detector_response(scene.detector, scene.laser).support
     width = scene.gate.bin_width
-    start = max(0.0, math.floor((times[0].min() + before - spread) / width) * width)
+    start = max(0.0, math.floor((np.nanmin(times[0]) + before - spread) / width) * width)
     start_ns = round(start * 1e9, 6)
-    bins = math.ceil((times[1].max() + after + spread - start_ns * 1e-9) / width)
+    bins = math.ceil((np.nanmax(times[1]) + after + spread - start_ns * 1e-9) / width)
     if bins > _MOST_BINS:
         raise ConfigError(
             f"gate.bin_width_ps = {scene.gate.bin_width_ps:g}: a gate for {span[0]:.4g} to {span[1]:.4g} m takes "

@@ -10,6 +10,7 @@ import numpy as np
 
 from spadwarp.analytic.exposure_proposal import Progress, Question, propose_exposure
 from spadwarp.analytic.gate_proposal import propose_gate
+from spadwarp.analytic.photon_budget import axis_line
 from spadwarp.errors import ConfigError
 from spadwarp.scene.pose import to_world
 
@@ -23,7 +24,8 @@ _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
 
 
 def with_plane(scene: Scene, distance: float) -> Scene:
-    """The scene with a plane square to the optical axis as its only target, larger than the view and the beam."""
+    """The scene with a plane square to the optical axis as its only target, larger than the view and the beam, at a
+    range on the axis."""
     camera = scene.camera
     given = scene.targets[0].reflectance if scene.targets else 0.5
     widest = max(abs(edge) for edge in camera.view_box)
@@ -31,7 +33,9 @@ def with_plane(scene: Scene, distance: float) -> Scene:
         widest = max(widest, math.tan(min(scene.laser.half_angle, math.radians(80.0))))
     offset = max(map(abs, scene.beam.position)) + scene.laser.beam_radius
     side = 2.4 * (distance * widest + offset)
-    place = to_world(camera, (0.0, 0.0, distance)) if camera.is_posed else np.array([0.0, 0.0, distance])
+    point = axis_line(scene).points(distance)[0]  # A tilted port bends the axis.
+    side += 2.0 * float(np.abs(point[:2]).max())
+    place = to_world(camera, point) if camera.is_posed else point
     plane = {
         "builtin": "plane",
         "size": [side, side],
@@ -54,6 +58,9 @@ def largest_range(
 
     def is_reached(distance: float) -> bool:
         nonlocal reason
+        if distance <= axis_line(scene).lead[0]:
+            reason = "the port"
+            return False
         if progress is not None:
             progress(f"a plane at {distance:.3g} m", 0, 0)
         there = with_plane(scene, distance)

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
-from spadwarp.scene.geometry import depth_per_time
+from spadwarp.scene.port_rays import laser_port
+from spadwarp.scene.sight import depth_per_time, lines_of_sight
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -54,8 +56,8 @@ def pixel_maps(
 
     Args:
         scene: The scene.
-        view: Unit vectors `[P, 3]`.
-        distance: Along them `[P]` [m]; NaN where nothing is hit.
+        view: Unit vectors `[P, 3]` in which the lens sees the pixels.
+        distance: From the lens along the line of sight, which a port bends, `[P]` [m]; NaN where nothing is hit.
         normal: Unit vectors towards the camera `[P, 3]`.
         reflectance: `[P]`.
         device: Warp device.
@@ -76,24 +78,28 @@ def pixel_maps(
 
     device = pick_device(device)
     start, stop = gate or (scene.gate.start, scene.gate.stop)
-    lidar = _lidar(scene, start, stop)
+    lidar, optics = _lidar(scene, start, stop)
     chosen = scene.analytic
     views = np.ascontiguousarray(view, np.float64)
     distances = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0)
+    in_water = _way_in_water(scene, views, distances)
 
     def on_device(values: ArrayLike, dtype: Any = wp.float64) -> Any:
         kind = np.float32 if dtype is wp.float32 else np.float64
         return wp.array(np.nan_to_num(np.ascontiguousarray(values, kind)), dtype=dtype, device=device)
 
-    view_d, distance_d, phase_d = on_device(views, wp.vec3d), on_device(distances), on_device(_phase_table(scene))
+    view_d, distance_d, phase_d = on_device(views, wp.vec3d), on_device(in_water), on_device(_phase_table(scene))
     lines = water_lines(scene)
-    signal, arrival = _signal(lidar, lines, [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)])
+    surfaces = [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)]
+    signal, arrival = _signal(lidar, lines, surfaces, optics)
     signal_d: Any = on_device(signal)
     arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
     lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
     profile = np.zeros((1, 1), np.float32)
     if chosen.backscatter == "single_scatter":
-        paths_d, cumulative_d, total_d = kernels.single_scatter_table(lidar, phase_d, view_d, distance_d, lines=lines_d)
+        paths_d, cumulative_d, total_d = kernels.single_scatter_table(
+            lidar, phase_d, view_d, distance_d, lines=lines_d, optics=optics
+        )
         table = BackscatterTable(paths_d.numpy(), cumulative_d.numpy())
     elif chosen.backscatter == "monte_carlo":
         if backscatter_profile is None:
@@ -122,6 +128,7 @@ def pixel_maps(
         outliers=outliers,
         lines=lines_d,
         ambient=None if scene.daylight is None else on_device(ambient),
+        optics=optics,
     )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
     maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy()}
@@ -131,7 +138,7 @@ def pixel_maps(
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = maps["signal"] / maps["backscatter"]
     maps["signal_to_backscatter"] = np.where(maps["fisher"] > 0, ratio, np.nan)
-    maps["sigma_depth"] = maps["sigma_time"] * depth_per_time(scene, views, distances)
+    maps["sigma_depth"] = maps["sigma_time"] * depth_per_time(scene, distances, views)
     return maps, table
 
 
@@ -158,7 +165,14 @@ def source_name(scene: Scene) -> str | None:
 # Parts
 
 
-def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any]) -> tuple[Map, Map]:
+def _way_in_water(scene: Scene, views: Map, distances: Map) -> Map:
+    """Length of the way in the water to ranges; 0 where there is nothing, or no way."""
+    if scene.camera.port is None:
+        return distances
+    return np.maximum(np.nan_to_num(distances - lines_of_sight(scene, views).lead, nan=0.0), 0.0)
+
+
+def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any], optics: Any) -> tuple[Map, Map]:
     """S, summed over the lines, and the mean arrival time of their photons, `[P]`; `lidar` is as it was afterwards."""
     from spadwarp_kernels import analytic as kernels
 
@@ -166,7 +180,7 @@ def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any]) -> tuple[Map,
     parts: list[tuple[Map, Map]] = []
     for line in lines:
         lidar.photons, lidar.extinction, lidar.speed = own[0] * line.share, line.extinction, line.speed
-        signal, arrival = kernels.signal_map(lidar, *arrays)
+        signal, arrival = kernels.signal_map(lidar, *arrays, optics=optics)
         parts.append((signal.numpy(), arrival.numpy()))
     lidar.photons, lidar.extinction, lidar.speed = own
     if len(parts) == 1:
@@ -209,6 +223,14 @@ def _not_covered(scene: Scene) -> list[str]:
             f"analytic.form = 'lu2024' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
             f"of {laser.half_angle_deg}"
         )
+    ported = scene.camera.port is not None or scene.laser.port is not None
+    if ported and chosen.form == "lu2024":
+        problems.append("analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometry' does")
+    if laser.profile == "collimated" and (port := laser_port(scene)) is not None and port.shape == "dome":
+        problems.append(
+            "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
+            "simulate takes it"
+        )
     if scene.medium.layers:
         problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
     if scene.medium.grid is not None:
@@ -221,8 +243,8 @@ def _not_covered(scene: Scene) -> list[str]:
     return problems
 
 
-def _lidar(scene: Scene, start: float, stop: float) -> Any:
-    """The scene as the kernels take it; raises `ConfigError` for what the model does not cover."""
+def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
+    """The scene and its optics as the kernels take it; raises `ConfigError` for what the model does not cover."""
     import warp as wp
 
     from spadwarp_kernels import BACKSCATTER_SOURCES, LASER_PROFILES, Lidar
@@ -254,7 +276,8 @@ def _lidar(scene: Scene, start: float, stop: float) -> Any:
     # Nearer than its own diameter the aperture's solid angle is not area over distance squared.
     lidar.nearest = 2.0 * camera.aperture_radius
     lidar.bin_width = scene.gate.bin_width
-    return lidar
+    optics, lidar.ports = scene_optics(scene)
+    return lidar, optics
 
 
 def _phase_table(scene: Scene) -> Map:

@@ -18,8 +18,7 @@ from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import check_integer, check_real, shown
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.geometry import path_from_range
-from spadwarp.scene.sight import refuse_ports
+from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 
 __all__ = ["LONGEST", "OUTLIERS", "TOLERANCE", "BudgetRow", "axis_rows", "budget"]
 
@@ -39,8 +38,8 @@ class BudgetRow:
     Attributes:
         medium: Name of the water.
         extinction: [1/m].
-        range: Distance of the face [m].
-        optical_depth: Attenuation lengths, one way.
+        range: Distance of the face, behind a port the length of the bent ray [m].
+        optical_depth: Attenuation lengths of the way in the water, one way.
         gate_start, gate_stop: The gate [s]: the scene's where all ranges fall into it, else one of the same length
             around the return.
         gate_moved: Whether it is not the scene's.
@@ -88,7 +87,8 @@ def budget(
 
     Args:
         scene: Laser, camera, detector, gate and `[analytic]` settings are taken from it; the target's shape is not.
-        ranges: Distances on the optical axis [m], 1e-6 to 1e6; default 1 to 50 m.
+        ranges: Distances on the optical axis [m], 1e-6 to 1e6; default 1 to 50 m. Behind a port they are lengths of
+            the ray that it bends, and must be beyond it.
         media: Names of presets, or name → fields of `[medium]`; default: the scene's water alone.
         reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
         device: Warp device; default: the first GPU, else the CPU.
@@ -101,8 +101,7 @@ def budget(
         ArgumentError: Ranges or reflectance out of range.
     """
     scene = as_scene(scene)
-    refuse_ports(scene, "the photon budget")
-    distances = _distances(RANGES if ranges is None else ranges)
+    distances = _distances(scene, ranges)
     if reflectance is None:
         given = scene.targets[0].reflectance if scene.targets else 0.5
         reflectance = 0.5 if given == "from_file" else given
@@ -115,11 +114,16 @@ def budget(
     return rows
 
 
-def _distances(ranges: Any) -> Map:
+def _distances(scene: Scene, ranges: Any) -> Map:
+    lead = float(axis_line(scene).lead[0])
+    if ranges is None:
+        return np.array([one for one in RANGES if one > lead] or [lead + one for one in RANGES])
     if isinstance(ranges, str | bytes) or not isinstance(ranges, Iterable):
         raise ArgumentError(f"ranges = {shown(ranges)} is not a list of distances [m]")
     distances = sorted(check_real("ranges: an item", one, "[1e-6, 1e6] m") for one in ranges)
     check_integer("number of ranges", len(distances), f"[1, {LONGEST}]")
+    if distances[0] <= lead:
+        raise ArgumentError(f"ranges: {distances[0]:g} m is not beyond the camera's port, which ends at {lead:g} m")
     return np.array(distances)
 
 
@@ -134,11 +138,16 @@ def _waters(scene: Scene, media: Iterable[str] | Mapping[str, Mapping[str, Any]]
             yield name, scene.with_overrides(medium={"preset": name})
 
 
+def axis_line(scene: Scene) -> LinesOfSight:
+    """The line of sight of the optical axis, `[1]`."""
+    return lines_of_sight(scene, np.array([[0.0, 0.0, 1.0]]))
+
+
 def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, device: str | None) -> list[BudgetRow]:
     """A row for each distance on the optical axis [m], for the scene's water of that name."""
     gate = (scene.gate.start, scene.gate.stop)
-    path = path_from_range(distances, np.array([0.0, 0.0, 1.0]), scene.beam.position)
-    arrival = path / scene.medium.pulse_speed
+    line = axis_line(scene)
+    arrival = np.array([line.path_from_range(one)[0] for one in distances]) / scene.medium.pulse_speed
     if gate[0] <= arrival.min() and arrival.max() <= gate[1]:
         gates = [(gate, distances)]
     else:
@@ -156,7 +165,7 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
             scene,
             view=axis,
             distance=inside,
-            normal=-axis,
+            normal=-np.tile(line.direction, (inside.size, 1)),
             reflectance=np.full(inside.size, reflectance),
             device=device,
             gate=(start, stop),
@@ -169,7 +178,7 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
                     medium=name,
                     extinction=scene.medium.extinction,
                     range=float(distance),
-                    optical_depth=float(distance * scene.medium.extinction),
+                    optical_depth=float((distance - line.lead[0]) * scene.medium.extinction),
                     gate_start=start,
                     gate_stop=stop,
                     gate_moved=(start, stop) != gate,

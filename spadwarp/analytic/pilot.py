@@ -23,9 +23,9 @@ from spadwarp.frames.estimators import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import merge
 from spadwarp.scene import noise_rate
-from spadwarp.scene.geometry import depth_from_range, depth_per_time, pixel_directions, range_from_path
+from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import simulate, truth_maps
-from spadwarp.units import path_from_time
 
 if TYPE_CHECKING:
     from spadwarp.frames import Frames
@@ -218,9 +218,7 @@ def _depth_error(result: Result, frames: Frames, histogram: Floats | None, metho
         background=frames.background,
         device=device,
     )
-    view = pixel_directions(result.scene.camera)
-    path = path_from_time(time, result.scene.medium.group_index)
-    return depth_from_range(range_from_path(path, view, result.scene.beam.position), view) - result.truth.depth
+    return depth_from_time(time, scene=result.scene) - result.truth.depth
 
 
 def _return(signal: Floats, background: Floats, result: Result) -> tuple[Floats, Floats]:
@@ -255,8 +253,6 @@ def _bounds(result: Result, runs: tuple[Result, Result], device: str | None) -> 
         "device": device,
     }
     law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
-    view = pixel_directions(scene.camera).reshape(-1, 3)
-    distance = np.nan_to_num(result.truth.range.astype(np.float64)).reshape(-1)
-    slope = depth_per_time(scene, view, distance).reshape(signal.shape[:2])
+    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
     bound = crlb_from_histogram(signal, background, law=law, **options)
     return bound * slope, crlb_from_histogram(signal, 0.0, **options) * slope

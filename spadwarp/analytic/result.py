@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import BackscatterTable, Map
+from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
 from spadwarp.errors import kernel_errors
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 
 __all__ = ["AnalyticResult", "background_photons"]
 
@@ -106,7 +108,7 @@ class AnalyticResult:
 
         device = pick_device(device)
         shape, pixels = self.truth.depth.shape, self.truth.depth.size
-        inputs = self._inputs(device)
+        inputs, (optics, ports) = self._inputs(device), scene_optics(self.scene)
         speed, gate = self.scene.medium.pulse_speed, self.scene.gate
         depth = np.empty((frames, *shape), np.float32)
         labels = np.empty((frames, *shape), np.bool_)
@@ -121,6 +123,8 @@ class AnalyticResult:
             drawn = kernels.sample_frames(
                 *inputs,
                 laser=self.scene.beam.position,
+                optics=optics,
+                ports=ports,
                 gate_paths=(gate.start * speed, gate.stop * speed),
                 first_frame=first + start,
                 frames=stop - start,
@@ -140,12 +144,12 @@ class AnalyticResult:
         def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
             return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=device)
 
-        view = pixel_directions(self.scene.camera)
+        view, in_water = pixel_directions(self.scene.camera), lines_of_sight(self.scene).direction
         return [
             put(view.reshape(-1, 3), wp.vec3),
             put(np.where(np.isnan(self.sigma_depth), np.nan, self.truth.depth).reshape(-1)),
             # No bound is worse than a guess anywhere in the gate.
-            put(np.minimum(self.sigma_depth, gate_deviation(self.scene, view)).reshape(-1)),
+            put(np.minimum(self.sigma_depth, gate_deviation(self.scene, in_water)).reshape(-1)),
             put(self.background_probability.reshape(-1)),
             put(self._flat_share),
             put(self._table.paths),

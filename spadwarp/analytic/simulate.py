@@ -20,7 +20,6 @@ from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.sight import refuse_ports
 from spadwarp.transport import truth_maps
 
 __all__ = ["simulate_analytic"]
@@ -42,7 +41,8 @@ def simulate_analytic(
 
     Args:
         scene: Its `[analytic]` section selects form, backscatter and count law.
-        truth: Depth, range, normal and reflectance of every pixel; default: the scene's own targets, ray-cast.
+        truth: Depth, range, normal and reflectance of every pixel; default: the scene's own targets, ray-cast. Behind a
+            port, range is the length of the bent ray.
         frames: Depth frames to draw, ≥ 0.
         seed: 64-bit seed of the frames.
         device: Warp device; default: the first GPU, else the CPU.
@@ -54,7 +54,6 @@ def simulate_analytic(
         ArgumentError: A truth or profile of the wrong shape, or with impossible values.
     """
     scene = as_scene(scene)
-    refuse_ports(scene, "the analytic simulator")
     frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)
     truth = truth_maps(scene) if truth is None else truth
     _check_truth(truth, scene)

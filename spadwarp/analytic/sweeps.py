@@ -22,7 +22,6 @@ from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.load import parse_key
 from spadwarp.scene.messages import locate
 from spadwarp.scene.quantities import field_unit, takes_integers
-from spadwarp.scene.sight import refuse_ports
 from spadwarp.transport import truth_maps
 from spadwarp.units import quantity
 
@@ -91,7 +90,6 @@ def sweep(
         ArgumentError: `vary` or `of` not of the form above.
     """
     scene = as_scene(scene)
-    refuse_ports(scene, "sweeps")
     check_choice("of", of, ("budget", "depth-error"))
     if isinstance(vary, str):
         field, values = parse_vary(vary)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import pixel_maps
+from spadwarp.analytic.optics import scene_optics
 from spadwarp.dataset.rendered import RenderedScene, StoredFrames, backscatter_profile, intensity_step, with_exposure
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.device import pick_device
@@ -16,7 +17,7 @@ from spadwarp.errors import kernel_errors
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.geometry import gate_deviation, pixel_directions
-from spadwarp.scene.sight import refuse_ports
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
 
 __all__ = ["render_analytic"]
@@ -28,7 +29,6 @@ _COARSE = 8  # every eighth pixel of every eighth row decides the exposure
 def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
     """Truth, bound and frames of a drawn scene. Raises `ConfigError` for one without a return."""
     scene, target = draw.scene, plan.targets[draw.target]
-    refuse_ports(scene, "datasets of the analytic model")
     truth = truth_maps(scene, device=device) if target.export is None else target.truth(scene.camera)
     view = pixel_directions(scene.camera)
     by_rates = math.isnan(draw.fractions[0])
@@ -53,7 +53,7 @@ def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rende
     maps, table = maps_of(scene, ..., outliers=by_rates)
     seen = maps["fisher"] > 0
     # No bound is worse than a guess anywhere in the gate.
-    guess = gate_deviation(scene, view.reshape(-1, 3))
+    guess = gate_deviation(scene, lines_of_sight(scene).direction.reshape(-1, 3))
     bound = np.where(seen, np.minimum(maps["sigma_depth"], guess), np.nan)
     axis = np.array([[0.0, 0.0, 1.0]])
     paths, cumulative = pixel_maps(
@@ -96,6 +96,7 @@ def _draw_frames(
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
 
     coding: Any = FrameCoding()
+    optics, coding.ports = scene_optics(scene)
     coding.laser = wp.vec3(*scene.beam.position)
     coding.nearest, coding.farthest = scene.gate.start * speed, scene.gate.stop * speed
     coding.width, coding.pixels = shape[1], truth.depth.size
@@ -109,6 +110,7 @@ def _draw_frames(
         put(view, wp.vec3),
         put(np.where(np.isnan(bound), np.nan, truth.depth.reshape(-1))),
         *map(put, (bound, maps["alpha"], probability, flat, *table, fractions)),
+        optics=optics,
     )
     count = len(draw.fractions)
     return StoredFrames(

@@ -20,6 +20,7 @@ from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
 from spadwarp.errors import ConfigError
 from spadwarp.scene import Camera, Scene, Trajectory, load_trajectory
 from spadwarp.scene.renamed import former_path
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.units import time_from_range
 
 __all__ = ["Plan", "SceneDraw", "Shard"]
@@ -146,7 +147,7 @@ class Plan:
         if (pulses := draw("exposure.pulses", recipe.exposure.pulses_per_depth_frame)) is not None:
             analytic["pulses_per_depth_frame"] = max(1, round(pulses))
         drawn = {
-            "gate": self._gate(draw, distance, scene.medium.group_index),
+            "gate": self._gate(draw, distance, scene),
             "targets": [] if source.export else self._targets(draw, source, distance, scene.camera),
             "analytic": analytic,
         }
@@ -207,12 +208,14 @@ class Plan:
             )
         return targets
 
-    def _gate(self, draw: _Draw, distance: float, group_index: float) -> dict[str, Any]:
-        window = self.recipe.gate
+    def _gate(self, draw: _Draw, distance: float, scene: Scene) -> dict[str, Any]:
+        window, group_index = self.recipe.gate, scene.medium.group_index
+        axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
+        sooner = float(axis.lead - axis.delay)  # In the air of a port light is faster.
         near = max(distance - draw("gate.before", window.before), _SHORTEST_RANGE)
         far = distance + draw("gate.behind", window.behind)
         return {
-            "start_ns": time_from_range(near, group_index) * 1e9,
+            "start_ns": time_from_range(max(near - sooner, 0.0), group_index) * 1e9,
             "bin_width_ps": time_from_range(far - near, group_index) / window.bins * 1e12,
             "bins": window.bins,
         }

@@ -18,6 +18,7 @@ from spadwarp.errors import ConfigError
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.phase import PhaseFunction, phase_function
+from spadwarp.scene.port_rays import camera_port
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.spectrum import filter_band, filter_transmission
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
@@ -39,6 +40,7 @@ Floats = NDArray[np.float64]
 _ANGLES = np.linspace(0.0, math.pi, 1441)  # of scattering
 _BAND_NODES = 13
 _PART_PIXELS = 1 << 16
+_DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
 
 class _Field(NamedTuple):
@@ -72,7 +74,7 @@ class _Field(NamedTuple):
         of_sky = np.interp(-(view @ self.down), np.linspace(-1.0, 1.0, self.by_sky.size), self.by_sky)
         return self.sun * np.interp(angle, _ANGLES, self.scattered) + of_sky
 
-    def of_water(self, view: Floats, distance: Floats, depth: float) -> Floats:
+    def of_water(self, view: Floats, distance: Floats, depth: Floats | float) -> Floats:
         """Radiance of the water up to a distance on lines of sight; up to the surface at most [W/m²/sr]."""
         downwards = view @ self.down
         to_surface = np.where(downwards < -1e-9, depth / np.maximum(-downwards, 1e-9), np.inf)
@@ -112,19 +114,21 @@ def daylight_radiance(
 ) -> Floats:
     """Spectral radiance that comes to the lens along lines of sight [W/m²/nm/sr].
 
+    Behind a port that is the transmission times (n_0/n_w)² of the radiance in the water, n_0 being the index inside.
+
     Args:
         scene: With `[daylight]`.
         wavelength_nm: 400 to 700 [nm].
-        view: Unit vectors in the camera frame `[..., 3]`.
-        distance: To a surface `[...]` [m]; NaN or 0 for open water; default: open water.
+        view: Unit vectors in the camera frame in which the lens sees `[..., 3]`.
+        distance: Range of a surface `[...]` [m]; NaN or 0 for open water; default: open water.
         normal: Of the surface, unit vectors towards the camera `[..., 3]`.
         reflectance: Of it, Lambertian `[...]`.
 
     Raises:
-        ConfigError: A scene without `[daylight]`.
+        ConfigError: A scene without `[daylight]`, or whose camera looks down through the surface.
         ArgumentError: A wavelength out of range.
     """
-    seen = _Seen.of(np.asarray(view, np.float64), distance, normal, reflectance)
+    seen = _Seen.of(scene, np.asarray(view, np.float64), distance, normal, reflectance)
     return _radiance(_field(scene, wavelength_nm), seen, _daylight(scene).depth)
 
 
@@ -151,7 +155,7 @@ def daylight_rate(
         widths * filter_transmission(scene.laser, scene.detector, nodes) * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
     )
     fields = [(_field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
-    seen = _Seen.of(view, distance, normal, reflectance)
+    seen = _Seen.of(scene, view, distance, normal, reflectance)
     total = np.zeros(len(seen.view))
     for first in range(0, len(total), _PART_PIXELS):
         part = slice(first, first + _PART_PIXELS)
@@ -177,17 +181,20 @@ def noise_rate(scene: Scene, truth: Any = None) -> Any:
 
 
 class _Seen(NamedTuple):
-    """What pixels see: lines of sight `[P, 3]`, distance `[P]` (infinite in open water), and of surfaces the normal and
-    the reflectance."""
+    """What pixels see: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open water), of
+    surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the radiance in
+    front of the lens over that in the water."""
 
     view: Floats
     distance: Floats
     normal: Floats
     reflectance: Floats
+    deeper: Floats | float
+    passed: Floats | float
     shape: tuple[int, ...]
 
     @classmethod
-    def of(cls, view: Floats, distance: Any, normal: Any, reflectance: Any) -> _Seen:
+    def of(cls, scene: Scene, view: Floats, distance: Any, normal: Any, reflectance: Any) -> _Seen:
         shape, count = view.shape[:-1], view[..., 0].size
         far = np.full(count, np.inf)
         faces, shade = np.zeros((count, 3)), np.zeros(count)
@@ -196,23 +203,43 @@ class _Seen(NamedTuple):
             far = np.where(given > 0.0, given, np.inf)
             faces = np.nan_to_num(np.asarray(normal, np.float64)).reshape(-1, 3)
             shade = np.nan_to_num(np.asarray(reflectance, np.float64)).reshape(-1)
-        return cls(view.reshape(-1, 3), far, faces, shade, shape)
+        view, port = view.reshape(-1, 3), camera_port(scene)
+        if port is None:
+            return cls(view, far, faces, shade, 0.0, 1.0, shape)
+        down = _daylight(scene).down @ rotation_matrix(scene.camera.rotation_deg)
+        if port.shape == "flat" and not port.thickness and down @ np.array(port.normal) > _DOWNWARDS:
+            raise ConfigError(
+                "daylight does not go with a camera.port that is the surface, seen from above: the sky that it "
+                "reflects is not modelled",
+                source=None if scene.source is None else str(scene.source),
+            )
+        start, direction, lead, _ = port.enter(np.zeros(3), view)
+        passes = np.isfinite(lead)
+        passed = port.transmission(np.zeros(3), view) * (port.index[0] / port.index[2]) ** 2
+        # Rays that do not get through see nothing.
+        direction = np.where(passes[:, None], direction, view)
+        deeper = np.where(passes, start @ down, 0.0)
+        along = np.maximum(far - np.where(passes, lead, 0.0), 0.0)
+        return cls(direction, along, faces, shade, deeper, np.where(passes, passed, 0.0), shape)
 
     def part(self, pixels: slice) -> _Seen:
         """Some of the pixels."""
         view, distance = self.view[pixels], self.distance[pixels]
-        return _Seen(view, distance, self.normal[pixels], self.reflectance[pixels], distance.shape)
+        deeper, passed = (x if isinstance(x, float) else x[pixels] for x in (self.deeper, self.passed))
+        return _Seen(view, distance, self.normal[pixels], self.reflectance[pixels], deeper, passed, distance.shape)
 
 
 def _radiance(field: _Field, seen: _Seen, depth: float) -> Floats:
     """Radiance that comes to the lens [W/m²/nm/sr], of the shape of what is seen."""
     hit = np.isfinite(seen.distance)
-    total = field.of_water(seen.view, seen.distance, depth) + np.where(hit, 0.0, field.of_sky(seen.view))
+    begin = np.maximum(depth + seen.deeper, 0.0)
+    total = field.of_water(seen.view, seen.distance, begin) + np.where(hit, 0.0, field.of_sky(seen.view))
     if hit.any():
         below = seen.distance[hit] * (seen.view[hit] @ field.down)
-        along = np.exp(-field.attenuation * seen.distance[hit] - field.decay * np.maximum(below, -depth))
+        above = -np.broadcast_to(begin, hit.shape)[hit]
+        along = np.exp(-field.attenuation * seen.distance[hit] - field.decay * np.maximum(below, above))
         total[hit] += seen.reflectance[hit] / math.pi * _on_faces(field, seen.normal[hit], depth) * along
-    return total.reshape(seen.shape)
+    return (total * np.exp(-field.decay * seen.deeper) * seen.passed).reshape(seen.shape)
 
 
 def _daylight(scene: Scene) -> Any:

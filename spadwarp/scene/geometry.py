@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "depth_from_range",
-    "depth_per_time",
     "gate_deviation",
     "path_from_range",
     "pixel_directions",
@@ -93,21 +92,7 @@ def range_from_depth(depth: Any, directions: Floats) -> Any:
     return depth / directions[..., 2]
 
 
-def depth_per_time(scene: Scene, directions: Floats, distance: Floats) -> Floats:
-    """dz/dt along lines of sight u `[P, 3]` at ranges r `[P]` [m/s].
-
-    The path is |r·u − p| + r, so that d path/dr = 1 + (direction of the light)·u.
-    """
-    laser = scene.beam
-    if laser.profile == "collimated":
-        light = np.broadcast_to(np.asarray(laser.axis), directions.shape)
-    else:
-        y = distance[:, None] * directions - np.asarray(laser.position)
-        light = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-300)
-    return scene.medium.pulse_speed / (1.0 + (light * directions).sum(axis=1)) * directions[:, 2]
-
-
 def gate_deviation(scene: Scene, directions: Floats) -> Floats:
-    """Standard deviation [m] of a depth that is guessed evenly over the gate, along unit vectors `[..., 3]`."""
+    """Standard deviation [m] of a depth that is guessed evenly over the gate; unit vectors are those in the water."""
     gate = scene.gate
     return 0.5 * scene.medium.pulse_speed * (gate.stop - gate.start) / math.sqrt(12.0) * directions[..., 2]

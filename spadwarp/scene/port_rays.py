@@ -73,6 +73,40 @@ class PortGeometry:
         inside, window = lengths
         return y, v, inside + window, self.delays[0] * inside + self.delays[1] * window
 
+    def transmission(self, x: ArrayLike, u: ArrayLike) -> Floats:
+        """Fraction of unpolarised light that gets through, of rays from x inside along unit vectors u; 0: none."""
+        y, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(u, np.float64))
+        s = p = 1.0
+        with np.errstate(invalid="ignore"):
+            for k, outward in enumerate((0.0, self.thickness)):
+                before, behind = self.index[k], self.index[k + 1]
+                y = y + self._to_face(y, v, outward)[..., None] * v
+                normals = self._normals(y)
+                q0 = (v * normals).sum(axis=-1)
+                v = _refracted(v, normals, before / behind)
+                q1 = (v * normals).sum(axis=-1)
+                s = s * (4.0 * before * q0 * behind * q1 / (before * q0 + behind * q1) ** 2)
+                p = p * (4.0 * before * q0 * behind * q1 / (behind * q0 + before * q1) ** 2)
+        return np.nan_to_num(0.5 * (s + p))
+
+    def spread(self, x: ArrayLike, u: ArrayLike, distance: float) -> float:
+        """Irradiance across a ray from x inside along the unit vector u, for an intensity of 1 in clear water, where it
+        has gone a distance beyond the port [1/m²]; by differences. 1/distance² without a port."""
+        x, u = np.asarray(x, np.float64), np.asarray(u, np.float64)
+        start, direction, lead, _ = self.enter(x, u)
+        middle = start + (distance - lead) * direction
+        aside = np.linalg.svd(u[None])[2][1:]
+        step = 1e-4
+        sides = []
+        for axis in aside:
+            ends = []
+            for sign in (1.0, -1.0):
+                y, v, _, _ = self.enter(x, math.cos(step) * u + sign * math.sin(step) * axis)
+                ends.append(y + ((middle - y) @ direction / (v @ direction)) * v)
+            sides.append((ends[0] - ends[1]) / (2.0 * step))
+        area = float(np.linalg.norm(np.cross(*sides)))
+        return float(self.transmission(x, u)) / area
+
     def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
         if self.shape == "flat":
             climb = u @ np.array(self.normal)

@@ -104,8 +104,6 @@ class Scene(BaseModel):
                     port.indices(self.laser.wavelength_nm)
                 except ValueError as error:
                     raise ValueError(f"{section}.port.{error}") from None
-        if self.daylight is not None and camera is not None:
-            raise ValueError("daylight does not go with a camera.port: its radiance is that at a lens in the water")
         if self.scan.mode != "none" and (camera is not None or laser is not None):
             if laser != "camera":
                 raise ValueError("scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both")

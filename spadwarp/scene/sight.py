@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ConfigError
 from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_path
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.units import path_from_time
@@ -16,7 +15,7 @@ from spadwarp.units import path_from_time
 if TYPE_CHECKING:
     from spadwarp.scene import Camera, Scene
 
-__all__ = ["LinesOfSight", "depth_from_time", "depth_per_time", "lines_of_camera", "lines_of_sight", "refuse_ports"]
+__all__ = ["LinesOfSight", "depth_from_time", "depth_per_time", "lines_of_camera", "lines_of_sight"]
 
 Floats = NDArray[np.float64]
 
@@ -99,10 +98,9 @@ class LinesOfSight:
             along = np.maximum(along - (self._path_to(points) + along - left) / slope, _LEAST)
         return np.where(left > least, along, np.nan) + self.lead
 
-    def depth_per_path(self, distance: ArrayLike, *, beam_axis: ArrayLike | None = None) -> Floats:
-        """dz/dpath at ranges; `beam_axis`: of a parallel beam, whose light comes along it."""
-        light = self._light_to(self.points(distance)) if beam_axis is None else np.asarray(beam_axis, np.float64)
-        return self.direction[..., 2] / (1.0 + (light * self.direction).sum(axis=-1))
+    def light_to(self, distance: ArrayLike) -> Floats:
+        """Unit vectors in which the light of a laser that is a point comes to ranges."""
+        return self._light_to(self.points(distance))
 
     @property
     def bent(self) -> bool:
@@ -145,23 +143,14 @@ def depth_from_time(time: Floats, *, scene: Scene) -> Floats:
     return lines.depth_from_range(lines.range_from_path(path_from_time(time, scene.medium.group_index)))
 
 
-def depth_per_time(scene: Scene, distance: Floats) -> Floats:
-    """dz/dt at ranges along the lines of sight, `[H, W]` [m/s]."""
+def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -> Floats:
+    """dz/dt at ranges along the lines of sight, `[H, W]` [m/s], or along those of unit vectors `view`."""
     beam = scene.beam
     axis: Floats | None = None
     if beam.profile == "collimated":
         port = laser_port(scene)
         axis = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
-    return scene.medium.pulse_speed * lines_of_sight(scene).depth_per_path(distance, beam_axis=axis)
-
-
-def refuse_ports(scene: Scene, what: str, instead: str = "") -> None:
-    """Raises `ConfigError` for a scene with a port: `what` knows cameras and lasers in the water alone; what to do
-    `instead`."""
-    for section in ("camera", "laser"):
-        if getattr(scene, section).port is not None:
-            raise ConfigError(
-                f"{section}.port does not go with {what}, for cameras and lasers in the water alone; photon transport "
-                f"takes ports: simulate, detect, depth, truth maps{instead and '; '}{instead}",
-                source=None if scene.source is None else str(scene.source),
-            )
+    lines = lines_of_sight(scene, view)
+    light = lines.light_to(distance) if axis is None else axis
+    # The path rises with the range by 1 + the cosine between both directions of light.
+    return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]

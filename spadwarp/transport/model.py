@@ -30,7 +30,7 @@ from spadwarp.transport.tally_unit import tally_scale
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["build_model", "transport_spec"]
+__all__ = ["build_model", "port_kind", "port_parameters", "transport_spec"]
 
 # The albedo of Lu et al. 2024 is uniform in (0, 0.97).
 _LU2024_ALBEDO = 0.97
@@ -249,8 +249,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode == "confocal",
         rotated_domain=_has_rotated_domain(scene),
-        port=_port_kind(camera_port(scene)),
-        laser_port=_port_kind(laser_port(scene)),
+        port=port_kind(camera_port(scene)),
+        laser_port=port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
         grid=grid_tracking(scene),
         derivatives=derivative_kinds(scene, derivatives),
@@ -264,7 +264,7 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     laser.position = wp.vec3(*beam.position)
     laser.axis = wp.vec3(*beam.axis)
     if (port := laser_port(scene)) is not None:
-        laser.port = _port(scene, port, beam.position, 0.0, 0.0)
+        laser.port = port_parameters(scene, port, beam.position, 0.0, 0.0)
     if beam.profile == "measured":
         rows, columns = sk.profile_tables(load_profile(beam))
         laser.rows = wp.array(rows, dtype=float, device=device)
@@ -294,15 +294,16 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
         lens.view = wp.vec4(*view_box(camera))
     if (port := camera_port(scene)) is not None:
-        lens.port = _port(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
+        lens.port = port_parameters(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
     return lens
 
 
-def _port_kind(port: PortGeometry | None) -> Any:
+def port_kind(port: PortGeometry | None) -> Any:
+    """The kernels' kind of a port; None: there is none."""
     return None if port is None else sk.FLAT_PORT if port.shape == "flat" else sk.DOME_PORT
 
 
-def _port(
+def port_parameters(
     scene: Scene, port: PortGeometry, origin: tuple[float, float, float], aperture_radius: float, inverse_focus: float
 ) -> Any:
     """A port as the kernels take it."""

@@ -4,6 +4,7 @@ One thread a pixel, float64. The model is eq 8 of *A Simulation Method for Under
 Sensors 24, 3886 (2024): a Gaussian pulse on dark counts, ambient light and backscatter, as rates per pulse.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -12,8 +13,9 @@ from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice,
 from spadwarp_kernels.math.float64 import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 from spadwarp_kernels.pixels import launch_pixels
 
-from .backscatter import background_rate, check_phase, spectral_lines
-from .lidar import Lidar, check_lidar
+from .backscatter import check_phase, make_background_rate, spectral_lines
+from .lidar import Lidar
+from .optics import IN_WATER, Optics, check_optics
 from .outliers import outlier_probability
 
 # Unrolled loops would make the compilation for a GPU take a minute.
@@ -66,109 +68,115 @@ def _gauss_legendre(node: int) -> wp.vec2d:
     return wp.vec2d(x, w)
 
 
-@wp.func
-def _integrate_pulse(
-    lidar: Lidar,
-    lines: wp.array(dtype=wp.vec3d),
-    phase: wp.array(dtype=wp.float64),
-    profile: wp.array2d(dtype=float),
-    i: int,
-    view: wp.vec3d,
-    s: wp.float64,
-    mu: wp.float64,
-    ambient: wp.float64,
-) -> PulseIntegrals:
-    """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there, 24
-    panels of at most σ/2 with five Gauss-Legendre nodes."""
-    total = PulseIntegrals()
-    sigma = lidar.sigma
-    for side in range(2):
-        low = wp.max(lidar.start, mu - wp.float64(12.0) * sigma)
-        high = wp.min(lidar.stop, mu)
-        if side == 1:
-            low = wp.max(lidar.start, mu)
-            high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
-        half = (high - low) / wp.float64(48.0)
-        if half > ZERO:
-            right = background_rate(lidar, lines, phase, profile, i, view, side, low) + ambient
-            for panel in range(24):
-                middle = low + (TWO * wp.float64(panel) + ONE) * half
-                left = wp.float64(right)
-                right = background_rate(lidar, lines, phase, profile, i, view, side, middle + half) + ambient
-                for node in range(5):
-                    rule = _gauss_legendre(node)
-                    x = rule[0]
-                    w = rule[1]
-                    t = middle + x * half
-                    z = (t - mu) / sigma
-                    pulse = s / (sigma * SQRT_2PI) * wp.exp(-HALF * z * z)
-                    # Straight across a panel; only a profile can have more detail than that.
-                    noise_rate = HALF * (left + right) + HALF * (right - left) * x
-                    if lidar.source == 2:
-                        noise_rate = background_rate(lidar, lines, phase, profile, i, view, side, t) + ambient
-                    rate = noise_rate + pulse
-                    if rate > ZERO:
-                        total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
-                    total.background += w * half * pulse * noise_rate
-                    total.signal += w * half * pulse
-    return total
+@functools.cache
+def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
+    Sight, see = optics.sight, optics.see
+    background_rate = make_background_rate(optics)
 
+    @wp.func
+    def integrate_pulse(
+        lidar: Lidar,
+        lines: wp.array(dtype=wp.vec3d),
+        phase: wp.array(dtype=wp.float64),
+        profile: wp.array2d(dtype=float),
+        i: int,
+        sight: Sight,
+        s: wp.float64,
+        mu: wp.float64,
+        ambient: wp.float64,
+    ) -> PulseIntegrals:
+        """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there,
+        24 panels of at most σ/2 with five Gauss-Legendre nodes."""
+        total = PulseIntegrals()
+        sigma = lidar.sigma
+        for side in range(2):
+            low = wp.max(lidar.start, mu - wp.float64(12.0) * sigma)
+            high = wp.min(lidar.stop, mu)
+            if side == 1:
+                low = wp.max(lidar.start, mu)
+                high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
+            half = (high - low) / wp.float64(48.0)
+            if half > ZERO:
+                right = background_rate(lidar, lines, phase, profile, i, sight, side, low) + ambient
+                for panel in range(24):
+                    middle = low + (TWO * wp.float64(panel) + ONE) * half
+                    left = wp.float64(right)
+                    right = background_rate(lidar, lines, phase, profile, i, sight, side, middle + half) + ambient
+                    for node in range(5):
+                        rule = _gauss_legendre(node)
+                        x = rule[0]
+                        w = rule[1]
+                        t = middle + x * half
+                        z = (t - mu) / sigma
+                        pulse = s / (sigma * SQRT_2PI) * wp.exp(-HALF * z * z)
+                        # Straight across a panel; only a profile can have more detail than that.
+                        noise_rate = HALF * (left + right) + HALF * (right - left) * x
+                        if lidar.source == 2:
+                            noise_rate = background_rate(lidar, lines, phase, profile, i, sight, side, t) + ambient
+                        rate = noise_rate + pulse
+                        if rate > ZERO:
+                            total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
+                        total.background += w * half * pulse * noise_rate
+                        total.signal += w * half * pulse
+        return total
 
-@wp.kernel
-def _statistics(
-    first: int,
-    lidar: Lidar,
-    lines: wp.array(dtype=wp.vec3d),
-    phase: wp.array(dtype=wp.float64),
-    profile: wp.array2d(dtype=float),
-    view: wp.array(dtype=wp.vec3d),
-    signal: wp.array(dtype=wp.float64),
-    arrival: wp.array(dtype=wp.float64),
-    backscatter: wp.array(dtype=wp.float64),
-    ambient: wp.array(dtype=wp.float64),
-    count_law: int,
-    acquisitions: wp.float64,
-    pulses_per_frame: wp.float64,
-    with_outliers: int,
-    # Out:
-    alpha: wp.array(dtype=wp.float64),
-    fisher: wp.array(dtype=wp.float64),
-    sigma_time: wp.array(dtype=wp.float64),
-    level: wp.array(dtype=wp.float64),
-    outlier: wp.array(dtype=wp.float64),
-):
-    """α (integral of eq 8), Fisher information per photon (eq 9), σ* and outlier probability. Launch grid: pixels."""
-    i = first + wp.tid()
-    s = signal[i]
-    mu = arrival[i]
-    sigma = lidar.sigma
-    gate = lidar.stop - lidar.start
-    beside = ambient[i % ambient.shape[0]]
-    noise = lidar.dark * gate + backscatter[i] + beside * gate
-    fraction = wp.float64(0.0)
-    if s > ZERO:
-        fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
-    a = noise + s * fraction
-    alpha[i] = a
-    pulse = PulseIntegrals()
-    if s * fraction > ZERO:
-        pulse = _integrate_pulse(lidar, lines, phase, profile, i, view[i], s, mu, beside)
-    counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
-    f = wp.float64(0.0)
-    sigma_star = wp.float64(wp.nan)
-    p = wp.float64(wp.nan)
-    # The outlier model takes the background as flat, at the level under the pulse: what is brighter elsewhere weighs
-    # less in a fit that knows the background.
-    flat = pulse.background / wp.max(pulse.signal, wp.float64(1.0e-300))
-    if pulse.information > ZERO:
-        f = pulse.information / a
-        sigma_star = ONE / wp.sqrt(counts * f)
-        if with_outliers == 1:
-            p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
-    fisher[i] = f
-    sigma_time[i] = sigma_star
-    level[i] = flat * sigma
-    outlier[i] = p
+    @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+    def statistics_kernel(
+        first: int,
+        lidar: Lidar,
+        lines: wp.array(dtype=wp.vec3d),
+        phase: wp.array(dtype=wp.float64),
+        profile: wp.array2d(dtype=float),
+        view: wp.array(dtype=wp.vec3d),
+        signal: wp.array(dtype=wp.float64),
+        arrival: wp.array(dtype=wp.float64),
+        backscatter: wp.array(dtype=wp.float64),
+        ambient: wp.array(dtype=wp.float64),
+        count_law: int,
+        acquisitions: wp.float64,
+        pulses_per_frame: wp.float64,
+        with_outliers: int,
+        # Out:
+        alpha: wp.array(dtype=wp.float64),
+        fisher: wp.array(dtype=wp.float64),
+        sigma_time: wp.array(dtype=wp.float64),
+        level: wp.array(dtype=wp.float64),
+        outlier: wp.array(dtype=wp.float64),
+    ):
+        """α (integral of eq 8), Fisher information per photon (eq 9), σ*, outlier probability. Launch grid: pixels."""
+        i = first + wp.tid()
+        s = signal[i]
+        mu = arrival[i]
+        sigma = lidar.sigma
+        gate = lidar.stop - lidar.start
+        beside = ambient[i % ambient.shape[0]]
+        noise = lidar.dark * gate + backscatter[i] + beside * gate
+        fraction = wp.float64(0.0)
+        if s > ZERO:
+            fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
+        a = noise + s * fraction
+        alpha[i] = a
+        pulse = PulseIntegrals()
+        if s * fraction > ZERO:
+            pulse = integrate_pulse(lidar, lines, phase, profile, i, see(lidar.ports, view[i]), s, mu, beside)
+        counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
+        f = wp.float64(0.0)
+        sigma_star = wp.float64(wp.nan)
+        p = wp.float64(wp.nan)
+        # The outlier model takes the background as flat, at the level under the pulse: what is brighter elsewhere
+        # weighs less in a fit that knows the background.
+        flat = pulse.background / wp.max(pulse.signal, wp.float64(1.0e-300))
+        if pulse.information > ZERO:
+            f = pulse.information / a
+            sigma_star = ONE / wp.sqrt(counts * f)
+            if with_outliers == 1:
+                p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
+        fisher[i] = f
+        sigma_time[i] = sigma_star
+        level[i] = flat * sigma
+        outlier[i] = p
+
+    return statistics_kernel
 
 
 # The bound of a histogram
@@ -234,6 +242,7 @@ def statistics_maps(
     outliers: bool = True,
     lines: wp.array | None = None,
     ambient: wp.array | None = None,
+    optics: Optics = IN_WATER,
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
@@ -242,7 +251,7 @@ def statistics_maps(
     as large.
 
     Args:
-        lidar, phase, view: As for `single_scatter_table`.
+        lidar, phase, view, optics: As for `single_scatter_table`.
         profile: float32 `[1 or pixel, bin]`, backscatter detections per pulse and bin, used where `lidar.source` is 2.
         signal, arrival: Of `signal_map`.
         backscatter: float64 `[pixel]`, backscatter detections per pulse within the gate.
@@ -258,7 +267,7 @@ def statistics_maps(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_lidar(lidar)
+    check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
     check_phase(phase, device)
@@ -282,7 +291,7 @@ def statistics_maps(
     if ambient.size not in (1, count):
         raise ArgumentError(f"ambient has {ambient.size} entries; 1 or {count} are needed")
     inputs = [lidar, spectral_lines(lidar, lines, device), phase, profile, view, signal, arrival, backscatter, ambient]
-    launch_pixels(_statistics, count, [*inputs, *counting, *out], device=device)
+    launch_pixels(_make_statistics_kernel(optics), count, [*inputs, *counting, *out], device=device)
     return out
 
 

@@ -1,5 +1,6 @@
 """Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,9 @@ import warp as wp
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_number, check_seed, check_vector
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_ANALYTIC, random_block, u01, u01_open
+
+from .lidar import Ports
+from .optics import IN_WATER, Optics, check_ports
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,6 +22,7 @@ class Sampler:
 
     Attributes:
         laser: Position of the laser [m].
+        ports: What camera and laser are behind, for the optics that say so.
         nearest, farthest: Paths at which the gate opens and closes [m].
         pixels: Number of pixels of a frame.
         first_frame, frames: The range of frames.
@@ -25,6 +30,7 @@ class Sampler:
     """
 
     laser: wp.vec3
+    ports: Ports
     nearest: float
     farthest: float
     pixels: int
@@ -63,56 +69,83 @@ def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
     return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
 
 
-@wp.kernel
-def _frames(
-    first: int,
-    sampler: Sampler,
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    sigma_depth: wp.array(dtype=float),
-    probability: wp.array(dtype=float),
-    flat_share: wp.array(dtype=float),
-    paths: wp.array2d(dtype=float),
-    cumulative: wp.array2d(dtype=float),
-    # Out:
-    frames: wp.array2d(dtype=float),
-    labels: wp.array2d(dtype=wp.bool),
-):
-    """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
+@functools.cache
+def make_depth_of_path(optics: Optics) -> wp.Function:
+    """The Warp function ``(laser, ports, view, path)`` -> planar depth at which light has gone a path; 0 if there is
+    none."""
+    see, point, range_of_path = optics.see, optics.point, optics.range_of_path
+    in_water = optics is IN_WATER
 
-    One block of random numbers serves two frames; a draw depends on seed, pixel and frame number alone.
-    """
-    tid = first + wp.tid()
-    pair = tid / sampler.pixels
-    pixel = tid - pair * sampler.pixels
-    pair += sampler.first_frame / 2
-    block = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair), STREAM_ANALYTIC)
-    radius = sigma_depth[pixel] * wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
-    angle = 6.283185307179586 * u01(block[1])
-    p = probability[pixel]
-    for k in range(2):
-        frame = 2 * pair + k - sampler.first_frame
-        if frame >= 0 and frame < sampler.frames:
-            shift = radius * wp.cos(angle)
-            word = block[2]
-            if k == 1:
-                shift = radius * wp.sin(angle)
-                word = block[3]
-            value = depth[pixel] + shift
-            reports_background = u01(word) < p
-            if reports_background:
-                extra = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
-                kind = u01(extra[0])
-                draw = u01(extra[1])
+    @wp.func
+    def depth_at(laser: wp.vec3, ports: Ports, view: wp.vec3, path: float) -> float:
+        if wp.static(in_water):
+            return depth_of_path(laser, view, path)
+        sight = see(ports, wp.vec3d(view))
+        r = range_of_path(wp.vec3d(laser), ports, sight, wp.float64(path))
+        depth = wp.float64(0.0)
+        if r > depth:
+            depth = point(sight, r)[2]
+        return float(depth)
+
+    return depth_at
+
+
+@functools.cache
+def _make_kernel(optics: Optics) -> wp.Kernel:
+    depth_at = make_depth_of_path(optics)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def frames_kernel(
+        first: int,
+        sampler: Sampler,
+        view: wp.array(dtype=wp.vec3),
+        depth: wp.array(dtype=float),
+        sigma_depth: wp.array(dtype=float),
+        probability: wp.array(dtype=float),
+        flat_share: wp.array(dtype=float),
+        paths: wp.array2d(dtype=float),
+        cumulative: wp.array2d(dtype=float),
+        # Out:
+        frames: wp.array2d(dtype=float),
+        labels: wp.array2d(dtype=wp.bool),
+    ):
+        """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
+
+        One block of random numbers serves two frames; a draw depends on seed, pixel and frame number alone.
+        """
+        tid = first + wp.tid()
+        pair = tid / sampler.pixels
+        pixel = tid - pair * sampler.pixels
+        pair += sampler.first_frame / 2
+        block = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair), STREAM_ANALYTIC)
+        radius = sigma_depth[pixel] * wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+        angle = 6.283185307179586 * u01(block[1])
+        p = probability[pixel]
+        for k in range(2):
+            frame = 2 * pair + k - sampler.first_frame
+            if frame >= 0 and frame < sampler.frames:
+                shift = radius * wp.cos(angle)
+                word = block[2]
                 if k == 1:
-                    kind = u01(extra[2])
-                    draw = u01(extra[3])
-                path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
-                if kind >= flat_share[pixel]:
-                    path = path_at_share(paths, cumulative, pixel, draw)
-                value = depth_of_path(sampler.laser, view[pixel], path)
-            frames[frame, pixel] = value
-            labels[frame, pixel] = reports_background
+                    shift = radius * wp.sin(angle)
+                    word = block[3]
+                value = depth[pixel] + shift
+                reports_background = u01(word) < p
+                if reports_background:
+                    extra = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
+                    kind = u01(extra[0])
+                    draw = u01(extra[1])
+                    if k == 1:
+                        kind = u01(extra[2])
+                        draw = u01(extra[3])
+                    path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
+                    if kind >= flat_share[pixel]:
+                        path = path_at_share(paths, cumulative, pixel, draw)
+                    value = depth_at(sampler.laser, sampler.ports, view[pixel], path)
+                frames[frame, pixel] = value
+                labels[frame, pixel] = reports_background
+
+    return frames_kernel
 
 
 def check_pixel_maps(maps: Mapping[str, Any], paths: Any, cumulative: Any, pixels: int, device: wp.Device) -> None:
@@ -148,6 +181,8 @@ def sample_frames(
     frames: int,
     seed: int,
     out: tuple[wp.array, wp.array] | None = None,
+    optics: Optics = IN_WATER,
+    ports: Any = None,
 ) -> tuple[wp.array, wp.array]:
     """Depth frames and which of their pixels report background: float32 and bool `[frames, pixel]`.
 
@@ -164,6 +199,7 @@ def sample_frames(
         first_frame, frames: The range of frames.
         seed: 64-bit.
         out: Arrays to write into.
+        optics, ports: As for `signal_map`, with the parameters in `ports`.
 
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
@@ -173,6 +209,8 @@ def sample_frames(
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
     check_pixel_maps(maps, paths, cumulative, pixels, device)
     check_vector("laser", laser)
+    ports = Ports() if ports is None else ports
+    check_ports("ports", ports, optics)
     check_gate_paths(gate_paths)
     frames = check_integer("frames", frames, 0)
     first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
@@ -185,12 +223,14 @@ def sample_frames(
         raise ArgumentError("out is not a pair of arrays, of depth and of labels")
     check_array("out[0]", out[0], wp.float32, (frames, pixels), device)
     check_array("out[1]", out[1], wp.bool, (frames, pixels), device)
+    kernel = _make_kernel(optics)
     # wp.tid() is a 32-bit integer, and a thread draws two frames.
     step = 2 * max((1 << 30) // max(pixels, 1), 1)
     for start in range(0, frames, step):
         stop = min(start + step, frames)
         sampler = Sampler()
         sampler.laser = wp.vec3(*map(float, laser))
+        sampler.ports = ports
         sampler.nearest, sampler.farthest = gate_paths
         sampler.pixels = pixels
         sampler.first_frame = first_frame + start
@@ -198,5 +238,5 @@ def sample_frames(
         sampler.seed = wp.uint64(seed)
         pairs = (first_frame + stop + 1) // 2 - (first_frame + start) // 2
         inputs = [sampler, view, depth, sigma_depth, probability, flat_share, paths, cumulative]
-        launch_pixels(_frames, pairs * pixels, [*inputs, out[0][start:stop], out[1][start:stop]], device=device)
+        launch_pixels(kernel, pairs * pixels, [*inputs, out[0][start:stop], out[1][start:stop]], device=device)
     return out

@@ -4,6 +4,7 @@ The same draw as in `analytic`, μ + N(0, σ*²) or a background photon instead,
 their pixels that reports background, with the number of recorded photons beside the depth.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +22,9 @@ from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
 from spadwarp_kernels.random.quantiles import count_quantile
 
-from .depth_frames import check_gate_paths, check_pixel_maps, depth_of_path, path_at_share
+from .depth_frames import check_gate_paths, check_pixel_maps, make_depth_of_path, path_at_share
+from .lidar import Ports
+from .optics import IN_WATER, Optics, check_ports
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -32,6 +35,7 @@ class FrameCoding:
 
     Attributes:
         laser: Position of the laser [m].
+        ports: What camera and laser are behind, for the optics that say so.
         nearest, farthest: Paths at which the gate opens and closes [m].
         width, pixels: Of a row, of a frame.
         seed: Of the random numbers.
@@ -42,6 +46,7 @@ class FrameCoding:
     """
 
     laser: wp.vec3
+    ports: Ports
     nearest: float
     farthest: float
     width: int
@@ -54,63 +59,69 @@ class FrameCoding:
     intensity_step: float
 
 
-@wp.kernel
-def _frames(
-    first: int,
-    coding: FrameCoding,
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    sigma_depth: wp.array(dtype=float),
-    alpha: wp.array(dtype=float),
-    probability: wp.array(dtype=float),
-    flat_share: wp.array(dtype=float),
-    paths: wp.array2d(dtype=float),
-    cumulative: wp.array2d(dtype=float),
-    fraction: wp.array(dtype=float),
-    # Out:
-    depth_codes: wp.array2d(dtype=wp.uint16),
-    intensity_codes: wp.array2d(dtype=wp.uint8),
-    label_bytes: wp.array2d(dtype=wp.uint8),
-):
-    """Launch grid: frames x bytes of labels. A thread draws the eight pixels of one byte."""
-    tid = first + wp.tid()
-    frame = tid / label_bytes.shape[1]
-    byte = tid - frame * label_bytes.shape[1]
-    row_bytes = (coding.width + 7) / 8
-    row = byte / row_bytes
-    column = 8 * (byte - row * row_bytes)
-    bits = int(0)
-    for k in range(8):
-        if column + k < coding.width:
-            pixel = row * coding.width + column + k
-            sample = wp.uint64(coding.first_sample + wp.int64(frame))
-            block = random_block(coding.seed, sample, wp.uint32(pixel), STREAM_FRAMES)
-            radius = wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
-            angle = 6.283185307179586 * u01(block[1])
-            low = depth_of_path(coding.laser, view[pixel], coding.nearest)
-            high = depth_of_path(coding.laser, view[pixel], coding.farthest)
-            # NaN, no estimate, stays NaN.
-            value = depth[pixel] + sigma_depth[pixel] * radius * wp.cos(angle)
-            chance = probability[pixel] * fraction[frame]
-            kind = u01(block[2])
-            if kind < chance:
-                bits |= 128 >> k
-                draw = u01(block[3])
-                path = coding.nearest + draw * (coding.farthest - coding.nearest)
-                # Of the pixels that report background, kind / chance is uniform again.
-                if kind >= flat_share[pixel] * chance:
-                    path = path_at_share(paths, cumulative, pixel, draw)
-                value = depth_of_path(coding.laser, view[pixel], path)
-            code = int(0)
-            if value == value:
-                # A fit does not leave the gate.
-                value = wp.clamp(value, low, high)
-                code = wp.clamp(int((value - coding.depth_offset) / coding.depth_step + 0.5), 1, 65535)
-            depth_codes[frame, pixel] = wp.uint16(code)
-            count = count_quantile(radius * wp.sin(angle), coding.pulses, alpha[pixel])
-            level = wp.min(int(count / coding.intensity_step + 0.5), 255)
-            intensity_codes[frame, pixel] = wp.uint8(level)
-    label_bytes[frame, byte] = wp.uint8(bits)
+@functools.cache
+def _make_kernel(optics: Optics) -> wp.Kernel:
+    depth_at = make_depth_of_path(optics)
+
+    @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+    def frames_kernel(
+        first: int,
+        coding: FrameCoding,
+        view: wp.array(dtype=wp.vec3),
+        depth: wp.array(dtype=float),
+        sigma_depth: wp.array(dtype=float),
+        alpha: wp.array(dtype=float),
+        probability: wp.array(dtype=float),
+        flat_share: wp.array(dtype=float),
+        paths: wp.array2d(dtype=float),
+        cumulative: wp.array2d(dtype=float),
+        fraction: wp.array(dtype=float),
+        # Out:
+        depth_codes: wp.array2d(dtype=wp.uint16),
+        intensity_codes: wp.array2d(dtype=wp.uint8),
+        label_bytes: wp.array2d(dtype=wp.uint8),
+    ):
+        """Launch grid: frames x bytes of labels. A thread draws the eight pixels of one byte."""
+        tid = first + wp.tid()
+        frame = tid / label_bytes.shape[1]
+        byte = tid - frame * label_bytes.shape[1]
+        row_bytes = (coding.width + 7) / 8
+        row = byte / row_bytes
+        column = 8 * (byte - row * row_bytes)
+        bits = int(0)
+        for k in range(8):
+            if column + k < coding.width:
+                pixel = row * coding.width + column + k
+                sample = wp.uint64(coding.first_sample + wp.int64(frame))
+                block = random_block(coding.seed, sample, wp.uint32(pixel), STREAM_FRAMES)
+                radius = wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+                angle = 6.283185307179586 * u01(block[1])
+                low = depth_at(coding.laser, coding.ports, view[pixel], coding.nearest)
+                high = depth_at(coding.laser, coding.ports, view[pixel], coding.farthest)
+                # NaN, no estimate, stays NaN.
+                value = depth[pixel] + sigma_depth[pixel] * radius * wp.cos(angle)
+                chance = probability[pixel] * fraction[frame]
+                kind = u01(block[2])
+                if kind < chance:
+                    bits |= 128 >> k
+                    draw = u01(block[3])
+                    path = coding.nearest + draw * (coding.farthest - coding.nearest)
+                    # Of the pixels that report background, kind / chance is uniform again.
+                    if kind >= flat_share[pixel] * chance:
+                        path = path_at_share(paths, cumulative, pixel, draw)
+                    value = depth_at(coding.laser, coding.ports, view[pixel], path)
+                code = int(0)
+                if value == value:
+                    # A fit does not leave the gate.
+                    value = wp.clamp(value, low, high)
+                    code = wp.clamp(int((value - coding.depth_offset) / coding.depth_step + 0.5), 1, 65535)
+                depth_codes[frame, pixel] = wp.uint16(code)
+                count = count_quantile(radius * wp.sin(angle), coding.pulses, alpha[pixel])
+                level = wp.min(int(count / coding.intensity_step + 0.5), 255)
+                intensity_codes[frame, pixel] = wp.uint8(level)
+        label_bytes[frame, byte] = wp.uint8(bits)
+
+    return frames_kernel
 
 
 def _check_coding(coding: Any) -> None:
@@ -137,6 +148,8 @@ def draw_frames(
     paths: wp.array,
     cumulative: wp.array,
     fraction: wp.array,
+    *,
+    optics: Optics = IN_WATER,
 ) -> Sequence[wp.array]:
     """Frames `coding.first_sample` and on, one for each entry of `fraction`.
 
@@ -151,6 +164,7 @@ def draw_frames(
         flat_share: float32 `[pixel]`, part of these that arrive at any time of the gate alike.
         paths, cumulative: For the others edges in path [m] and distribution, float32 `[1 or pixel, n]`.
         fraction: float32 `[frame]`, in [0, 1].
+        optics: As for `signal_map`, with the parameters in `coding.ports`.
 
     Returns:
         Depth codes uint16 `[frame, pixel]`, intensity codes uint8 `[frame, pixel]`, labels uint8 `[frame, byte]`: rows
@@ -160,6 +174,7 @@ def draw_frames(
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
     _check_coding(coding)
+    check_ports("coding.ports", coding.ports, optics)
     check_array("view", view, wp.vec3, (coding.pixels,))
     maps = {"depth": depth, "sigma_depth": sigma_depth, "alpha": alpha, "probability": probability}
     check_pixel_maps(maps | {"flat_share": flat_share}, paths, cumulative, coding.pixels, view.device)
@@ -171,5 +186,7 @@ def draw_frames(
     intensity_codes = wp.empty((frames, coding.pixels), dtype=wp.uint8, device=device)
     labels = wp.empty((frames, label_count), dtype=wp.uint8, device=device)
     inputs = [coding, view, depth, sigma_depth, alpha, probability, flat_share, paths, cumulative, fraction]
-    launch_pixels(_frames, frames * label_count, [*inputs, depth_codes, intensity_codes, labels], device=device)
+    launch_pixels(
+        _make_kernel(optics), frames * label_count, [*inputs, depth_codes, intensity_codes, labels], device=device
+    )
     return depth_codes, intensity_codes, labels

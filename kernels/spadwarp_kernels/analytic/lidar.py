@@ -9,12 +9,26 @@ import warp as wp
 
 from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
 from spadwarp_kernels.math.float64 import ONE, PI, TWO, ZERO
+from spadwarp_kernels.port.port import Port
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 
 BACKSCATTER_SOURCES = ("constant", "single_scatter", "monte_carlo")
+
+
+@wp.struct
+class Ports:
+    """The ports that an `Optics` of them reads; those of a camera and a laser in the water are as they are made.
+
+    Attributes:
+        camera: What the camera looks through.
+        laser: What the laser shines through.
+    """
+
+    camera: Port
+    laser: Port
 
 
 @wp.struct
@@ -41,6 +55,7 @@ class Lidar:
         constant: Backscatter rate [1/s] (source 0).
         nearest: Range below which single scattering is left out [m] (source 1).
         bin_width: Of the Monte Carlo profile [s] (source 2).
+        ports: What camera and laser are behind, for the optics that say so.
     """
 
     lu2024: int
@@ -65,6 +80,7 @@ class Lidar:
     constant: wp.float64
     nearest: wp.float64
     bin_width: wp.float64
+    ports: Ports
 
 
 _RANGES = {
@@ -140,12 +156,3 @@ def beam_fluence(lidar: Lidar, x: wp.vec3d) -> wp.float64:
     if wp.length_sq(wp.cross(y, lidar.axis)) > lidar.radius * lidar.radius:
         return ZERO
     return ONE / (PI * lidar.radius * lidar.radius)
-
-
-@wp.func
-def range_of_path(lidar: Lidar, view: wp.vec3d, path: wp.float64) -> wp.float64:
-    """Distance along `view` at which light has gone `path` from laser to target to lens [m]; 0 if there is none."""
-    baseline2 = wp.length_sq(lidar.laser)
-    if path * path <= baseline2:
-        return ZERO
-    return (path * path - baseline2) / (TWO * (path - wp.dot(view, lidar.laser)))

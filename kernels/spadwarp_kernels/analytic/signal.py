@@ -4,6 +4,7 @@ Equation numbers are those of *A Simulation Method for Underwater SPAD Depth Ima
 Times are from the emission of the pulse; everything in float64.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -12,7 +13,8 @@ from spadwarp_kernels.arguments import check_array
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
 from spadwarp_kernels.pixels import launch_pixels
 
-from .lidar import Lidar, beam_direction, beam_fluence, beam_path, check_lidar
+from .lidar import Lidar
+from .optics import IN_WATER, Optics, check_optics
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -83,115 +85,141 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
     return lidar.axis
 
 
-@wp.func
-def _small_spot_signal(
-    lidar: Lidar, x: wp.vec3d, view: wp.vec3d, normal: wp.vec3d, reflectance: wp.float64
-) -> wp.float64:
-    """Signal where the beam illuminates part of the pixel: its rays go to the surface's tangent plane at x."""
-    total = wp.float64(0.0)
-    half = HALF * lidar.pixel_tangent
-    for i in range(16):
-        for j in range(16):
-            radial = (wp.float64(i) + HALF) / wp.float64(16.0)
-            azimuth = (wp.float64(j) + HALF) / wp.float64(16.0)
-            origin = _beam_ray(lidar, radial, azimuth, True)
-            u = _beam_ray(lidar, radial, azimuth, False)
-            facing = -wp.dot(normal, u)
-            if facing > wp.float64(1.0e-6):
-                s = wp.dot(normal, origin - x) / facing
-                hit = origin + s * u
-                inside = wp.abs(hit[0] - view[0] / view[2] * hit[2]) <= half * hit[2]
-                inside = inside and wp.abs(hit[1] - view[1] / view[2] * hit[2]) <= half * hit[2]
-                r = wp.length(hit)
-                cos_out = -wp.dot(normal, hit) / r
-                if s > ZERO and inside and cos_out > ZERO:
-                    total += cos_out * (hit[2] / r) / (r * r) * wp.exp(-lidar.extinction * (s + r))
-    scale = lidar.photons * lidar.pde * reflectance / PI * lidar.aperture_area
-    return scale * total / wp.float64(256.0)
+@functools.cache
+def make_radiometric_signal(optics: Optics) -> wp.Function:
+    """The Warp function ``(lidar, sight, distance, normal, reflectance)`` -> signal detections per pulse, `distance`
+    being the range."""
+    Sight = optics.sight
+    emit, receive, light_at, beside = optics.emit, optics.receive, optics.light, optics.beside
+    point, optics_view, from_lens, in_front_of_lens = optics.point, optics.view, optics.from_lens, optics.collected
+    spot, footprint = optics.spot, optics.footprint
+
+    @wp.func
+    def small_spot_signal(
+        lidar: Lidar, x: wp.vec3d, view: wp.vec3d, normal: wp.vec3d, reflectance: wp.float64
+    ) -> wp.float64:
+        """Signal where the beam illuminates part of the pixel: its rays go to the surface's tangent plane at x."""
+        total = wp.float64(0.0)
+        half = HALF * lidar.pixel_tangent
+        for i in range(16):
+            for j in range(16):
+                radial = (wp.float64(i) + HALF) / wp.float64(16.0)
+                azimuth = (wp.float64(j) + HALF) / wp.float64(16.0)
+                origin = _beam_ray(lidar, radial, azimuth, True)
+                ray = emit(lidar, origin, _beam_ray(lidar, radial, azimuth, False))
+                facing = -wp.dot(normal, ray.u)
+                if facing > wp.float64(1.0e-6):
+                    s = wp.dot(normal, ray.x - x) / facing
+                    seen = receive(lidar, normal, ray.x + s * ray.u)
+                    d = seen.ray
+                    inside = wp.abs(d[0] - view[0] / view[2] * d[2]) <= half * d[2]
+                    inside = inside and wp.abs(d[1] - view[1] / view[2] * d[2]) <= half * d[2]
+                    if s > ZERO and inside and seen.share > ZERO:
+                        total += ray.transmission * seen.share * wp.exp(-lidar.extinction * (s + seen.water))
+        scale = lidar.photons * lidar.pde * reflectance / PI * lidar.aperture_area
+        return scale * total / wp.float64(256.0)
+
+    @wp.func
+    def radiometric_signal(
+        lidar: Lidar, sight: Sight, distance: wp.float64, normal: wp.vec3d, reflectance: wp.float64
+    ) -> wp.float64:
+        """Signal detections per pulse by radiometry: eq 7 with K = 4, cos(theta_in) cos^4(psi), the beam's own fluence.
+
+        A surface that fills the pixel has no cos(theta_out), because its footprint grows by the inverse. A beam
+        narrower than the pixel carries cos(theta_out) and not cos(theta_in).
+        """
+        x = point(sight, distance)
+        view = optics_view(sight)
+        light = light_at(lidar, x)
+        if light.path <= ZERO:
+            return ZERO
+        if spot(lidar, light.path) < TWO * footprint(lidar, from_lens(sight, distance)):
+            return small_spot_signal(lidar, x, view, normal, reflectance)
+        fluence = light.fluence
+        if lidar.profile != 1:
+            # A pixel on the rim of the beam is partly illuminated.
+            corners_inside = wp.int32(0)
+            for corner in range(4):
+                y = beside(lidar, sight, x, wp.float64(corner % 2) - HALF, wp.float64(corner / 2) - HALF)
+                if light_at(lidar, y).fluence > ZERO:
+                    corners_inside += 1
+            if corners_inside > 0 and corners_inside < 4:
+                fluence = ZERO
+                for i in range(64):
+                    a = (wp.float64(i % 8) + HALF) / wp.float64(8.0) - HALF
+                    b = (wp.float64(i / 8) + HALF) / wp.float64(8.0) - HALF
+                    fluence += light_at(lidar, beside(lidar, sight, x, a, b)).fluence / wp.float64(64.0)
+        cos_in = wp.max(-wp.dot(normal, light.u), ZERO)
+        cos_psi2 = view[2] * view[2]
+        collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
+        attenuation = wp.exp(-lidar.extinction * (light.water + distance))
+        signal = lidar.photons * lidar.pde * fluence * cos_in * reflectance / PI * collected * attenuation
+        return in_front_of_lens(sight, signal)
+
+    return radiometric_signal
 
 
-@wp.func
-def radiometric_signal(
-    lidar: Lidar, view: wp.vec3d, distance: wp.float64, normal: wp.vec3d, reflectance: wp.float64
-) -> wp.float64:
-    """Signal detections per pulse by radiometry: eq 7 with K = 4, cos(theta_in) cos^4(psi) and the beam's own fluence.
-
-    A surface that fills the pixel has no cos(theta_out), because its footprint grows by the inverse. A beam narrower
-    than the pixel carries cos(theta_out) and not cos(theta_in).
-    """
-    x = distance * view
-    path = beam_path(lidar, x)
-    if path <= ZERO:
-        return ZERO
-    footprint = distance * lidar.pixel_tangent
-    spot = lidar.radius
-    if lidar.profile != 2:
-        spot = path * wp.sqrt(lidar.tan2)
-    if spot < TWO * footprint:
-        return _small_spot_signal(lidar, x, view, normal, reflectance)
-    fluence = beam_fluence(lidar, x)
-    if lidar.profile != 1:
-        # A pixel on the rim of the beam is partly illuminated.
-        corners_inside = wp.int32(0)
-        for corner in range(4):
-            du = (wp.float64(corner % 2) - HALF) * lidar.pixel_tangent * x[2]
-            dv = (wp.float64(corner / 2) - HALF) * lidar.pixel_tangent * x[2]
-            if beam_fluence(lidar, x + wp.vec3d(du, dv, ZERO)) > ZERO:
-                corners_inside += 1
-        if corners_inside > 0 and corners_inside < 4:
-            fluence = ZERO
-            for i in range(64):
-                du = ((wp.float64(i % 8) + HALF) / wp.float64(8.0) - HALF) * lidar.pixel_tangent * x[2]
-                dv = ((wp.float64(i / 8) + HALF) / wp.float64(8.0) - HALF) * lidar.pixel_tangent * x[2]
-                fluence += beam_fluence(lidar, x + wp.vec3d(du, dv, ZERO)) / wp.float64(64.0)
-    cos_in = wp.max(-wp.dot(normal, beam_direction(lidar, x)), ZERO)
-    cos_psi2 = view[2] * view[2]
-    collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
-    attenuation = wp.exp(-lidar.extinction * (path + distance))
-    return lidar.photons * lidar.pde * fluence * cos_in * reflectance / PI * collected * attenuation
+radiometric_signal = make_radiometric_signal(IN_WATER)
+"""That of a camera and a laser in the water, `sight` being the unit line of sight."""
 
 
-@wp.kernel
-def _signal(
-    first: int,
-    lidar: Lidar,
-    view: wp.array(dtype=wp.vec3d),
-    distance: wp.array(dtype=wp.float64),
-    normal: wp.array(dtype=wp.vec3d),
-    reflectance: wp.array(dtype=wp.float64),
-    # Out:
-    signal: wp.array(dtype=wp.float64),
-    arrival: wp.array(dtype=wp.float64),
-):
-    """Launch grid: pixels."""
-    i = first + wp.tid()
-    r = distance[i]
-    gamma = reflectance[i]
-    value = wp.float64(0.0)
-    time = wp.float64(wp.nan)
-    if r > ZERO:
-        time = (beam_path(lidar, r * view[i]) + r) / lidar.speed
-        if lidar.lu2024 == 1:
-            value = lu2024_signal(lidar, r, gamma)
-        else:
-            value = radiometric_signal(lidar, view[i], r, normal[i], gamma)
-        if not (value > ZERO):
-            value = ZERO
-    signal[i] = value
-    arrival[i] = time
+@functools.cache
+def _make_kernel(optics: Optics) -> wp.Kernel:
+    see, point, light_at, whole_path = optics.see, optics.point, optics.light, optics.whole_path
+    radiometric = make_radiometric_signal(optics)
+
+    @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+    def signal_kernel(
+        first: int,
+        lidar: Lidar,
+        view: wp.array(dtype=wp.vec3d),
+        distance: wp.array(dtype=wp.float64),
+        normal: wp.array(dtype=wp.vec3d),
+        reflectance: wp.array(dtype=wp.float64),
+        # Out:
+        signal: wp.array(dtype=wp.float64),
+        arrival: wp.array(dtype=wp.float64),
+    ):
+        """Launch grid: pixels."""
+        i = first + wp.tid()
+        r = distance[i]
+        gamma = reflectance[i]
+        value = wp.float64(0.0)
+        time = wp.float64(wp.nan)
+        if r > ZERO:
+            sight = see(lidar.ports, view[i])
+            time = whole_path(sight, light_at(lidar, point(sight, r)).path + r) / lidar.speed
+            if lidar.lu2024 == 1:
+                value = lu2024_signal(lidar, r, gamma)
+            else:
+                value = radiometric(lidar, sight, r, normal[i], gamma)
+            if not (value > ZERO):
+                value = ZERO
+        signal[i] = value
+        arrival[i] = time
+
+    return signal_kernel
 
 
 def signal_map(
-    lidar: Any, view: wp.array, distance: wp.array, normal: wp.array, reflectance: wp.array
+    lidar: Any,
+    view: wp.array,
+    distance: wp.array,
+    normal: wp.array,
+    reflectance: wp.array,
+    *,
+    optics: Optics = IN_WATER,
 ) -> tuple[wp.array, wp.array]:
     """Signal detections per pulse and arrival time of each pixel.
 
     Args:
         lidar: A `Lidar`.
-        view: vec3d `[pixel]`, unit line of sight.
-        distance: float64 `[pixel]` [m]; NaN or 0 where nothing is hit.
+        view: vec3d `[pixel]`, unit line of sight, as the lens sees it.
+        distance: float64 `[pixel]`, length of the way in the water, from the lens or its port to the target [m]; NaN or
+            0 where nothing is hit.
         normal: vec3d `[pixel]`, unit, towards the camera.
         reflectance: float64 `[pixel]`.
+        optics: Of `make_optics`: what camera and laser are behind, with their parameters in `lidar.ports`.
 
     Returns:
         Signal float64 `[pixel]` (0 without a target) and arrival time float64 `[pixel]` [s] (NaN without a target).
@@ -199,7 +227,7 @@ def signal_map(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_lidar(lidar)
+    check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
     check_array("distance", distance, wp.float64, (count,), device)
@@ -207,5 +235,7 @@ def signal_map(
     check_array("reflectance", reflectance, wp.float64, (count,), device)
     signal = wp.empty(count, dtype=wp.float64, device=device)
     arrival = wp.empty(count, dtype=wp.float64, device=device)
-    launch_pixels(_signal, count, [lidar, view, distance, normal, reflectance, signal, arrival], device=device)
+    launch_pixels(
+        _make_kernel(optics), count, [lidar, view, distance, normal, reflectance, signal, arrival], device=device
+    )
     return signal, arrival
