@@ -96,21 +96,16 @@ def pixel_maps(
     arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
     lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
     profile = np.zeros((1, 1), np.float32)
-    if chosen.backscatter == "single_scatter":
-        paths_d, cumulative_d, total_d = kernels.single_scatter_table(
-            lidar, phase_d, view_d, distance_d, lines=lines_d, optics=optics
-        )
-        table = BackscatterTable(paths_d.numpy(), cumulative_d.numpy())
-    elif chosen.backscatter == "monte_carlo":
+    if chosen.backscatter == "monte_carlo":
         if backscatter_profile is None:
             raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
         profile = backscatter_profile
-        total, table = _profile_table(profile, start, stop, scene.medium.pulse_speed)
-        total_d = on_device(np.broadcast_to(total, distances.shape))
+    if chosen.backscatter == "single_scatter":
+        *edges, total_d = kernels.single_scatter_table(lidar, phase_d, *surfaces[:2], lines=lines_d, optics=optics)
+        table = BackscatterTable(*(part.numpy() for part in edges))
     else:
-        total_d = on_device(np.full(distances.shape, chosen.backscatter_rate * (stop - start)))
-        ends = np.array([[start * scene.medium.pulse_speed, stop * scene.medium.pulse_speed]], np.float32)
-        table = BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32))
+        total, table = _given_backscatter(scene, profile, start, stop)
+        total_d = on_device(np.broadcast_to(total, distances.shape))
     ambient = daylight_rate(
         scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
     )
@@ -131,8 +126,7 @@ def pixel_maps(
         optics=optics,
     )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
-    maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy()}
-    maps["daylight"] = ambient
+    maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy(), "daylight": ambient}
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}
     _check_alpha(scene, maps["alpha"])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -198,6 +192,17 @@ def _check_alpha(scene: Scene, alpha: Map) -> None:
             "pulse here, use 'per_frame'",
             source=source_name(scene),
         )
+
+
+def _given_backscatter(
+    scene: Scene, profile: NDArray[np.float32], start: float, stop: float
+) -> tuple[Map, BackscatterTable]:
+    """Detections per pulse in the gate, and their table, of a constant rate or of a profile."""
+    if scene.analytic.backscatter == "monte_carlo":
+        return _profile_table(profile, start, stop, scene.medium.pulse_speed)
+    ends = np.array([[start * scene.medium.pulse_speed, stop * scene.medium.pulse_speed]], np.float32)
+    total = np.array([scene.analytic.backscatter_rate * (stop - start)])
+    return total, BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32))
 
 
 def _profile_table(

@@ -96,7 +96,7 @@ def _draw_frames(
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
 
     coding: Any = FrameCoding()
-    optics, coding.ports = scene_optics(scene)
+    optics, ports = scene_optics(scene)
     coding.laser = wp.vec3(*scene.beam.position)
     coding.nearest, coding.farthest = scene.gate.start * speed, scene.gate.stop * speed
     coding.width, coding.pixels = shape[1], truth.depth.size
@@ -111,6 +111,7 @@ def _draw_frames(
         put(np.where(np.isnan(bound), np.nan, truth.depth.reshape(-1))),
         *map(put, (bound, maps["alpha"], probability, flat, *table, fractions)),
         optics=optics,
+        ports=ports,
     )
     count = len(draw.fractions)
     return StoredFrames(

@@ -104,7 +104,7 @@ class PortGeometry:
                 y, v, _, _ = self.enter(x, math.cos(step) * u + sign * math.sin(step) * axis)
                 ends.append(y + ((middle - y) @ direction / (v @ direction)) * v)
             sides.append((ends[0] - ends[1]) / (2.0 * step))
-        area = float(np.linalg.norm(np.cross(*sides)))
+        area = float(np.linalg.norm(np.cross(sides[0], sides[1])))
         return float(self.transmission(x, u)) / area
 
     def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
@@ -128,7 +128,8 @@ class PortGeometry:
         takes as long [m]. NaN for points behind the port.
         """
         points, origin = np.asarray(points, np.float64), np.asarray(origin, np.float64)
-        u = self._start_flat(points, origin) if self.shape == "flat" else self._start_dome(points, origin)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = self._start_flat(points, origin) if self.shape == "flat" else self._start_dome(points, origin)
         start, v, length, path = self.enter(origin, u)
         water = np.linalg.norm(points - start, axis=-1)
         return u, v, length + water, path + water

@@ -82,9 +82,6 @@ def test_combinations_that_are_refused():
         ported(DOME, laser={"wavelength_nm": 355.0})
     with pytest.raises(ConfigError, match=r"scan.mode = 'confocal' behind a port needs laser.port"):
         ported(WINDOW, scan={"mode": "confocal"})
-    for call in (spadwarp.simulate_analytic, spadwarp.budget, spadwarp.plan):
-        with pytest.raises(ConfigError, match=r"camera\.port does not go with"):
-            call(ported(WINDOW))
 
 
 def test_presets_overrides_and_files_of_scenes():

@@ -237,7 +237,7 @@ def single_scatter_table(
     distance: wp.array,
     *,
     lines: wp.array | None = None,
-    optics: Optics = IN_WATER,
+    optics: Optics | None = None,
 ) -> tuple[wp.array, wp.array, wp.array]:
     """Where and when each pixel's single-scatter backscatter comes from.
 
@@ -255,7 +255,7 @@ def single_scatter_table(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_optics(lidar, optics)
+    optics = check_optics(lidar, optics)
     check_number("lidar.nearest", lidar.nearest, "(0, inf)")
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device

@@ -15,7 +15,7 @@ from spadwarp_kernels.pixels import launch_pixels
 
 from .backscatter import check_phase, make_background_rate, spectral_lines
 from .lidar import Lidar
-from .optics import IN_WATER, Optics, check_optics
+from .optics import Optics, check_optics
 from .outliers import outlier_probability
 
 # Unrolled loops would make the compilation for a GPU take a minute.
@@ -242,7 +242,7 @@ def statistics_maps(
     outliers: bool = True,
     lines: wp.array | None = None,
     ambient: wp.array | None = None,
-    optics: Optics = IN_WATER,
+    optics: Optics | None = None,
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
     """α, Fisher information per photon [1/s²], σ* [s], background per σ, outlier probability: float64 `[pixel]` each.
 
@@ -267,7 +267,7 @@ def statistics_maps(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_optics(lidar, optics)
+    optics = check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
     check_phase(phase, device)

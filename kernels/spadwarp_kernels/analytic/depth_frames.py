@@ -22,7 +22,6 @@ class Sampler:
 
     Attributes:
         laser: Position of the laser [m].
-        ports: What camera and laser are behind, for the optics that say so.
         nearest, farthest: Paths at which the gate opens and closes [m].
         pixels: Number of pixels of a frame.
         first_frame, frames: The range of frames.
@@ -30,7 +29,6 @@ class Sampler:
     """
 
     laser: wp.vec3
-    ports: Ports
     nearest: float
     farthest: float
     pixels: int
@@ -105,6 +103,7 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
         flat_share: wp.array(dtype=float),
         paths: wp.array2d(dtype=float),
         cumulative: wp.array2d(dtype=float),
+        ports: Ports,
         # Out:
         frames: wp.array2d(dtype=float),
         labels: wp.array2d(dtype=wp.bool),
@@ -141,7 +140,7 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
                     path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
                     if kind >= flat_share[pixel]:
                         path = path_at_share(paths, cumulative, pixel, draw)
-                    value = depth_at(sampler.laser, sampler.ports, view[pixel], path)
+                    value = depth_at(sampler.laser, ports, view[pixel], path)
                 frames[frame, pixel] = value
                 labels[frame, pixel] = reports_background
 
@@ -181,7 +180,7 @@ def sample_frames(
     frames: int,
     seed: int,
     out: tuple[wp.array, wp.array] | None = None,
-    optics: Optics = IN_WATER,
+    optics: Optics | None = None,
     ports: Any = None,
 ) -> tuple[wp.array, wp.array]:
     """Depth frames and which of their pixels report background: float32 and bool `[frames, pixel]`.
@@ -199,7 +198,8 @@ def sample_frames(
         first_frame, frames: The range of frames.
         seed: 64-bit.
         out: Arrays to write into.
-        optics, ports: As for `signal_map`, with the parameters in `ports`.
+        optics: Of `make_optics`: what camera and laser are behind; default: both are in the water.
+        ports: `Ports`, their parameters; needed where the optics have any.
 
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
@@ -209,8 +209,7 @@ def sample_frames(
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
     check_pixel_maps(maps, paths, cumulative, pixels, device)
     check_vector("laser", laser)
-    ports = Ports() if ports is None else ports
-    check_ports("ports", ports, optics)
+    optics, ports = check_ports("ports", ports, optics)
     check_gate_paths(gate_paths)
     frames = check_integer("frames", frames, 0)
     first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
@@ -230,13 +229,12 @@ def sample_frames(
         stop = min(start + step, frames)
         sampler = Sampler()
         sampler.laser = wp.vec3(*map(float, laser))
-        sampler.ports = ports
         sampler.nearest, sampler.farthest = gate_paths
         sampler.pixels = pixels
         sampler.first_frame = first_frame + start
         sampler.frames = stop - start
         sampler.seed = wp.uint64(seed)
         pairs = (first_frame + stop + 1) // 2 - (first_frame + start) // 2
-        inputs = [sampler, view, depth, sigma_depth, probability, flat_share, paths, cumulative]
+        inputs = [sampler, view, depth, sigma_depth, probability, flat_share, paths, cumulative, ports]
         launch_pixels(kernel, pairs * pixels, [*inputs, out[0][start:stop], out[1][start:stop]], device=device)
     return out

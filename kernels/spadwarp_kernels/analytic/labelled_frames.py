@@ -24,7 +24,7 @@ from spadwarp_kernels.random.quantiles import count_quantile
 
 from .depth_frames import check_gate_paths, check_pixel_maps, make_depth_of_path, path_at_share
 from .lidar import Ports
-from .optics import IN_WATER, Optics, check_ports
+from .optics import Optics, check_ports
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -35,7 +35,6 @@ class FrameCoding:
 
     Attributes:
         laser: Position of the laser [m].
-        ports: What camera and laser are behind, for the optics that say so.
         nearest, farthest: Paths at which the gate opens and closes [m].
         width, pixels: Of a row, of a frame.
         seed: Of the random numbers.
@@ -46,7 +45,6 @@ class FrameCoding:
     """
 
     laser: wp.vec3
-    ports: Ports
     nearest: float
     farthest: float
     width: int
@@ -76,6 +74,7 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
         paths: wp.array2d(dtype=float),
         cumulative: wp.array2d(dtype=float),
         fraction: wp.array(dtype=float),
+        ports: Ports,
         # Out:
         depth_codes: wp.array2d(dtype=wp.uint16),
         intensity_codes: wp.array2d(dtype=wp.uint8),
@@ -96,8 +95,8 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
                 block = random_block(coding.seed, sample, wp.uint32(pixel), STREAM_FRAMES)
                 radius = wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
                 angle = 6.283185307179586 * u01(block[1])
-                low = depth_at(coding.laser, coding.ports, view[pixel], coding.nearest)
-                high = depth_at(coding.laser, coding.ports, view[pixel], coding.farthest)
+                low = depth_at(coding.laser, ports, view[pixel], coding.nearest)
+                high = depth_at(coding.laser, ports, view[pixel], coding.farthest)
                 # NaN, no estimate, stays NaN.
                 value = depth[pixel] + sigma_depth[pixel] * radius * wp.cos(angle)
                 chance = probability[pixel] * fraction[frame]
@@ -109,7 +108,7 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
                     # Of the pixels that report background, kind / chance is uniform again.
                     if kind >= flat_share[pixel] * chance:
                         path = path_at_share(paths, cumulative, pixel, draw)
-                    value = depth_at(coding.laser, coding.ports, view[pixel], path)
+                    value = depth_at(coding.laser, ports, view[pixel], path)
                 code = int(0)
                 if value == value:
                     # A fit does not leave the gate.
@@ -149,7 +148,8 @@ def draw_frames(
     cumulative: wp.array,
     fraction: wp.array,
     *,
-    optics: Optics = IN_WATER,
+    optics: Optics | None = None,
+    ports: Any = None,
 ) -> Sequence[wp.array]:
     """Frames `coding.first_sample` and on, one for each entry of `fraction`.
 
@@ -164,7 +164,7 @@ def draw_frames(
         flat_share: float32 `[pixel]`, part of these that arrive at any time of the gate alike.
         paths, cumulative: For the others edges in path [m] and distribution, float32 `[1 or pixel, n]`.
         fraction: float32 `[frame]`, in [0, 1].
-        optics: As for `signal_map`, with the parameters in `coding.ports`.
+        optics, ports: As for `sample_frames`.
 
     Returns:
         Depth codes uint16 `[frame, pixel]`, intensity codes uint8 `[frame, pixel]`, labels uint8 `[frame, byte]`: rows
@@ -174,7 +174,7 @@ def draw_frames(
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
     _check_coding(coding)
-    check_ports("coding.ports", coding.ports, optics)
+    optics, ports = check_ports("ports", ports, optics)
     check_array("view", view, wp.vec3, (coding.pixels,))
     maps = {"depth": depth, "sigma_depth": sigma_depth, "alpha": alpha, "probability": probability}
     check_pixel_maps(maps | {"flat_share": flat_share}, paths, cumulative, coding.pixels, view.device)
@@ -185,7 +185,7 @@ def draw_frames(
     depth_codes = wp.empty((frames, coding.pixels), dtype=wp.uint16, device=device)
     intensity_codes = wp.empty((frames, coding.pixels), dtype=wp.uint8, device=device)
     labels = wp.empty((frames, label_count), dtype=wp.uint8, device=device)
-    inputs = [coding, view, depth, sigma_depth, alpha, probability, flat_share, paths, cumulative, fraction]
+    inputs = [coding, view, depth, sigma_depth, alpha, probability, flat_share, paths, cumulative, fraction, ports]
     launch_pixels(
         _make_kernel(optics), frames * label_count, [*inputs, depth_codes, intensity_codes, labels], device=device
     )

@@ -242,21 +242,25 @@ IN_WATER = Optics(
 """A camera and a laser in the water."""
 
 
-def check_ports(name: str, ports: Any, optics: Any) -> None:
-    """Parameters of the ports that the optics are of; raises `ArgumentError`."""
+def check_ports(name: str, ports: Any, optics: Any) -> tuple[Optics, Any]:
+    """Optics, None being those in the water, and parameters of the ports that they are of; raises `ArgumentError`."""
+    optics = IN_WATER if optics is None else optics
     if not isinstance(optics, Optics):
         raise ArgumentError(f"optics = {optics!r} is not of make_optics")
+    ports = Ports() if ports is None else ports
     check_struct(name, ports, Ports)
     for part, kind in zip(("camera", "laser"), optics.kinds, strict=True):
         if kind is not None:
             check_port(f"{name}.{part}", getattr(ports, part), kind)
+    return optics, ports
 
 
-def check_optics(lidar: Any, optics: Any) -> None:
+def check_optics(lidar: Any, optics: Any) -> Optics:
     """A `Lidar` whose numbers are in range, and optics that its laser can have; raises `ArgumentError`."""
     check_lidar(lidar)
-    check_ports("lidar.ports", lidar.ports, optics)
+    optics, _ = check_ports("lidar.ports", lidar.ports, optics)
     if optics is not IN_WATER and lidar.lu2024:
         raise ArgumentError("lidar.lu2024 = 1 is for a camera and a laser in the water, not for optics of ports")
     if lidar.profile == 2 and optics.kinds[1] == DOME_PORT:
         raise ArgumentError("lidar.profile = 2: a collimated beam does not stay one behind a dome")
+    return optics

@@ -208,7 +208,7 @@ def signal_map(
     normal: wp.array,
     reflectance: wp.array,
     *,
-    optics: Optics = IN_WATER,
+    optics: Optics | None = None,
 ) -> tuple[wp.array, wp.array]:
     """Signal detections per pulse and arrival time of each pixel.
 
@@ -219,7 +219,8 @@ def signal_map(
             0 where nothing is hit.
         normal: vec3d `[pixel]`, unit, towards the camera.
         reflectance: float64 `[pixel]`.
-        optics: Of `make_optics`: what camera and laser are behind, with their parameters in `lidar.ports`.
+        optics: Of `make_optics`: what camera and laser are behind, with their parameters in `lidar.ports`; default: both
+            are in the water.
 
     Returns:
         Signal float64 `[pixel]` (0 without a target) and arrival time float64 `[pixel]` [s] (NaN without a target).
@@ -227,7 +228,7 @@ def signal_map(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_optics(lidar, optics)
+    optics = check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
     check_array("distance", distance, wp.float64, (count,), device)
