@@ -230,7 +230,7 @@ def _not_covered(scene: Scene) -> list[str]:
         )
     ported = scene.camera.port is not None or scene.laser.port is not None
     if ported and chosen.form == "lu2024":
-        problems.append("analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometry' does")
+        problems.append("analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometric' does")
     if laser.profile == "collimated" and (port := laser_port(scene)) is not None and port.shape == "dome":
         problems.append(
             "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
