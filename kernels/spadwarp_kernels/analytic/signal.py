@@ -219,8 +219,8 @@ def signal_map(
             0 where nothing is hit.
         normal: vec3d `[pixel]`, unit, towards the camera.
         reflectance: float64 `[pixel]`.
-        optics: Of `make_optics`: what camera and laser are behind, with their parameters in `lidar.ports`; default: both
-            are in the water.
+        optics: Of `make_optics`: what camera and laser are behind, with their parameters in `lidar.ports`; default:
+            both are in the water.
 
     Returns:
         Signal float64 `[pixel]` (0 without a target) and arrival time float64 `[pixel]` [s] (NaN without a target).
