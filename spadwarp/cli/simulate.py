@@ -18,7 +18,9 @@ from spadwarp.cli._progress import progress
 from spadwarp.errors import ConfigError
 
 if TYPE_CHECKING:
-    from spadwarp import Result, Scene
+    from types import ModuleType
+
+    from spadwarp import Ray, Result, Scene
     from spadwarp.run import RunFiles
 
 
@@ -117,8 +119,6 @@ def simulate(
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --engine ray --ray-address auto --out run4/
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
     """
-    from spadwarp import run
-
     earlier = None
     if resume is not None:
         given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
@@ -136,9 +136,10 @@ def simulate(
         photons = None
     if records:
         _check_records(scene, whole=not (first_photon or shard_text))
-    _warn(scene, device)
     shard = opt.read_part(shard_text, "--shard")
     engine = opt.read_engine(engine_name, ray_address, workers)
+    run = _prepared(scene, device, engine)
+    _warn(scene, device)
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     names = _parameters(scene, derivatives, earlier)
     sizes: dict[str, Any] = {"batches": batches, "records": records, "checkpoint": checkpoint > 0}
@@ -146,7 +147,6 @@ def simulate(
     inputs = (scene_path, *scene.files)
     options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
     outputs = _outputs(out, resume=earlier is not None, **options)
-    _load_pictures(scene)
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
@@ -230,10 +230,16 @@ def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt
     return outputs
 
 
-def _load_pictures(scene: Scene) -> None:
-    """Loads what draws the pictures at the end, beside the compilation of kernels."""
+def _prepared(scene: Scene, device: str | None, engine: Ray | None) -> ModuleType:
+    """Begins what takes long when kernels must be compiled: the compiler, and what draws the pictures at the end.
+
+    Returns the room `spadwarp.run`, which is loaded meanwhile.
+    """
+    if engine is None:
+        spadwarp.transport.prepare_kernels(device)
     if scene.output.png or scene.output.pdf:
         threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True).start()
+    return importlib.import_module("spadwarp.run")
 
 
 def _has_errors(result: Result) -> bool:

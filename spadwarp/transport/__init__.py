@@ -1,6 +1,7 @@
 """Photon transport: a scene in, a `Result`, truth maps or photon records out."""
 
 from spadwarp.transport.derivatives import derivative_names, resolve_derivatives
+from spadwarp.transport.loading import prepare_kernels
 from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
 from spadwarp.transport.simulation import Progress, provenance, simulate
 from spadwarp.transport.tally_unit import PHOTON_CAPACITY, photon_capacity, tally_scale
@@ -13,6 +14,7 @@ __all__ = [
     "derivative_names",
     "load_records",
     "photon_capacity",
+    "prepare_kernels",
     "provenance",
     "resolve_derivatives",
     "save_records",

@@ -6,12 +6,10 @@ import queue
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
-import spadwarp_kernels as sk
 from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError
 from spadwarp.limits import check_integer
@@ -19,6 +17,7 @@ from spadwarp.result import COMPONENTS, Tallies, Truth
 from spadwarp.result.photon_ids import Range
 from spadwarp.transport.device_worker import DeviceWorker, device_errors
 from spadwarp.transport.executor import Event
+from spadwarp.transport.loading import load_transport_kernel
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan
 from spadwarp.transport.truth import trace_truth
@@ -67,14 +66,12 @@ class LocalWorkers:
         models = []
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
         choices: dict[str, Any] = {"copies": copies, "scale": plan.scale, "kept": kept, "derivatives": plan.derivatives}
-        with ThreadPoolExecutor(1) as beside:
-            # It may have to be compiled, which takes as long as all that is done meanwhile.
-            loading = beside.submit(_load_transport_kernel, spec, devices)
-            for device in devices:
-                with device_errors(device):
-                    models.append(build_model(plan.scene, device, plan.mesh, **choices))
-            with device_errors(devices[0]):
-                self._truth = trace_truth(plan.scene, models[0])
+        loading = load_transport_kernel(spec, devices)
+        for device in devices:
+            with device_errors(device):
+                models.append(build_model(plan.scene, device, plan.mesh, **choices))
+        with device_errors(devices[0]):
+            self._truth = trace_truth(plan.scene, models[0])
             built = time.perf_counter()
             loading.result()
         settings: dict[str, Any] = {
@@ -156,9 +153,3 @@ class LocalWorkers:
     def metadata(self) -> dict[str, Any]:
         names = list(dict.fromkeys(map(processor_name, self._devices)))
         return {"device": ",".join(device.alias for device in self._devices), "device_name": ", ".join(names)}
-
-
-def _load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> None:
-    for device in devices:
-        with device_errors(device):
-            sk.load_transport_kernel(spec, device)

@@ -1,0 +1,56 @@
+"""Kernels of transport are compiled, or loaded from Warp's cache, in a thread of their own beside the rest of a run."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from spadwarp.device import pick_devices
+
+if TYPE_CHECKING:
+    import warp as wp
+
+__all__ = ["load_transport_kernel", "prepare_kernels"]
+
+
+@functools.cache
+def _thread() -> ThreadPoolExecutor:
+    # One for all runs: in each thread that compiles Warp first prepares its headers, 1.5 s on a CPU.
+    return ThreadPoolExecutor(1, "spadwarp-kernels")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_thread.cache_clear)  # a child has none of its parent's threads
+
+
+def prepare_kernels(device: str | None = None) -> None:
+    """Begins to load a kernel that all runs need, and with it the compiler; returns at once.
+
+    A run that follows has its kernels sooner where they must be compiled. `device`: as for `simulate`. Raises
+    `DeviceError` for one that does not exist.
+    """
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    devices = pick_devices(device)
+
+    def load() -> None:
+        for one in devices:
+            sk.has_overflowed(wp.zeros(1, dtype=wp.int64, device=one))
+
+    _thread().submit(load)  # what fails here fails again in the run
+
+
+def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Future[None]:
+    """Begins to load the kernel of a spec on devices; the future ends when it is there, or raises what went wrong."""
+    import spadwarp_kernels as sk
+
+    def load() -> None:
+        for device in devices:
+            sk.load_transport_kernel(spec, device)
+
+    return _thread().submit(load)
