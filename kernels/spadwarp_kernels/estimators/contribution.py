@@ -150,8 +150,8 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     water_extinction, water_at = water.extinction, water.at
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     # What the flight has passed where its point was drawn is known, unless that was drawn from blocks.
-    has_profile, exact = profile is not None, profile is not None and profile.exact
-    depth_along = profile.depth if profile is not None else water_extinction
+    has_profile, exact = profile is not None, profile is not None and profile.depth is not None
+    depth_along = profile.depth if profile is not None and profile.depth is not None else water_extinction
     apparent_lens = make_apparent_lens(spec)
 
     @wp.func
@@ -167,8 +167,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
         if wp.static(has_profile):
-            mean = depth_along(medium, layers, begin, request.u, width) / width
-            flight = sample_flight(from_lens, request.u, request.interval, mean, medium, xi_choice, xi, layers, begin)
+            flight = sample_flight(from_lens, request.u, request.interval, 0.0, medium, xi_choice, xi, layers, begin)
         else:
             mean = water_extinction(medium, layers, begin, request.u, width, seed)
             flight = sample_flight(from_lens, request.u, request.interval, mean, medium, xi_choice, xi)

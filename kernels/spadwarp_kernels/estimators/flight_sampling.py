@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, Layers, Profile
+from spadwarp_kernels.medium.layers import Layers, Profile
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
 from spadwarp_kernels.phase.phase_function import PhaseGuide
@@ -126,7 +126,7 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
     profile ``(..., layers, begin_point)``, the latter where the interval begins."""
     has_profile = profile is not None
-    depth_along, distance_to, extinction_at = (profile or HOMOGENEOUS)[:3]
+    draw = profile.draw if profile is not None else sample_lens  # any function: it is not called
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
     # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
     turn_of, along_of, slope = (
@@ -172,24 +172,25 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
         angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
 
         s = float(0.0)
+        given = float(-1.0)
         if xi_choice < angular:
             g = begin - xi * span
             s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
-        else:
             if wp.static(has_profile):
-                s = s0 + xi * width
-                if thick:
-                    s = s0 + distance_to(medium, layers, begin_point, u, -wp.log(1.0 - xi * kept))
-            else:
+                given = wp.clamp(s, s0, s1) - s0
+        else:
+            if wp.static(not has_profile):
                 s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
+        if wp.static(has_profile):
+            drawn = draw(medium, layers, begin_point, u, width, given, xi)
+            s = s0 + drawn.s
+            sample.depth = drawn.depth
         s = wp.clamp(s, s0, s1)
 
         along = s - t_c
         r = wp.sqrt(d * d + along * along)
         if wp.static(has_profile):
-            sample.depth = depth_along(medium, layers, begin_point, u, s - s0)
-            exponential = extinction_at(medium, layers, begin_point + (s - s0) * u) * wp.exp(-sample.depth)
-            linear_density = wp.where(thick, exponential / kept, 1.0 / width)
+            linear_density = drawn.density
         else:
             linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
         towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)

@@ -5,46 +5,17 @@ al. 1965) flies through blocks of the largest extinction and rejects collisions,
 al. 2014) estimates what a flight lets through from the mean extinction of the blocks and a few cells on the way.
 """
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.random.philox import u01, u01_open
 from spadwarp_kernels.random.splitmix import splitmix
 
-from .grid import Grid, first_place, grid_block, grid_cell, grid_line, next_place
-from .layers import Layers, Profile, Water
+from .grid import first_place, grid_block, grid_cell, grid_line, next_place
+from .layers import Layers, Profile, ProfileSample, Water
 from .water import Medium
 
-
-@wp.func
-def _edge_of_cells(grid: Grid) -> int:
-    return 1
-
-
-@wp.func
-def _size_in_cells(grid: Grid) -> wp.vec3i:
-    return grid.size
-
-
-@wp.func
-def _edge_of_blocks(grid: Grid) -> int:
-    return grid.block_edge
-
-
-@wp.func
-def _size_in_blocks(grid: Grid) -> wp.vec3i:
-    return grid.block_size
-
-
-@wp.func
-def _cell_extinction(grid: Grid, cell: int) -> float:
-    return grid.extinction[cell]
-
-
-@wp.func
-def _block_mean(grid: Grid, block: int) -> float:
-    return grid.block_mean[block]
+# Pieces of a flight in which `guided` draws its points from the extinction of the block in the middle.
+_PIECES = wp.constant(12)
 
 
 @wp.func
@@ -53,60 +24,117 @@ def _over(depth: float, extinction: float) -> float:
     return wp.where(extinction > 0.0, depth / wp.max(extinction, 1.0e-30), 1.0e30)
 
 
-@functools.cache
-def make_profile(blocks: bool) -> Profile:
-    """Optical depth by the extinction of the cells, or the mean one of their blocks."""
-    edge_of, size_of, extinction_of, index_of = (
-        (_edge_of_blocks, _size_in_blocks, _block_mean, grid_block)
-        if blocks
-        else (_edge_of_cells, _size_in_cells, _cell_extinction, grid_cell)
-    )
+@wp.func
+def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+    """Optical depth of the cells between x and x + length u."""
+    grid = layers.grid
+    line = grid_line(grid, 1, grid.size, x, u, length)
+    if line.begin >= line.end:
+        return medium.extinction * length
+    depth = medium.extinction * (length - (line.end - line.begin))
+    place = first_place(line, grid.size)
+    while place.leave < line.end:
+        depth += grid.extinction[place.cell] * (place.leave - place.t)
+        place = next_place(line, place)
+    return depth + grid.extinction[place.cell] * (line.end - place.t)
 
-    @wp.func
-    def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
-        grid = layers.grid
-        size = size_of(grid)
-        line = grid_line(grid, edge_of(grid), size, x, u, length)
-        if line.begin >= line.end:
-            return medium.extinction * length
-        depth = medium.extinction * (length - (line.end - line.begin))
-        place = first_place(line, size)
-        while place.leave < line.end:
-            depth += extinction_of(grid, place.cell) * (place.leave - place.t)
-            place = next_place(line, place)
-        return depth + extinction_of(grid, place.cell) * (line.end - place.t)
 
-    @wp.func
-    def distance_to(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, depth: float) -> float:
-        grid = layers.grid
-        size = size_of(grid)
-        line = grid_line(grid, edge_of(grid), size, x, u, 1.0e30)
-        before = medium.extinction * line.begin
-        if line.begin >= line.end or depth <= before:
-            return _over(depth, medium.extinction)
-        rest = depth - before
-        place = first_place(line, size)
-        extinction = float(extinction_of(grid, place.cell))
+@wp.func
+def distance_to(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, depth: float) -> float:
+    """Distance [m] from x along u to an optical depth of the cells; 1e30: there is none."""
+    grid = layers.grid
+    line = grid_line(grid, 1, grid.size, x, u, 1.0e30)
+    before = medium.extinction * line.begin
+    if line.begin >= line.end or depth <= before:
+        return _over(depth, medium.extinction)
+    rest = depth - before
+    place = first_place(line, grid.size)
+    extinction = float(grid.extinction[place.cell])
+    leave = wp.min(place.leave, line.end)
+    while extinction * (leave - place.t) < rest and leave < line.end:
+        rest -= extinction * (leave - place.t)
+        place = next_place(line, place)
+        extinction = grid.extinction[place.cell]
         leave = wp.min(place.leave, line.end)
-        while extinction * (leave - place.t) < rest and leave < line.end:
-            rest -= extinction * (leave - place.t)
-            place = next_place(line, place)
-            extinction = extinction_of(grid, place.cell)
-            leave = wp.min(place.leave, line.end)
-        kept = extinction * (leave - place.t)
-        if kept < rest:
-            return line.end + _over(rest - kept, medium.extinction)
-        return wp.min(place.t + _over(rest, extinction), line.end)
+    kept = extinction * (leave - place.t)
+    if kept < rest:
+        return line.end + _over(rest - kept, medium.extinction)
+    return wp.min(place.t + _over(rest, extinction), line.end)
 
-    @wp.func
-    def extinction_at(medium: Medium, layers: Layers, x: wp.vec3) -> float:
-        cell = index_of(layers.grid, x)
-        extinction = float(medium.extinction)
-        if cell >= 0:
-            extinction = extinction_of(layers.grid, cell)
-        return extinction
 
-    return Profile(depth_along, distance_to, extinction_at, exact=not blocks)
+@wp.func
+def draw_by_cells(
+    medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, width: float, given: float, xi: float
+) -> ProfileSample:
+    """A point of [0, width] by the optical depth of the cells; an even one where that is next to none."""
+    sample = ProfileSample()
+    whole = depth_along(medium, layers, x, u, width)
+    thick = whole > 1.0e-4
+    kept = 1.0 - wp.exp(-whole)
+    sample.s = given
+    if given < 0.0:
+        sample.s = xi * width
+        if thick:
+            sample.s = wp.min(distance_to(medium, layers, x, u, -wp.log(1.0 - xi * kept)), width)
+    sample.depth = depth_along(medium, layers, x, u, sample.s)
+    cell = grid_cell(layers.grid, x + sample.s * u)
+    extinction = float(medium.extinction)
+    if cell >= 0:
+        extinction = layers.grid.extinction[cell]
+    sample.density = wp.where(thick, extinction * wp.exp(-sample.depth) / kept, 1.0 / width)
+    return sample
+
+
+@wp.func
+def draw_by_blocks(
+    medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, width: float, given: float, xi: float
+) -> ProfileSample:
+    """A point of [0, width] by the extinction of the blocks in the middle of _PIECES pieces.
+
+    A piece is chosen as it comes, with the chance of its weight among all so far, and a point in it from the
+    exponential of its extinction. That has a floor: wherever there may be water, there is a density.
+    """
+    grid = layers.grid
+    step = width / float(_PIECES)
+    wanted = int(-1)
+    if given >= 0.0:
+        wanted = wp.min(int(given / step), _PIECES - 1)
+    rest = float(xi)
+    passed = float(1.0)
+    total = float(0.0)
+    chosen = int(0)
+    weight = float(0.0)
+    extinction = float(0.0)
+    k = int(0)
+    while k < _PIECES:  # not unrolled: registers are few
+        block = grid_block(grid, x + (float(k) + 0.5) * step * u)
+        c = grid.block_mean[wp.max(block, 0)]
+        c = wp.where(block >= 0, c, medium.extinction) + 0.1 / width
+        left = wp.exp(-c * step)
+        share = passed * wp.min(c * step, 1.0)
+        passed *= left
+        total += share
+        chance = share / wp.max(total, 1.0e-30)
+        take = rest < chance
+        rest = wp.where(take, rest / wp.max(chance, 1.0e-30), (rest - chance) / wp.max(1.0 - chance, 1.0e-30))
+        if wanted >= 0:
+            take = k == wanted
+        if take:
+            chosen = k
+            weight = share
+            extinction = c
+        k += 1
+    sample = ProfileSample()
+    kept = 1.0 - wp.exp(-extinction * step)
+    thick = extinction * step > 1.0e-3
+    within = given - float(chosen) * step
+    if given < 0.0:
+        rest = wp.clamp(rest, 0.0, 1.0)
+        within = wp.min(wp.where(thick, -wp.log(1.0 - rest * kept) / extinction, rest * step), step)
+    sample.s = float(chosen) * step + within
+    density = wp.where(thick, extinction * wp.exp(-extinction * within) / kept, 1.0 / step)
+    sample.density = density * weight / wp.max(total, 1.0e-30)
+    return sample
 
 
 @wp.func
@@ -122,21 +150,16 @@ def grid_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     return water
 
 
-_CELLS = make_profile(False)
-_BLOCKS = make_profile(True)
-_depth_along, _distance_to = _CELLS.depth, _CELLS.distance
-
-
 @wp.func
 def regular_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     """Free flight [m] for uniform xi in (0, 1]: where the optical depth of the cells reaches -ln(xi)."""
-    return _distance_to(medium, layers, x, u, -wp.log(xi))
+    return distance_to(medium, layers, x, u, -wp.log(xi))
 
 
 @wp.func
 def regular_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     """Mean extinction [1/m] between x and x + length u."""
-    return _depth_along(medium, layers, x, u, length) / wp.max(length, 1.0e-30)
+    return depth_along(medium, layers, x, u, length) / wp.max(length, 1.0e-30)
 
 
 @wp.func
@@ -204,5 +227,5 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 
-REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, _CELLS)
-DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, _BLOCKS)
+REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(draw_by_cells, depth_along))
+DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(draw_by_blocks))

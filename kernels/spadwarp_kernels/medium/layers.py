@@ -151,20 +151,28 @@ def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     return medium
 
 
+@wp.struct
+class ProfileSample:
+    """A point of a line: its distance s [m], the density over s of the draw [1/m], and with an exact profile the
+    optical depth up to it."""
+
+    s: float
+    density: float
+    depth: float
+
+
 class Profile(NamedTuple):
-    """Extinction along a line from which `guided` draws a point of a flight, as Warp functions.
+    """Extinction along a line, from which `guided` draws a point of a flight, as Warp functions.
 
     Attributes:
-        depth: ``(medium, layers, x, u, length) -> float``, optical depth.
-        distance: ``(medium, layers, x, u, depth) -> float``, distance [m] to an optical depth; 1e30: there is none.
-        at: ``(medium, layers, x) -> float``, extinction at a point [1/m].
-        exact: Whether it is the water's own, and not that of blocks of cells.
+        draw: ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width], near to c(s)
+            exp(-depth(s)); or, where that is not negative, the point `given` with the density that it would have.
+        depth: ``(medium, layers, x, u, length) -> float``, the optical depth of the water itself; None: `draw` does not
+            know it either.
     """
 
-    depth: wp.Function
-    distance: wp.Function
-    at: wp.Function
-    exact: bool = True
+    draw: wp.Function
+    depth: wp.Function | None = None
 
 
 class Water(NamedTuple):

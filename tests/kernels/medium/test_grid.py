@@ -7,14 +7,12 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.launch import Floats, Integers, Vectors, launched
 from spadwarp_kernels.medium.grid import grid_cell
-from spadwarp_kernels.medium.grid_tracking import make_profile
 
 COUNT = 4_000
 OUTSIDE = 0.3
 SIZE, CENTRE = np.array([2.0, 1.5, 3.0]), np.array([0.2, -0.1, 1.0])
 AXES = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]).T
 REGULAR, DELTA = sk.REGULAR_TRACKING, sk.DELTA_TRACKING
-BLOCKS = make_profile(True)
 
 
 @wp.kernel(enable_backward=False)
@@ -26,22 +24,18 @@ def fly(
     xi: Floats,
     length: Floats,
     mean: Floats,
-    coarse: Floats,
     ratio: Floats,
     regular: Floats,
     delta: Floats,
-    back: Floats,
     cell: Integers,
 ):
     """Launch: rays."""
     i = wp.tid()
     seed = wp.uint64(12345) * wp.uint64(i + 1) * wp.uint64(0x9E3779B97F4A7C1)
     mean[i] = wp.static(REGULAR.extinction)(medium, layers, x[i], u[i], length[i], seed)
-    coarse[i] = wp.static(BLOCKS.depth)(medium, layers, x[i], u[i], length[i])
     ratio[i] = wp.static(DELTA.extinction)(medium, layers, x[i], u[i], length[i], seed)
     regular[i] = wp.static(REGULAR.free_path)(medium, layers, x[i], u[i], xi[i], seed)
     delta[i] = wp.static(DELTA.free_path)(medium, layers, x[i], u[i], xi[i], seed)
-    back[i] = wp.static(BLOCKS.distance)(medium, layers, x[i], u[i], coarse[i])
     cell[i] = grid_cell(layers.grid, x[i])
 
 
@@ -93,13 +87,13 @@ def optical_depth(extinction, x, u, length):
 
 def flown(device, x, u, xi, length, **choices):
     medium, layers, extinction = water(device, **choices)
-    kinds = (float,) * 6 + (int,)
+    kinds = (float,) * 4 + (int,)
     return launched(fly, [medium, layers, x, u, xi, length], kinds, device), extinction
 
 
 def test_regular_tracking_is_the_sum_over_the_cells(device):
     x, u, xi, length = rays()
-    (mean, _, _, distance, _, _, cell), extinction = flown(device, x, u, xi, length)
+    (mean, _, distance, _, cell), extinction = flown(device, x, u, xi, length)
     wanted = np.array([optical_depth(extinction, *ray) for ray in zip(x, u, length, strict=True)])
     np.testing.assert_allclose(mean * length, wanted, rtol=2e-5, atol=1e-5)
     reached = np.array([optical_depth(extinction, *ray) for ray in zip(x, u, distance, strict=True)])
@@ -111,15 +105,58 @@ def test_regular_tracking_is_the_sum_over_the_cells(device):
     np.testing.assert_array_equal(cell, np.where(inside, index, -1))
 
 
-def test_profile_of_blocks_is_its_own_inverse(device):
-    x, u, xi, length = rays()
-    (_, _, _, _, _, back, _), _ = flown(device, x, u, xi, length)
-    # Through blocks that are empty, the depth says no more than where they begin.
-    flat = np.abs(back - length) > 1e-3 * (1.0 + length)
-    assert flat.mean() < 0.02 and (back[flat] < length[flat]).all()
-    (_, fine, _, _, _, _, _), _ = flown(device, x, u, xi, length, block_edge=1)
-    (mean, *_), _ = flown(device, x, u, xi, length)
-    np.testing.assert_allclose(fine, mean * length, rtol=1e-5, atol=1e-6)
+@wp.kernel(enable_backward=False)
+def draw(
+    medium: sk.Medium,
+    layers: sk.Layers,
+    x: Vectors,
+    u: Vectors,
+    xi: Floats,
+    length: Floats,
+    given: Floats,
+    s: Floats,
+    density: Floats,
+    again: Floats,
+    at_given: Floats,
+    coarse_s: Floats,
+    coarse_density: Floats,
+    coarse_again: Floats,
+    coarse_at_given: Floats,
+):
+    """Points by both profiles and their densities; the densities of points that are given. Launch: rays."""
+    i = wp.tid()
+    drawn = wp.static(REGULAR.profile.draw)(medium, layers, x[i], u[i], length[i], -1.0, xi[i])
+    s[i] = drawn.s
+    density[i] = drawn.density
+    again[i] = wp.static(REGULAR.profile.draw)(medium, layers, x[i], u[i], length[i], drawn.s, xi[i]).density
+    at_given[i] = wp.static(REGULAR.profile.draw)(medium, layers, x[i], u[i], length[i], given[i], xi[i]).density
+    drawn = wp.static(DELTA.profile.draw)(medium, layers, x[i], u[i], length[i], -1.0, xi[i])
+    coarse_s[i] = drawn.s
+    coarse_density[i] = drawn.density
+    coarse_again[i] = wp.static(DELTA.profile.draw)(medium, layers, x[i], u[i], length[i], drawn.s, xi[i]).density
+    coarse_at_given[i] = wp.static(DELTA.profile.draw)(medium, layers, x[i], u[i], length[i], given[i], xi[i]).density
+
+
+def test_points_of_a_flight_have_the_density_that_is_said(device):
+    """Along one line: frequencies against the integral of the density (chi square), which is 1."""
+    count, bins = 40_000, 32
+    medium, layers, _ = water(device)
+    x = np.tile((CENTRE + np.array([-0.2, 0.4, -1.9])).astype(np.float32), (count, 1))
+    u = np.tile(np.float32([0.2, -0.1, 1.0] / np.linalg.norm([0.2, -0.1, 1.0])), (count, 1))
+    length = np.full(count, 3.0, np.float32)
+    xi = np.minimum(np.random.default_rng(9).random(count), 1 - 2.0**-24).astype(np.float32)
+    given = ((np.arange(count) + 0.5) * (3.0 / count)).astype(np.float32)
+    drawn = launched(draw, [medium, layers, x, u, xi, length, given], (float,) * 8, device)
+    for s, density, again, at_given in (drawn[:4], drawn[4:]):
+        assert (s >= 0.0).all() and (s <= 3.0).all()
+        # A point that rounding puts beside a face has the density behind it.
+        assert (np.abs(again / density - 1.0) > 1e-3).mean() < 1e-3
+        expected = at_given.reshape(bins, -1).sum(axis=1) * 3.0
+        assert expected.sum() == pytest.approx(count, rel=1e-3)
+        counted = np.histogram(s, np.linspace(0.0, 3.0, bins + 1))[0]
+        assert counted[expected < 1e-9].sum() == 0
+        chi2 = ((counted - expected) ** 2 / np.maximum(expected, 1.0))[expected > 20].sum()
+        assert chi2 < bins + 4.0 * (2.0 * bins) ** 0.5
 
 
 @pytest.mark.parametrize("block_edge", [2, 4, 13])
@@ -130,7 +167,7 @@ def test_delta_and_ratio_tracking_have_the_expectation_of_the_cells(device, bloc
     u = np.tile(np.float32([0.2, -0.1, 1.0] / np.linalg.norm([0.2, -0.1, 1.0])), (count, 1))
     xi = 1 - np.random.default_rng(9).random(count, dtype=np.float32)
     length = np.full(count, 3.0, np.float32)
-    (mean, _, ratio, _, delta, _, _), extinction = flown(device, x, u, xi, length, block_edge=block_edge)
+    (mean, ratio, _, delta, _), extinction = flown(device, x, u, xi, length, block_edge=block_edge)
     exact = np.exp(-mean[0] * 3.0)
     passed = np.exp(-ratio.astype(float) * length)
     assert abs(passed.mean() - exact) < 4.0 * passed.std() / count**0.5
@@ -149,9 +186,7 @@ def test_flights_in_vacuum_and_beside_the_box_know_no_end(device):
     medium.extinction = 0.0
     x = np.float32([[50.0, 0.0, 0.0], CENTRE - np.array([0.0, 0.0, 50.0])])
     u, xi, length = np.float32([[0, 1, 0], [0, 0, 1]]), np.float32([0.5, 1e-12]), np.float32([1.0, 1.0])
-    mean, _, ratio, regular, delta, _, _ = launched(
-        fly, [medium, layers, x, u, xi, length], (float,) * 6 + (int,), device
-    )
+    mean, ratio, regular, delta, _ = launched(fly, [medium, layers, x, u, xi, length], (float,) * 4 + (int,), device)
     assert mean.tolist() == ratio.tolist() == [0.0, 0.0]
     assert (regular >= 1e30).all() and (delta >= 1e30).all()
 
