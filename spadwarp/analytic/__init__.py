@@ -6,6 +6,7 @@ from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, perm
 from spadwarp.analytic.file import AnalyticFile, save_analytic
 from spadwarp.analytic.labelled import to_xarray
 from spadwarp.analytic.model import pixel_maps
+from spadwarp.analytic.optics import beam_axis_fluence, scene_eye_limit
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budget
 from spadwarp.analytic.pilot import Pilot
 from spadwarp.analytic.result import AnalyticResult, background_photons
@@ -27,6 +28,7 @@ __all__ = [
     "Sweep",
     "axis_fluence",
     "background_photons",
+    "beam_axis_fluence",
     "budget",
     "eye_limit",
     "parse_values",
@@ -35,6 +37,7 @@ __all__ = [
     "pixel_maps",
     "plan",
     "save_analytic",
+    "scene_eye_limit",
     "simulate_analytic",
     "sweep",
     "to_xarray",

@@ -17,6 +17,7 @@ from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Method
 from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene.sight import port_advance
 from spadwarp.units import quantity, range_from_time
 
 __all__ = ["Proposal", "plan"]
@@ -167,8 +168,7 @@ def plan(
         farthest = find_largest_range(exposure.scene, 0.5 * sum(span), question, max(photons // 8, 1), progress)
     index, chosen = scene.medium.group_index, exposure.scene
     fluence = beam_axis_fluence(chosen, span[0]) * math.exp(-optical_depth)
-    # With the laser at the lens, the way through the port takes longer or shorter than the same length of water.
-    behind = float(line.lead[0] - line.delay[0])
+    advance = port_advance(scene)
     return Proposal(
         **vars(exposure),
         depth_error=depth_error,
@@ -176,8 +176,8 @@ def plan(
         method=method,
         target_range=span,
         optical_depth=optical_depth,
-        gate_range=tuple(range_from_time(end, index) + behind for end in (chosen.gate.start, chosen.gate.stop)),
-        unambiguous_range=range_from_time(1.0 / chosen.laser.repetition_rate, index) + behind,
+        gate_range=tuple(range_from_time(end, index) + advance for end in (chosen.gate.start, chosen.gate.stop)),
+        unambiguous_range=range_from_time(1.0 / chosen.laser.repetition_rate, index) + advance,
         largest_rate=gate.largest_rate,
         irradiance=fluence * chosen.laser.pulse_energy * chosen.laser.repetition_rate,
         largest_range=farthest[0],

@@ -88,7 +88,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "target_arrival_ns": survey.target_arrival_ns,
         "optical_depth": survey.optical_depth,
         "gate_range": (survey.range_of(gate.start), survey.range_of(gate.stop)),
-        "bin_range": survey.range_of(gate.bin_width),
+        "bin_range": survey.bin_range,
         "path_limit": scene.path_limit,
         "unambiguous_range": survey.range_of(1.0 / laser.repetition_rate),
         "irf_fwhm_ps": survey.irf_fwhm_ps,

@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic import axis_fluence
+from spadwarp.analytic import beam_axis_fluence
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.beam_profile import profile_extent
 from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
+from spadwarp.scene.sight import port_advance
 from spadwarp.units import range_from_time, time_from_path
 
 __all__ = ["Survey"]
@@ -99,7 +100,12 @@ class Survey:
 
     def range_of(self, time: float) -> float:
         """Range [m] of a round trip of `time` [s], laser at the lens."""
-        return range_from_time(time, self.scene.medium.group_index)
+        return range_from_time(time, self.scene.medium.group_index) + (port_advance(self.scene) if time > 0.0 else 0.0)
+
+    @property
+    def bin_range(self) -> float:
+        """Range that a bin covers [m]."""
+        return range_from_time(self.scene.gate.bin_width, self.scene.medium.group_index)
 
     @property
     def target_arrival_ns(self) -> tuple[float, float] | None:
@@ -175,8 +181,7 @@ class Survey:
         if self.distance is None or self.optical_depth is None:
             return None
         return (
-            axis_fluence(self.scene.laser, self.distance)
-            * (self._transmission(self.laser_port) / self._narrowed(self.laser_port))
+            beam_axis_fluence(self.scene, self.distance)
             * math.exp(-self.optical_depth)
             * self.scene.laser.average_power
         )

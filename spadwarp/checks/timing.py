@@ -31,7 +31,7 @@ def check_timing(survey: Survey) -> Iterator[CheckMessage]:
     if gate.bin_width_ps > survey.irf_fwhm_ps:
         text = (
             f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
-            f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.range_of(gate.bin_width):.3g} m"
+            f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.bin_range:.3g} m"
         )
         yield note("gate.bin_width_ps", text, irf_fwhm_ps=survey.irf_fwhm_ps)
     yield from _check_group_index(survey)

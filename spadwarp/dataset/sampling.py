@@ -20,7 +20,7 @@ from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
 from spadwarp.errors import ConfigError
 from spadwarp.scene import Camera, Scene, Trajectory, load_trajectory
 from spadwarp.scene.renamed import former_path
-from spadwarp.scene.sight import lines_of_sight
+from spadwarp.scene.sight import port_advance
 from spadwarp.units import time_from_range
 
 __all__ = ["Plan", "SceneDraw", "Shard"]
@@ -210,12 +210,10 @@ class Plan:
 
     def _gate(self, draw: _Draw, distance: float, scene: Scene) -> dict[str, Any]:
         window, group_index = self.recipe.gate, scene.medium.group_index
-        axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
-        sooner = float(axis.lead - axis.delay)  # In the air of a port light is faster.
         near = max(distance - draw("gate.before", window.before), _SHORTEST_RANGE)
         far = distance + draw("gate.behind", window.behind)
         return {
-            "start_ns": time_from_range(max(near - sooner, 0.0), group_index) * 1e9,
+            "start_ns": time_from_range(max(near - port_advance(scene), 0.0), group_index) * 1e9,
             "bin_width_ps": time_from_range(far - near, group_index) / window.bins * 1e12,
             "bins": window.bins,
         }

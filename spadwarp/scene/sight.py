@@ -15,7 +15,7 @@ from spadwarp.units import path_from_time
 if TYPE_CHECKING:
     from spadwarp.scene import Camera, Scene
 
-__all__ = ["LinesOfSight", "depth_from_time", "depth_per_time", "lines_of_camera", "lines_of_sight"]
+__all__ = ["LinesOfSight", "depth_from_time", "depth_per_time", "lines_of_camera", "lines_of_sight", "port_advance"]
 
 Floats = NDArray[np.float64]
 
@@ -135,6 +135,13 @@ def lines_of_camera(camera: Camera) -> LinesOfSight:
     view = pixel_directions(camera)
     nothing = np.zeros(view.shape[:-1])
     return LinesOfSight(np.zeros(view.shape), view, nothing, nothing, np.zeros(3))
+
+
+def port_advance(scene: Scene) -> float:
+    """By how much farther light gets along the optical axis through the camera's port than through water in the same
+    time [m]; 0 without a port."""
+    axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
+    return float(axis.lead - axis.delay)
 
 
 def depth_from_time(time: Floats, *, scene: Scene) -> Floats:

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 import spadwarp
-from spadwarp.analytic import pixel_maps
-from spadwarp.analytic.optics import as_if_bare, scene_eye_limit
+from spadwarp.analytic import pixel_maps, scene_eye_limit
+from spadwarp.analytic.optics import as_if_bare
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.scene import Scene, daylight_rate
 from spadwarp.scene.geometry import pixel_directions
