@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,17 +43,26 @@ class Run:
     device: str | None = None
     tables: Path | None = None
 
-    def records(self, tables: Mapping[str, Any], *, key: str | None = None) -> Iterator[Any]:
+    def records(
+        self, tables: Mapping[str, Any], *, key: str | None = None, derivatives: Sequence[str] = ()
+    ) -> Iterator[Any]:
         """`PhotonRecords` of blocks of photons; random numbers differ from scene to scene, or from `key` to `key`."""
         traced = self._scene(tables)
         for block, start in enumerate(range(0, self.photons, BLOCK)):
             count = min(BLOCK, self.photons - start)
-            yield trace(traced, photons=count, seed=self._seed(key or repr(tables), block), device=self.device)
+            seed = self._seed(key or repr(tables), block)
+            yield trace(traced, photons=count, seed=seed, device=self.device, derivatives=derivatives)
 
-    def means(self, tables: Mapping[str, Any], scores: Callable[[Any], list[NDArray[Any]]]) -> list[Estimate]:
+    def means(
+        self,
+        tables: Mapping[str, Any],
+        scores: Callable[[Any], list[NDArray[Any]]],
+        *,
+        derivatives: Sequence[str] = (),
+    ) -> list[Estimate]:
         """Means over photons of the scores `[N]` each that a function makes of `PhotonRecords`."""
         means = ScoreMeans()
-        for records in self.records(tables):
+        for records in self.records(tables, derivatives=derivatives):
             means.add(np.stack(scores(records), axis=1))
         return means.estimates()
 

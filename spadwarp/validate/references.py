@@ -12,7 +12,19 @@ from typing import NamedTuple
 
 __all__ = ["AFTER_COLLISIONS", "AFTER_PATH", "CUBE60", "CUBE60_ROUNDING", "CUTOFF", "EXIT_COSINES", "EXIT_COSINE_EDGES"]
 __all__ += ["FLUENCE", "FOURNIER_FORAND", "FOURNIER_FORAND_ANGLE", "FOURNIER_FORAND_SINGLE_SCATTER", "LAMBERTIAN"]
-__all__ += ["NEAR_AXIS", "SINGLE_SCATTER", "SLABS", "STACKS", "TIME_RESOLVED", "Fluence", "Pulse", "Slab", "Stack"]
+__all__ += [
+    "NEAR_AXIS",
+    "SINGLE_SCATTER",
+    "SLABS",
+    "SLAB_DERIVATIVES",
+    "STACKS",
+    "TIME_RESOLVED",
+    "Fluence",
+    "Pulse",
+    "Slab",
+    "SlabDerivatives",
+    "Stack",
+]
 
 
 class Slab(NamedTuple):
@@ -41,6 +53,35 @@ SLABS = (
     Slab(0.924, 0.97, 7.5, 0.10822358, 0.61149022),
     Slab(0.0, 0.8, math.inf, 0.28525450, 0.0),
     Slab(0.924, 0.95, math.inf, 0.10773397, 0.0),
+)
+
+
+class SlabDerivatives(NamedTuple):
+    """Derivatives of what leaves a slab with an extinction of 1 1/m, normal incidence: by absorption [m], scattering
+    [m] and anisotropy."""
+
+    anisotropy: float
+    albedo: float
+    optical_depth: float
+    reflected: tuple[float, float, float]
+    transmitted: tuple[float, float, float]
+
+    @property
+    def text(self) -> str:
+        return f"g {self.anisotropy:g}, ω {self.albedo:g}, τ {self.optical_depth:g}"
+
+
+# Adding–doubling, differentiated numerically.
+SLAB_DERIVATIVES = (
+    SlabDerivatives(0.0, 0.9, 0.5, (-0.15272215, 0.15742895, -0.18840523), (-0.46695804, -0.17009768, 0.18806004)),
+    SlabDerivatives(0.0, 0.9, 2.0, (-0.95368366, 0.22686175, -0.24997523), (-1.17738796, -0.26992162, 0.23115400)),
+    SlabDerivatives(0.0, 0.9, 8.0, (-1.63715047, 0.18287816, -0.21256956), (-0.29527945, -0.04178317, 0.03199551)),
+    SlabDerivatives(0.5, 0.9, 0.5, (-0.07898399, 0.08149315, -0.18624387), (-0.50015071, -0.09201544, 0.20497228)),
+    SlabDerivatives(0.5, 0.9, 2.0, (-0.66549053, 0.19152481, -0.39040836), (-1.48073237, -0.24998057, 0.46368231)),
+    SlabDerivatives(0.5, 0.9, 8.0, (-1.57833685, 0.18069401, -0.36763430), (-0.79779839, -0.09731067, 0.16375440)),
+    SlabDerivatives(0.924, 0.9, 0.5, (-0.00902234, 0.00829725, -0.10478131), (-0.48347152, -0.01037582, 0.13060156)),
+    SlabDerivatives(0.924, 0.9, 2.0, (-0.08811821, 0.02901992, -0.36240427), (-1.66786320, -0.05107528, 0.62809605)),
+    SlabDerivatives(0.924, 0.9, 8.0, (-0.42092961, 0.05840857, -0.71951477), (-2.86269922, -0.14106234, 1.66293832)),
 )
 
 

@@ -59,6 +59,23 @@ def _slabs(run: Run) -> list[Quantity]:
     return measured
 
 
+def _slab_derivatives(run: Run) -> list[Quantity]:
+    # A table of the phase function has no anisotropy.
+    kinds = ("absorption", "scattering", "anisotropy")[: 2 if run.tables else 3]
+
+    def slopes(records: Any) -> list[NDArray]:
+        return [face * score for face in _both_faces(records) for score in records.scores.T.astype(np.float64)]
+
+    measured = []
+    for slab in references.SLAB_DERIVATIVES:
+        medium = {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
+        tables = scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **_ROULETTE)
+        names = [f"∂{face}/∂{kind}, {slab.text}" for face in "RT" for kind in kinds]
+        expected = [*slab.reflected[: len(kinds)], *slab.transmitted[: len(kinds)]]
+        measured += quantities(names, run.means(tables, slopes, derivatives=kinds), expected)
+    return measured
+
+
 def _stacks(run: Run) -> list[Quantity]:
     measured = []
     for stack in references.STACKS:
@@ -171,6 +188,11 @@ def _cube60(run: Run) -> list[Quantity]:
 
 CASES = (
     Case("slab", "Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows", _slabs),
+    Case(
+        "slab-derivatives",
+        "Derivatives of slabs by absorption, scattering and anisotropy: adding–doubling, differentiated numerically",
+        _slab_derivatives,
+    ),
     Case("layers", "Three layers of different waters, illuminated from either side: adding–doubling", _stacks),
     Case("exit-cosines", "What leaves a slab, by exit cosine: adding–doubling", _exit_cosines),
     Case(

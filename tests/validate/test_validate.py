@@ -11,6 +11,7 @@ from reference import fournier_forand
 from reference.adding_doubling import cumulative_reflectance, exit_cosine_fractions, reflected_by_order, slab, stack
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
+from reference.slab_derivatives import slab_derivatives
 from spadwarp.errors import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
@@ -63,6 +64,14 @@ def test_means_in_blocks_are_those_of_the_whole():
 def test_slab_references(row):
     solved = slab(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
     assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
+
+
+@pytest.mark.physics
+@pytest.mark.slow
+@pytest.mark.parametrize("row", references.SLAB_DERIVATIVES[1::3], ids=lambda row: row.text)
+def test_slab_derivative_references(row):
+    solved = slab_derivatives(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
+    np.testing.assert_allclose([row.reflected, row.transmitted], solved, atol=6e-9)
 
 
 @pytest.mark.physics
