@@ -22,6 +22,7 @@ _ROOMS = {
     "result": ("Result", "load_result", "merge"),
     "frames": ("Frames", "arrival_time", "crlb", "detect"),
     "analytic": ("budget", "plan", "simulate_analytic", "sweep"),
+    "inverse": ("fit",),
     "dataset": (),
     "denoise": (),
     "files": ("load",),
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from spadwarp.files import load
     from spadwarp.frames import Frames, arrival_time, crlb, detect
     from spadwarp.interop import data_frame
+    from spadwarp.inverse import fit
     from spadwarp.parallel import Ray
     from spadwarp.result import Result, load_result, merge
     from spadwarp.run import export

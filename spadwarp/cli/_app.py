@@ -33,9 +33,9 @@ Value = TypeVar("Value")
 # Commands by stage of work, in the order of the help.
 STAGES = {
     "Begin": ("init", "examples", "schema", "doctor", "devices"),
-    "Plan": ("check", "plan", "budget", "sweep", "water", "particles", "presets", "targets"),
+    "Plan": ("check", "plan", "budget", "crlb", "sweep", "water", "particles", "presets", "targets"),
     "Simulate": ("simulate", "merge", "analytic"),
-    "Counts and depth": ("detect", "depth", "denoise"),
+    "Counts and depth": ("detect", "depth", "fit", "denoise"),
     "Look at results": ("info", "view", "video", "export"),
     "Datasets and training": ("dataset", "train", "evaluate"),
     "Trust and speed": ("validate", "bench"),

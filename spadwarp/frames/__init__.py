@@ -9,6 +9,7 @@ from spadwarp.frames.labelled import to_xarray
 from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.pile_up import coates, first_photon_probabilities
+from spadwarp.frames.receiver import Receiver
 from spadwarp.frames.record import FrameErrors, Recording, record_frames
 from spadwarp.frames.response import (
     InstrumentResponse,
@@ -28,6 +29,7 @@ __all__ = [
     "InstrumentResponse",
     "Method",
     "MonteCarloNoise",
+    "Receiver",
     "Recording",
     "Reduction",
     "TimeTags",

@@ -10,6 +10,7 @@ from spadwarp.run.directory import (
     remove_checkpoint,
     write_run,
 )
+from spadwarp.run.fit import fit_files, write_fit
 from spadwarp.run.formats import FORMATS, export, export_sensor_fusion
 from spadwarp.run.schema import SCHEMAS, json_schema
 from spadwarp.run.sequence import simulate_sequence
@@ -23,10 +24,12 @@ __all__ = [
     "bytes_needed",
     "export",
     "export_sensor_fusion",
+    "fit_files",
     "json_schema",
     "load_resumable",
     "remove_checkpoint",
     "simulate_sequence",
     "write_depth",
+    "write_fit",
     "write_run",
 ]

@@ -3,6 +3,7 @@
 from spadwarp.viz.budget import draw_budget, draw_sweep
 from spadwarp.viz.contact_sheet import draw_dataset
 from spadwarp.viz.depth import draw_denoised, draw_depth
+from spadwarp.viz.fit import draw_fit
 from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.learning_curves import draw_learning_curves
 from spadwarp.viz.notebook import html, plot
@@ -15,6 +16,7 @@ from spadwarp.viz.viewer import view
 
 __all__ = ["describe_targets", "draw_analytic", "draw_budget", "draw_dataset", "draw_denoised", "draw_depth"]
 __all__ += [
+    "draw_fit",
     "draw_learning_curves",
     "draw_mesh",
     "draw_recording",

@@ -16,11 +16,13 @@ from spadwarp.analytic import AnalyticResult, Proposal
 from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, SpadwarpError
 from spadwarp.frames import Frames, FramesFile
+from spadwarp.inverse import Fit
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
 from spadwarp.scene import Scene
 from spadwarp.transport import truth_maps
 from spadwarp.units import with_prefix
+from spadwarp.viz.fit import fit_figure
 from spadwarp.viz.frames import analytic_figure, frame_figure, stored_frame_figure
 from spadwarp.viz.panels import Panels, shown_limits
 from spadwarp.viz.result import KINDS, result_figure
@@ -33,7 +35,7 @@ _HTML_DPI = 100
 
 @paper()
 def plot(
-    shown: Result | Frames | FramesFile | Scene | AnalyticResult,
+    shown: Result | Frames | FramesFile | Scene | AnalyticResult | Fit,
     kind: Literal["depth", "intensity", "histogram", "truth"] | None = None,
     *,
     method: Any = "centroid",
@@ -45,8 +47,8 @@ def plot(
 
     Args:
         shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: one of them, from a
-            file with its depth. An analytic result: its maps and a frame. A scene: true depth and reflectance, by ray
-            casting.
+            file with its depth. An analytic result: its maps and a frame. A fit: counts and residuals. A scene: true depth
+            and reflectance, by ray casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
@@ -65,6 +67,8 @@ def plot(
         raise ArgumentError(f"kind = {kind!r} goes with results only, not with {type(shown).__name__}")
     if isinstance(shown, AnalyticResult):
         return analytic_figure(shown, width)
+    if isinstance(shown, Fit):
+        return fit_figure(shown, width)
     if isinstance(shown, FramesFile):
         return stored_frame_figure(shown, frame, width)
     if isinstance(shown, Frames):

@@ -17,6 +17,7 @@ LEVELS = (
     ("files",),
     ("dataset",),
     ("checks",),
+    ("inverse",),
     ("analytic",),
     ("frames",),
     ("transport",),

@@ -1,0 +1,142 @@
+"""The likelihood's equations for unknowns: score, information and covariance, from two independent halves of photons.
+
+An expected histogram λ and its derivatives are Monte Carlo estimates. A square of one estimate is too large by its
+variance; a product of two independent estimates is right in the mean. So the weights of the score come from one half,
+what they weigh from the other, and both ways are averaged. Whatever the noise of the weights, the score's mean is 0 at
+the truth; what it costs is precision, and the covariance, which is that of the equations that were solved, has it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.device import core_count
+from spadwarp.inverse.rendering import Half
+
+__all__ = ["Equations", "Law", "equations", "planned_pulses"]
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.float32]
+
+_PIXELS = 256  # of a part that a thread works on
+
+
+class Law(NamedTuple):
+    """How a detector counts.
+
+    Attributes:
+        first_photon: One count a pulse at most: in each bin a binomial of the pulses that no earlier bin has counted
+            in. Otherwise counts of all detections, Poisson.
+        dead_share: Dead time over the period between windows, for free-running counts.
+        recorded: Bins that are counted; later ones are there for the dead time alone.
+    """
+
+    first_photon: bool
+    dead_share: float
+    recorded: int
+
+    def mean(self, rates: Rows, trials: Rows) -> Rows:
+        """Expected counts `[pixel, bin]` for λ `[pixel, bin]`; `trials`: pulses that can still count in each bin."""
+        if self.first_photon:
+            return -trials * np.expm1(-rates)
+        ready = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1, keepdims=True))
+        return trials * (rates * ready)[:, : self.recorded]
+
+    def slopes(self, rates: Rows, slopes: Rows, trials: Rows) -> tuple[Rows, Rows]:
+        """Derivatives of the mean, and these over the variance, `[pixel, unknown, bin]`, for those of λ."""
+        recorded = self.recorded
+        if self.first_photon:
+            share = -np.expm1(-rates)
+            over = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
+            return slopes * (trials * (1.0 - share))[:, None], slopes * over[:, None]
+        ready = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1))[:, None, None]
+        lost = self.dead_share * slopes.sum(axis=2, keepdims=True)
+        mean = ready * (slopes - ready * lost * rates[:, None])[..., :recorded]
+        seen = rates[:, None, :recorded] * ready
+        return trials[:, None] * mean, np.divide(mean, seen, out=np.zeros_like(mean), where=seen > 0)
+
+    def variance(self, mean: Rows, trials: Rows) -> Rows:
+        """Variance of the counts."""
+        if not self.first_photon:
+            return mean
+        return mean * (1.0 - np.divide(mean, trials, out=np.zeros_like(mean), where=trials > 0))
+
+
+def planned_pulses(law: Law, rates: Rows, pulses: float) -> Rows:
+    """Mean of the pulses that no earlier bin has counted in, `[pixel, bin]`, where there are no counts to know it."""
+    if not law.first_photon:
+        return np.full((rates.shape[0], law.recorded), pulses, np.float32)
+    before = np.cumsum(rates, axis=1, dtype=np.float64) - rates
+    return (pulses * np.exp(-before)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Sums over the bins of each pixel, float64.
+
+    Attributes:
+        score: Σ w (n − m), `[pixel, unknown]`; 0 without counts.
+        slope: Σ w dm, `[pixel, unknown, unknown]`: minus the derivative of the score by the unknowns (last axis).
+        noise: Σ w w v, its covariance by the counts, `[pixel, unknown, unknown]`.
+        simulation: Σ w m of each batch of photons less their mean, of the two halves: `[half][batch, pixel, unknown]`.
+    """
+
+    score: Floats
+    slope: Floats
+    noise: Floats
+    simulation: list[Floats]
+
+    def times(self, scales: Floats) -> Equations:
+        """The equations for unknowns in other units: each unknown is `scales` `[pixel, unknown]` times the new one."""
+        left, right = scales[:, :, None], scales[:, None, :]
+        return Equations(
+            self.score * scales,
+            self.slope * left * right,
+            self.noise * left * right,
+            [part * scales for part in self.simulation],
+        )
+
+
+def equations(
+    law: Law, halves: list[Half], trials: Rows | None, counts: NDArray[np.integer] | None, *, pulses: float
+) -> Equations:
+    """The equations of counts `[pixel, bin]`, or of a plan of so many `pulses`, from two halves of photons.
+
+    `trials`: pulses that can still count in each bin; None: their mean.
+    """
+    a, b = halves
+    pixels, unknowns = a.rates.shape[0], a.slopes.shape[0]
+    score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
+    noise = np.zeros_like(slope)
+    simulation = [np.zeros((len(half.batches), pixels, unknowns)) for half in halves]
+
+    def part(chosen: slice) -> None:
+        mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
+        left = planned_pulses(law, mean_rates, pulses) if trials is None else trials[chosen]
+        weights, slopes = [], []
+        for half in halves:
+            own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+            most = half.limits[:, None] * half.first[chosen][:, None]
+            slopes.append(law.slopes(half.first[chosen], own, left)[0])
+            weights.append(law.slopes(half.first[chosen], np.clip(own, -most, most), left)[1])
+        for i, other in enumerate(reversed(halves)):
+            slope[chosen] += 0.5 * np.matmul(weights[i], slopes[1 - i].transpose(0, 2, 1))
+            if counts is not None:
+                rest = counts[chosen] - law.mean(other.rates[chosen], left)
+                score[chosen] += 0.5 * np.matmul(weights[i], rest[..., None])[..., 0]
+            for batch, rates in enumerate(other.batches):
+                mean = law.mean(rates[chosen], left)
+                simulation[1 - i][batch, chosen] = np.matmul(weights[i], mean[..., None])[..., 0]
+        both = 0.5 * (weights[0] + weights[1])
+        variance = law.variance(law.mean(mean_rates, left), left)
+        noise[chosen] = np.matmul(both * variance[:, None], both.transpose(0, 2, 1))
+
+    parts = [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
+    with ThreadPoolExecutor(core_count()) as pool:
+        list(pool.map(part, parts))
+    return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation])

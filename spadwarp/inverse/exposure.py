@@ -1,0 +1,108 @@
+"""Counts to fit: frames of spadwarp or measured histograms, on the time axis and in the image of a scene."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ArgumentError
+from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
+from spadwarp.limits import check_integer
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["Exposure", "read_exposure"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exposure:
+    """Counts of a number of pulses.
+
+    Attributes:
+        counts: `[pixel, bin]`, added up over frames; None where there is only a plan of an exposure.
+        pulses: In all.
+        window: Start [s] and bins of the detector's window.
+        tdc_widths: Relative widths of its bins; None: equal.
+        irf: The response that the counts contain; None: that of the scene.
+    """
+
+    counts: NDArray[np.int64] | None
+    pulses: int
+    window: tuple[float, int]
+    tdc_widths: NDArray[np.float64] | None = None
+    irf: InstrumentResponse | None = None
+
+    def left(self) -> NDArray[np.float32]:
+        """Pulses without a count before each bin, `[pixel, bin]`: those that first-photon counting has left there."""
+        assert self.counts is not None
+        before = np.cumsum(self.counts, axis=1)
+        before -= self.counts
+        return np.maximum(self.pulses - before, 0).astype(np.float32)
+
+
+def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **facts: Any) -> Exposure:
+    """Counts of a frames file, of `Frames`, of `Histograms` or an array, for a scene of the same image.
+
+    Args:
+        counts: The path of frames or of measured histograms; `Frames`, `Histograms`; or integers `[H, W, T]` or
+            `[frames, H, W, T]` on the scene's gate.
+        scene: Camera and gate.
+        pulses: Of one frame; by default those that the frames name, else the scene's `detector.pulses_per_frame`.
+        facts: Of a measured file, as `spadwarp.frames.read_histograms` takes them.
+
+    Raises:
+        ArgumentError: Counts that do not fit the scene, or are no counts.
+        FileError: A file that cannot be read.
+    """
+    if isinstance(counts, str | os.PathLike):
+        own = str(counts).lower().endswith((".h5", ".hdf5")) and is_frames_file(counts)
+        counts = FramesFile.load(counts) if own else read_histograms(counts, **facts)
+    gate = scene.gate
+    start, width, irf, widths = gate.start, gate.bin_width, None, None
+    values = counts
+    if isinstance(counts, Frames | FramesFile):
+        start, width, irf = counts.gate_start, counts.bin_width, counts.irf
+        steps = np.diff(counts.edges)
+        widths = None if np.allclose(steps, steps[0], rtol=1e-9) else steps
+        pulses = counts.pulses if pulses is None else pulses
+        if isinstance(counts, Frames) and counts.summed:
+            pulses *= counts.frames
+        values = counts.counts() if isinstance(counts, FramesFile) else counts.counts
+    elif isinstance(counts, Histograms):
+        start, irf, values = counts.gate_start, counts.irf, counts.values
+        width = width if counts.bin_width is None else counts.bin_width
+    pulses = scene.detector.pulses_per_frame if pulses is None else check_integer("pulses", pulses, "[1, 1e15]")
+    cube, frames = _added_up(values, scene)
+    if abs(width / gate.bin_width - 1.0) > 1e-6:
+        raise ArgumentError(
+            f"counts: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
+        )
+    return Exposure(
+        counts=cube,
+        pulses=pulses * frames,
+        window=(start, cube.shape[1]),
+        tdc_widths=widths,
+        irf=irf,
+    )
+
+
+def _added_up(values: Any, scene: Scene) -> tuple[NDArray[np.int64], int]:
+    """Counts `[pixel, bin]` over all frames, and the number of these."""
+    array = np.asarray(values)
+    if array.ndim not in (3, 4) or array.size == 0 or array.dtype.kind not in "biuf":
+        raise ArgumentError(f"counts: {array.dtype} {array.shape}; [H, W, T] or [frames, H, W, T] is needed")
+    image = (scene.camera.height, scene.camera.width)
+    if array.shape[-3:-1] != image:
+        raise ArgumentError(f"counts: an image of {array.shape[-3:-1]}; that of the scene, {image}, is needed")
+    if array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
+        raise ArgumentError("counts: rates, not whole counts; how sure they are is not known")
+    if array.min() < 0:
+        raise ArgumentError(f"counts: {array.min()} is outside [0, inf)")
+    frames = array.shape[0] if array.ndim == 4 else 1
+    total = array.sum(axis=0, dtype=np.int64) if array.ndim == 4 else array.astype(np.int64)
+    return total.reshape(-1, total.shape[-1]), frames

@@ -1,0 +1,237 @@
+"""Expected detections of a scene and their derivatives by its unknowns, from independent groups of photons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.device import pick_device
+from spadwarp.frames import InstrumentResponse, Receiver, detector_response
+from spadwarp.frames.window import Window
+from spadwarp.inverse.derivatives import Light, central_difference, traced
+from spadwarp.inverse.shifting import shifted
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, with_values
+from spadwarp.scene import noise_rate
+from spadwarp.scene.sight import lines_of_sight
+
+if TYPE_CHECKING:
+    from spadwarp.inverse.exposure import Exposure
+    from spadwarp.result import Truth
+    from spadwarp.scene import Scene
+
+__all__ = ["Half", "Renderer", "Values"]
+
+Rows = NDArray[np.float32]
+Values = Mapping[str, Any]
+"""By name a number, or for an unknown of each pixel `[pixel]`; depth as a shift from the scene's [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Half:
+    """What one group of photons says.
+
+    Attributes:
+        rates: λ, expected detections per pulse, float32 `[pixel, bin]`.
+        slopes: dλ/d(unknown), float32 `[unknown, pixel, bin]`, of the first batch of the group.
+        first: λ of that batch.
+        limits: Largest |dλ|/λ that a weight takes, `[unknown]`. A scored derivative is λ times a mean of what its
+            photons scored, and needs none; a difference of two places is noise alone where λ is hardly known.
+        batches: λ of each batch; their mean is `rates`.
+    """
+
+    rates: Rows
+    slopes: Rows
+    first: Rows
+    limits: Rows
+    batches: list[Rows]
+
+
+@dataclass(eq=False)
+class Renderer:
+    """Renders a scene at values of its unknowns; every call takes photons that no other call has taken.
+
+    Attributes:
+        scene: With the values that are known.
+        unknowns: In the order of the slopes.
+        exposure: Time axis and response of the counts.
+        device: As in `simulate`.
+        seed: Key of the random numbers.
+        depth_step: Half of the distance between the two places of central differences [m].
+        truth: Truth maps of the scene at the values rendered last.
+        photons: Emitted so far.
+    """
+
+    scene: Scene
+    unknowns: tuple[Unknown, ...]
+    exposure: Exposure
+    device: str | None = None
+    seed: int = 0
+    depth_step: float = 0.0
+    truth: Truth | None = None
+    photons: int = 0
+    _kept: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.depth_step == 0.0:
+            # Half the response, where the slopes are steep and the histogram is still nearly straight between the two.
+            response = detector_response(self.scene.detector, self.scene.laser)
+            sigma = response.fwhm / 2.355 if response.is_smooth else 0.0
+            self.depth_step = 0.25 * self.scene.medium.pulse_speed * max(sigma, 0.5 * self.scene.gate.bin_width)
+
+    @property
+    def window(self) -> Window:
+        """The detector's bins in time."""
+        scene = self.scene
+        return self._receiver(scene, {}).window
+
+    @property
+    def apart(self) -> bool:
+        """Whether light of the targets is held apart, because each pixel places it."""
+        return any(one.per_pixel and one.name != BACKGROUND for one in self.unknowns)
+
+    def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
+        """Groups of `photons` · `batches` photons each, which are independent of each other."""
+        shared = {name: float(np.mean(value)) for name, value in values.items()}
+        scene = self._with_focus(with_values(self.scene, shared))
+        groups = []
+        for _ in range(halves):
+            light, slopes = self._traced(scene, photons)
+            receiver = self._receiver(scene, values)
+            place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
+            first = _rates(receiver, light, place)
+            group = [first]
+            for _ in range(batches - 1):
+                group.append(_rates(receiver, self._light(scene, photons), place))
+            rates = first if batches == 1 else np.mean(group, axis=0, dtype=np.float32)
+            groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
+        return groups
+
+    @property
+    def _limits(self) -> Rows:
+        return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
+
+    def _run(self, photons: int) -> dict[str, Any]:
+        """Arguments of `simulate` for photons that were not traced before."""
+        first, self.photons = self.photons, self.photons + photons
+        return {"photons": photons, "first_photon": first, "seed": self.seed, "device": self.device}
+
+    def _light(self, scene: Scene, photons: int) -> Light:
+        run = self._run(photons)
+        result, light, _ = traced(scene, (), apart=self.apart, kept=self._kept.setdefault("scene", {}), **run)
+        self.truth = result.truth
+        return light
+
+    def _traced(self, scene: Scene, photons: int) -> tuple[Light, dict[str, Light]]:
+        run, names = self._run(photons), [one.name for one in self.unknowns if one.is_light]
+        kept = self._kept.setdefault("scene", {})
+        result, light, slopes = traced(scene, names, apart=self.apart, kept=kept, **run)
+        self.truth = result.truth
+        if any(one.name == DEPTH for one in self.unknowns):
+            slopes[DEPTH] = central_difference(scene, self.depth_step, kept=self._kept, apart=self.apart, **run)
+        return light, slopes
+
+    def _with_focus(self, scene: Scene) -> Scene:
+        """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved."""
+        from spadwarp.mesh import build_mesh, focus_distance
+
+        if "focus" not in self._kept:
+            self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
+        focus = self._kept["focus"]
+        if focus is None or scene.camera.focus_distance != "target":
+            return scene
+        return scene.model_copy(update={"camera": scene.camera.model_copy(update={"focus_distance": focus})})
+
+    def _receiver(self, scene: Scene, values: Values) -> Receiver:
+        gate, camera = scene.gate, scene.camera
+        ambient = None
+        if scene.daylight is not None and self.truth is not None:
+            ambient = noise_rate(scene, self.truth)[..., 0] - scene.detector.noise_rate
+        background = values.get(BACKGROUND)
+        if np.ndim(background):
+            own = np.reshape(background, (camera.height, camera.width)) - scene.detector.ambient_rate
+            ambient = own if ambient is None else ambient + own
+        response: InstrumentResponse | None = self.exposure.irf
+        return Receiver.of(
+            scene.detector,
+            scene.laser,
+            shape=(camera.height, camera.width, gate.bins),
+            axis=(gate.start, gate.bin_width),
+            irf=response,
+            window=self.exposure.window,
+            tdc_widths=self.exposure.tdc_widths,
+            ambient=ambient,
+            device=pick_device(self.device),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    """How each pixel changes the light of the targets: a delay in bins and a factor, both `[pixel]`."""
+
+    delay: NDArray[np.float64]
+    factor: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, values: Values, shared: Mapping[str, float], unknowns: Sequence[Unknown], receiver: Receiver
+    ) -> _Placement:
+        pixels = scene.camera.width * scene.camera.height
+        delay, factor = np.zeros(pixels), np.ones(pixels)
+        for one in unknowns:
+            if not one.per_pixel or one.name == BACKGROUND:
+                continue
+            if one.name == DEPTH:
+                per_metre = bins_per_metre(scene).reshape(-1)
+                delay += (np.asarray(values[DEPTH]) - shared[DEPTH]) * per_metre
+            else:
+                factor *= np.asarray(values[one.name]) / shared[one.name]
+        return cls(delay, factor)
+
+    def change(self, receiver: Receiver, light: Light) -> Rows:
+        """What it adds to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
+        assert light.target is not None
+        target = _through(receiver, light.target, with_noise=False)
+        return shifted(target, self.delay) * self.factor.astype(np.float32)[:, None] - target
+
+
+def bins_per_metre(scene: Scene) -> NDArray[np.float64]:
+    """Delay of a return in bins for each metre that its target is deeper, `[H, W]`."""
+    lines, middle = lines_of_sight(scene), 0.5 * scene.medium.pulse_speed * (scene.gate.start + scene.gate.stop) * 0.5
+    step = 1e-3 * middle
+    ends = [lines.path_from_range(lines.range_from_depth(middle + side * step)) for side in (-1.0, 1.0)]
+    return (ends[1] - ends[0]) / (2.0 * step * scene.medium.pulse_speed * scene.gate.bin_width)
+
+
+def _through(receiver: Receiver, rows: Rows, *, with_noise: bool) -> Rows:
+    import warp as wp
+
+    source = wp.array(rows, dtype=wp.float32, device=receiver.noise.device)
+    return (receiver.hazard(source) if with_noise else receiver.slope(source)).numpy()
+
+
+def _rates(receiver: Receiver, light: Light, place: _Placement | None) -> Rows:
+    """λ of light."""
+    rates = _through(receiver, light.total, with_noise=True)
+    return rates if place is None else rates + place.change(receiver, light)
+
+
+def _slopes(
+    receiver: Receiver, slopes: Mapping[str, Light], unknowns: Sequence[Unknown], place: _Placement | None
+) -> Rows:
+    """Derivatives of λ, `[unknown, pixel, bin]`."""
+    widths = np.diff(receiver.window.edges).astype(np.float32)
+    pixels = receiver.image[0] * receiver.image[1]
+    found = np.empty((len(unknowns), pixels, widths.size), np.float32)
+    for row, one in zip(found, unknowns, strict=True):
+        if one.name == BACKGROUND:
+            row[:] = widths
+            continue
+        light = slopes[one.name]
+        row[:] = _through(receiver, light.total, with_noise=False)
+        if place is not None:
+            row += place.change(receiver, light)
+    return found

@@ -1,0 +1,148 @@
+"""What is unknown in a scene: names, one value or one for each pixel, and the scale on which a value is searched."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.limits import shown, suggestion
+from spadwarp.scene.pose import to_world
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["BACKGROUND", "DEPTH", "Unknown", "moved", "read_unknowns", "with_values"]
+
+DEPTH, BACKGROUND = "depth", "detector.ambient_rate"
+_SHORT = {name: f"medium.{name}" for name in ("absorption", "scattering", "anisotropy")} | {"background": BACKGROUND}
+_FIELD = re.compile(r"medium\.(absorption|scattering|anisotropy)|targets\[(\d+)\]\.reflectance")
+_UNITS = {"absorption": "1/m", "scattering": "1/m", DEPTH: "m", "ambient_rate": "1/s"}
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One unknown.
+
+    Attributes:
+        name: "medium.absorption", "medium.scattering", "medium.anisotropy", "targets[k].reflectance",
+            "detector.ambient_rate", or "depth": where the targets are along the optical axis.
+        per_pixel: Whether each pixel has a value of its own.
+    """
+
+    name: str
+    per_pixel: bool = False
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether its logarithm is searched, which keeps it positive."""
+        return self.name not in (DEPTH, "medium.anisotropy")
+
+    @property
+    def is_light(self) -> bool:
+        """Whether its derivative is one of the scored quantities of transport."""
+        return self.name not in (DEPTH, BACKGROUND)
+
+    @property
+    def unit(self) -> str:
+        """SI, "" for a plain number."""
+        return _UNITS.get(self.name.rpartition(".")[2], "")
+
+    def __str__(self) -> str:
+        return f"{self.name}:pixel" if self.per_pixel else self.name
+
+
+def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ...]:
+    """Unknowns from names: "medium.absorption,depth:pixel", or a list of them.
+
+    `absorption`, `scattering`, `anisotropy`, `background` and, with one target, `reflectance` are short for the fields.
+    ":pixel" behind depth, a reflectance or the background gives each pixel its own value.
+
+    Raises:
+        ArgumentError: No name, an unknown one, or one twice.
+        ConfigError: The scene has no such value to start from: its layers, its albedo, its phase function.
+    """
+    words = [word.strip() for word in names.split(",")] if isinstance(names, str) else list(names)
+    found: list[Unknown] = []
+    for word in words:
+        one = _read(scene, word)
+        if one.name in [other.name for other in found]:
+            raise ArgumentError(f"unknown: {one.name} is named twice")
+        found.append(one)
+    if not found:
+        raise ArgumentError("unknown: no name is given")
+    return tuple(found)
+
+
+def _read(scene: Scene, word: Any) -> Unknown:
+    if not isinstance(word, str):
+        raise ArgumentError(f"unknown: {shown(word)} is not a name")
+    name, _, spread = word.partition(":")
+    if spread not in ("", "pixel"):
+        raise ArgumentError(f"unknown: {shown(word)} ends neither with a name nor with ':pixel'")
+    name = _SHORT.get(name, name)
+    if name == "reflectance" and len(scene.targets) == 1:
+        name = "targets[0].reflectance"
+    if name == "ambient_rate":
+        name = BACKGROUND
+    field = _FIELD.fullmatch(name)
+    if field is None and name not in (DEPTH, BACKGROUND):
+        known = [*_SHORT, *_SHORT.values(), "reflectance", "targets[0].reflectance", DEPTH]
+        raise ArgumentError(f"unknown: {shown(name)} is not one of {', '.join(known)}{suggestion(name, known)}")
+    if spread and name.startswith("medium."):
+        raise ArgumentError(f"unknown: {name} is one of the whole water, not of a pixel")
+    _check_scene(scene, name, None if field is None or field[2] is None else int(field[2]))
+    return Unknown(name, bool(spread))
+
+
+def _check_scene(scene: Scene, name: str, target: int | None) -> None:
+    """Raises `ConfigError` for what has no derivative."""
+    if name == DEPTH and not scene.targets:
+        raise ConfigError("unknown: depth, but the scene has no targets")
+    if target is not None:
+        if target >= len(scene.targets):
+            raise ConfigError(f"unknown: {name}, but the scene has {len(scene.targets)} targets")
+        if isinstance(scene.targets[target].reflectance, str):
+            raise ConfigError(f"unknown: {name} is from_file; a number is needed")
+    if name.startswith("medium."):
+        if scene.medium.albedo == "lu2024":
+            raise ConfigError(f"unknown: {name}, but medium.albedo is 'lu2024', random at each collision")
+        if name == "medium.anisotropy" and scene.medium.phase_function != "henyey_greenstein":
+            law = scene.medium.phase_function
+            raise ConfigError(f"unknown: {name} goes with phase_function = 'henyey_greenstein', not {law!r}")
+
+
+def start_value(scene: Scene, unknown: Unknown) -> float:
+    """The scene's own value; depth counts from where the targets are."""
+    if unknown.name == DEPTH:
+        return 0.0
+    section, _, field = unknown.name.rpartition(".")
+    if section.startswith("targets"):
+        return float(scene.targets[int(section[8:-1])].reflectance)
+    return float(getattr(scene.medium if section == "medium" else scene.detector, field))
+
+
+def with_values(scene: Scene, values: Mapping[str, float]) -> Scene:
+    """The scene with other values; `depth` is a shift of all targets along the optical axis [m]."""
+    fields: dict[str, Any] = {name: float(value) for name, value in values.items() if name != DEPTH}
+    if water := {"medium.absorption", "medium.scattering"} & set(fields):
+        for name in {"medium.absorption", "medium.scattering"} - water:
+            fields[name] = getattr(scene.medium, name.rpartition(".")[2])
+    changed = scene.with_overrides(fields) if fields else scene
+    return moved(changed, values[DEPTH]) if values.get(DEPTH) else changed
+
+
+def moved(scene: Scene, shift: float) -> Scene:
+    """The scene with all targets moved along the optical axis [m]."""
+    origin, ahead = to_world(scene.camera, [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    step: NDArray[np.float64] = shift * (ahead - origin)
+    targets = tuple(
+        target.model_copy(update={"translation": tuple(map(float, target.translation + step))})
+        for target in scene.targets
+    )
+    return scene.model_copy(update={"targets": targets})
