@@ -139,7 +139,8 @@ def bounds(
     law = detector_law(scene.detector, render.window)
     values: dict[str, Any] = {one.name: start_value(scene, one) for one in unknowns}
     given = checked_prior(prior or {}, unknowns)
-    scales = np.array([values[one.name] if one.is_positive and values[one.name] > 0 else 1.0 for one in unknowns])
+    in_logarithm = [one.is_positive and values[one.name] > 0 for one in unknowns]
+    scales = np.array([values[one.name] if log else 1.0 for one, log in zip(unknowns, in_logarithm, strict=True)])
     is_own = np.array([one.per_pixel for one in unknowns])
     shared = [one for one in unknowns if not one.per_pixel]
     information = np.array([_known(one, given, values) for one in shared])
@@ -157,7 +158,7 @@ def bounds(
     found, maps, alone_maps = _table(unknowns, values, scales, own, solution, image)
     covariance = _inverse(solution.information)
     names = [one.name for one in shared]
-    warnings = not_identifiable(names, covariance, [one.is_positive for one in shared])
+    warnings = not_identifiable(names, covariance, [values[name] > 0 and name != DEPTH for name in names])
     if solution.simulation_share > SIMULATION:
         share = 100 * solution.simulation_share
         warnings.append(f"the noise of the simulation is {share:.2g} % of that of the counts, above 10 %: more photons")
@@ -179,7 +180,7 @@ def _known(one: Unknown, prior: Mapping[str, tuple[float, float]], values: Mappi
     """Information of a prior on the scale of the covariance."""
     if one.name not in prior:
         return 0.0
-    return (float(values[one.name] if one.is_positive else 1.0) / prior[one.name][1]) ** 2
+    return (float(values[one.name] if one.is_positive and values[one.name] > 0 else 1.0) / prior[one.name][1]) ** 2
 
 
 def _inverse(information: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Histograms and their derivatives by light: scored along the photons' histories, or as differences of moved targets."""
+"""Expected light and its derivatives: scored along the photons' histories, or as differences of moved targets."""
 
 from __future__ import annotations
 

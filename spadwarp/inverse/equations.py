@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,10 +51,10 @@ class Law(NamedTuple):
         """Derivatives of the mean, and these over the variance, `[pixel, unknown, bin]`, for those of λ."""
         recorded = self.recorded
         if self.first_photon:
-            share = -np.expm1(-rates)
+            share: Any = -np.expm1(-rates)
             over = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
-            return slopes * (trials * (1.0 - share))[:, None], slopes * over[:, None]
-        ready = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1))[:, None, None]
+            return slopes * (trials * (np.float32(1.0) - share))[:, None], slopes * over[:, None]
+        ready: Any = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1))[:, None, None]
         lost = self.dead_share * slopes.sum(axis=2, keepdims=True)
         mean = ready * (slopes - ready * lost * rates[:, None])[..., :recorded]
         seen = rates[:, None, :recorded] * ready
@@ -64,7 +64,8 @@ class Law(NamedTuple):
         """Variance of the counts."""
         if not self.first_photon:
             return mean
-        return mean * (1.0 - np.divide(mean, trials, out=np.zeros_like(mean), where=trials > 0))
+        share: Any = np.divide(mean, trials, out=np.zeros_like(mean), where=trials > 0)
+        return mean * (np.float32(1.0) - share)
 
 
 def planned_pulses(law: Law, rates: Rows, pulses: float) -> Rows:

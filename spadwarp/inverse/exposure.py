@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,8 +61,9 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         FileError: A file that cannot be read.
     """
     if isinstance(counts, str | os.PathLike):
-        own = str(counts).lower().endswith((".h5", ".hdf5")) and is_frames_file(counts)
-        counts = FramesFile.load(counts) if own else read_histograms(counts, **facts)
+        path = Path(counts)
+        own = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
+        counts = FramesFile.load(path) if own else read_histograms(path, **facts)
     gate = scene.gate
     start, width, irf, widths = gate.start, gate.bin_width, None, None
     values = counts

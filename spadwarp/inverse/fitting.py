@@ -22,6 +22,7 @@ from spadwarp.inverse.start import lidar_start
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, start_value
 from spadwarp.limits import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
+from spadwarp.transport import truth_maps
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector
@@ -188,7 +189,7 @@ class Fitter:
             prior=self.prior,
             exposure=self.exposure,
             expected=self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials),
-            truth=self.render.truth,
+            truth=truth_maps(self.scene, device=self.device),
             edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
             photons=self.render.photons - first,
             seconds=time.perf_counter() - began,
@@ -288,6 +289,7 @@ class Fitter:
 def checked_prior(
     prior: Mapping[str, tuple[float, float]], unknowns: Sequence[Unknown]
 ) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation by name. Raises `ArgumentError`."""
     names = [one.name for one in unknowns if not one.per_pixel]
     found = {}
     for name, pair in prior.items():

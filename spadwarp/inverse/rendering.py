@@ -106,7 +106,7 @@ class Renderer:
             group = [first]
             for _ in range(batches - 1):
                 group.append(_rates(receiver, self._light(scene, photons), place))
-            rates = first if batches == 1 else np.mean(group, axis=0, dtype=np.float32)
+            rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
             groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
         return groups
 
@@ -150,8 +150,8 @@ class Renderer:
         ambient = None
         if scene.daylight is not None and self.truth is not None:
             ambient = noise_rate(scene, self.truth)[..., 0] - scene.detector.noise_rate
-        background = values.get(BACKGROUND)
-        if np.ndim(background):
+        background = np.asarray(values.get(BACKGROUND, 0.0))
+        if background.ndim:
             own = np.reshape(background, (camera.height, camera.width)) - scene.detector.ambient_rate
             ambient = own if ambient is None else ambient + own
         response: InstrumentResponse | None = self.exposure.irf
@@ -209,7 +209,7 @@ def bins_per_metre(scene: Scene) -> NDArray[np.float64]:
 def _through(receiver: Receiver, rows: Rows, *, with_noise: bool) -> Rows:
     import warp as wp
 
-    source = wp.array(rows, dtype=wp.float32, device=receiver.noise.device)
+    source: Any = wp.array(rows, dtype=wp.float32, device=receiver.noise.device)
     return (receiver.hazard(source) if with_noise else receiver.slope(source)).numpy()
 
 

@@ -23,7 +23,7 @@ __all__ = ["estimates_of", "middle_depth"]
 Floats = NDArray[np.float64]
 
 
-def middle_depth(depth: Floats) -> float:
+def middle_depth(depth: NDArray[np.floating]) -> float:
     """Depth in the pixel nearest to the middle of the image that sees a target [m]; 0 without any."""
     rows, columns = np.nonzero(np.isfinite(depth))
     if not rows.size:
@@ -52,12 +52,9 @@ def estimates_of(
     seconds: float,
 ) -> Fit:
     """The fit from its last values and the solution of its equations there."""
-    from spadwarp.transport import truth_maps
-
     image = (scene.camera.height, scene.camera.width)
     fitted = with_values(scene, {name: float(np.nanmean(value)) for name, value in values.items()})
-    given = truth_maps(scene, device="cpu") if DEPTH in values else truth
-    middle = middle_depth(given.depth)
+    middle = middle_depth(truth.depth)
     shared = [one for one in unknowns if not one.per_pixel]
     estimates, maps = {}, {}
     for row, one in enumerate(shared):
@@ -74,13 +71,13 @@ def estimates_of(
         value = np.where(unknown, np.nan, np.asarray(values[one.name], np.float64)).reshape(image)
         maps[one.name] = EstimateMap(
             name=one.name,
-            value=value + given.depth if one.name == DEPTH else value,
+            value=value + truth.depth if one.name == DEPTH else value,
             standard_error=(error * scales[:, position]).reshape(image),
             unit=one.unit,
         )
     depth = None
     if DEPTH in estimates:
-        depth = given.depth + values[DEPTH]
+        depth = truth.depth + values[DEPTH]
     elif DEPTH in maps:
         depth = maps[DEPTH].value
     names = [one.name for one in shared]

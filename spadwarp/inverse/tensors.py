@@ -46,8 +46,8 @@ def render(
         import torch
     except ModuleNotFoundError as error:
         raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
-    scene, seed = as_scene(scene), check_integer("seed", seed, SEED)
-    unknowns = read_unknowns(scene, list(parameters))
+    given, seed = as_scene(scene), check_integer("seed", seed, SEED)
+    unknowns = read_unknowns(given, list(parameters))
     for one, value in zip(unknowns, parameters.values(), strict=True):
         if one.name in (DEPTH, BACKGROUND) or one.per_pixel:
             raise ArgumentError(f"parameters: {one} has no scored derivative")
@@ -59,7 +59,7 @@ def render(
         @staticmethod
         def forward(ctx: Any, *values: torch.Tensor) -> torch.Tensor:
             numbers = {name: float(value) for name, value in zip(names, values, strict=True)}
-            at = with_values(scene, numbers)
+            at = with_values(given, numbers)
             run: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
             result = simulate(at, **run)
             scale = at.laser.photons_per_pulse * at.detections_per_photon
