@@ -38,6 +38,7 @@ def traced(scene: Scene, names: Sequence[str], *, apart: bool, **run: Any) -> tu
     slopes: dict[str, Light] = {}
     if names:
         stored = result.derivative_tallies
+        assert stored is not None
         for name, tallies, unit in zip(stored.names, stored.tallies, stored.units, strict=True):
             slopes[name] = _light(tallies, rate * (unit / result.unit), apart=apart)
     return result, _light(result.tallies, rate, apart=apart), slopes
