@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.inverse.equations import equations, planned_pulses
+from spadwarp.inverse.equations import planned_pulses
 from spadwarp.inverse.estimates import correlations, not_identifiable
 from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.fitting import BATCHES, PHOTONS, SIMULATION, checked_prior, detector_law
 from spadwarp.inverse.rendering import Renderer
-from spadwarp.inverse.solving import Solution, solve
+from spadwarp.inverse.solving import Solution
 from spadwarp.inverse.unknowns import DEPTH, read_unknowns, start_value
+from spadwarp.inverse.weighing import solved
 from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import SceneLike, as_scene
 
@@ -141,20 +142,27 @@ def bounds(
     given = checked_prior(prior or {}, unknowns)
     in_logarithm = [one.is_positive and values[one.name] > 0 for one in unknowns]
     scales = np.array([values[one.name] if log else 1.0 for one, log in zip(unknowns, in_logarithm, strict=True)])
-    is_own = np.array([one.per_pixel for one in unknowns])
     shared = [one for one in unknowns if not one.per_pixel]
     information = np.array([_known(one, given, values) for one in shared])
-    number = max(most // 8, 8000)
+    number, level, image = max(most // 8, 8000), None, (scene.camera.height, scene.camera.width)
     while True:
         halves = render(values, photons=max(number // (2 * BATCHES), 1), batches=BATCHES)
-        own = equations(law, halves, None, None, pulses=pulses)
-        own = own.times(np.broadcast_to(scales, own.score.shape))
-        solution = solve(own, is_own, prior=information)
+        level, own, solution = solved(
+            unknowns,
+            np.broadcast_to(scales, (image[0] * image[1], len(unknowns))),
+            level=level,
+            image=image,
+            prior=(np.zeros_like(information), information),
+            law=law,
+            halves=halves,
+            trials=None,
+            counts=None,
+            pulses=pulses,
+        )
         if solution.simulation_share <= SIMULATION or 2 * number > most:
             break
         number = min(most, int(number * max(2.0, min(solution.simulation_share / (0.8 * SIMULATION), 16.0))))
     mean = law.mean(halves[0].rates, planned_pulses(law, halves[0].rates, pulses))
-    image = (scene.camera.height, scene.camera.width)
     found, maps, alone_maps = _table(unknowns, values, scales, own, solution, image)
     covariance = _inverse(solution.information)
     names = [one.name for one in shared]

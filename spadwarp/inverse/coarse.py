@@ -45,7 +45,7 @@ def in_cells(law: Law, half: Half, trials: NDArray, counts: NDArray, scales: Flo
         own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
         observed[block] = counts[chosen].sum(axis=0)
         mean[block] = law.mean(half.rates[chosen], trials[chosen]).sum(axis=0)
-        slopes[block] = law.slopes(half.rates[chosen], own, trials[chosen])[0].sum(axis=0) * scales[:, None]
+        slopes[block] = law.slopes(half.rates[chosen], own, trials[chosen]).sum(axis=0) * scales[:, None]
     mean += 1e-3  # of a count: a cell that no photon has reached can still have one
     limits = half.limits[:, None] * scales[:, None]
     return Cells(observed, mean, np.clip(slopes / mean[:, None], -limits, limits))

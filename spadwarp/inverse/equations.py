@@ -8,6 +8,7 @@ the truth; what it costs is precision, and the covariance, which is that of the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,10 +19,13 @@ from numpy.typing import NDArray
 from spadwarp.device import core_count
 from spadwarp.inverse.rendering import Half
 
-__all__ = ["Equations", "Law", "equations", "planned_pulses"]
+__all__ = ["Cell", "Equations", "Law", "equations", "planned_pulses"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
+
+Cell = tuple[int, int, int]
+"""Rows, columns and bins."""
 
 _PIXELS = 256  # of a part that a thread works on
 
@@ -47,18 +51,13 @@ class Law(NamedTuple):
         ready = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1, keepdims=True))
         return trials * (rates * ready)[:, : self.recorded]
 
-    def slopes(self, rates: Rows, slopes: Rows, trials: Rows) -> tuple[Rows, Rows]:
-        """Derivatives of the mean, and these over the variance, `[pixel, unknown, bin]`, for those of λ."""
-        recorded = self.recorded
+    def slopes(self, rates: Rows, slopes: Rows, trials: Rows) -> Rows:
+        """Derivatives of the mean by what changes λ by `slopes`, `[pixel, unknown, bin]` both."""
         if self.first_photon:
-            share: Any = -np.expm1(-rates)
-            over = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
-            return slopes * (trials * (np.float32(1.0) - share))[:, None], slopes * over[:, None]
+            return slopes * (trials * np.exp(-rates))[:, None]
         ready: Any = 1.0 / (1.0 + self.dead_share * rates.sum(axis=1))[:, None, None]
         lost = self.dead_share * slopes.sum(axis=2, keepdims=True)
-        mean = ready * (slopes - ready * lost * rates[:, None])[..., :recorded]
-        seen = rates[:, None, :recorded] * ready
-        return trials[:, None] * mean, np.divide(mean, seen, out=np.zeros_like(mean), where=seen > 0)
+        return trials[:, None] * (ready * (slopes - ready * lost * rates[:, None]))[..., : self.recorded]
 
     def variance(self, mean: Rows, trials: Rows) -> Rows:
         """Variance of the counts."""
@@ -104,40 +103,110 @@ class Equations:
 
 
 def equations(
-    law: Law, halves: list[Half], trials: Rows | None, counts: NDArray[np.integer] | None, *, pulses: float
+    law: Law,
+    halves: list[Half],
+    trials: Rows | None,
+    counts: NDArray[np.integer] | None,
+    *,
+    pulses: float,
+    image: tuple[int, int],
+    cells: Sequence[Cell] | None = None,
 ) -> Equations:
     """The equations of counts `[pixel, bin]`, or of a plan of so many `pulses`, from two halves of photons.
 
-    `trials`: pulses that can still count in each bin; None: their mean.
+    Args:
+        law, halves: The detector; what the photons say.
+        trials: Pulses that can still count in each bin; None: their mean.
+        counts: None for a plan.
+        pulses: In all.
+        image: (height, width).
+        cells: Of each unknown: rows, columns and bins over which its weights are averaged. Any weights give equations
+            that are right in the mean; noisy ones are less precise.
     """
     a, b = halves
     pixels, unknowns = a.rates.shape[0], a.slopes.shape[0]
     score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
     noise = np.zeros_like(slope)
     simulation = [np.zeros((len(half.batches), pixels, unknowns)) for half in halves]
-
-    def part(chosen: slice) -> None:
-        mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
-        left = planned_pulses(law, mean_rates, pulses) if trials is None else trials[chosen]
-        weights, slopes = [], []
-        for half in halves:
-            own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-            most = half.limits[:, None] * half.first[chosen][:, None]
-            slopes.append(law.slopes(half.first[chosen], own, left)[0])
-            weights.append(law.slopes(half.first[chosen], np.clip(own, -most, most), left)[1])
-        for i, other in enumerate(reversed(halves)):
-            slope[chosen] += 0.5 * np.matmul(weights[i], slopes[1 - i].transpose(0, 2, 1))
-            if counts is not None:
-                rest = counts[chosen] - law.mean(other.rates[chosen], left)
-                score[chosen] += 0.5 * np.matmul(weights[i], rest[..., None])[..., 0]
-            for batch, rates in enumerate(other.batches):
-                mean = law.mean(rates[chosen], left)
-                simulation[1 - i][batch, chosen] = np.matmul(weights[i], mean[..., None])[..., 0]
-        both = 0.5 * (weights[0] + weights[1])
-        variance = law.variance(law.mean(mean_rates, left), left)
-        noise[chosen] = np.matmul(both * variance[:, None], both.transpose(0, 2, 1))
-
+    if trials is None:
+        trials = planned_pulses(law, 0.5 * (a.rates + b.rates), pulses)
+    cells = [(1, 1, 1)] * unknowns if cells is None else cells
     parts = [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
     with ThreadPoolExecutor(core_count()) as pool:
+        slopes = [_mean_slopes(law, half, trials, parts, pool) for half in halves]
+        weights = [_weights(law, *pair, trials, image, cells, pool) for pair in zip(halves, slopes, strict=True)]
+
+        def part(chosen: slice) -> None:
+            left = trials[chosen]
+            for i, other in enumerate(reversed(halves)):
+                weight = weights[i][chosen]
+                slope[chosen] += 0.5 * np.matmul(weight, slopes[1 - i][chosen].transpose(0, 2, 1))
+                if counts is not None:
+                    rest = counts[chosen] - law.mean(other.rates[chosen], left)
+                    score[chosen] += 0.5 * np.matmul(weight, rest[..., None])[..., 0]
+                for batch, rates in enumerate(other.batches):
+                    mean = law.mean(rates[chosen], left)
+                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[..., None])[..., 0]
+            both = 0.5 * (weights[0][chosen] + weights[1][chosen])
+            mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
+            variance = law.variance(law.mean(mean_rates, left), left)
+            noise[chosen] = np.matmul(both * variance[:, None], both.transpose(0, 2, 1))
+
         list(pool.map(part, parts))
     return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation])
+
+
+def _mean_slopes(law: Law, half: Half, trials: Rows, parts: list[slice], pool: ThreadPoolExecutor) -> Rows:
+    """Derivatives of the mean counts, `[pixel, unknown, bin]`."""
+    found = np.empty((len(half.first), len(half.slopes), law.recorded), np.float32)
+
+    def part(chosen: slice) -> None:
+        own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+        found[chosen] = law.slopes(half.first[chosen], own, trials[chosen])
+
+    list(pool.map(part, parts))
+    return found
+
+
+def _weights(
+    law: Law,
+    half: Half,
+    slopes: Rows,
+    trials: Rows,
+    image: tuple[int, int],
+    cells: Sequence[Cell],
+    pool: ThreadPoolExecutor,
+) -> Rows:
+    """Derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
+    mean = law.mean(half.first, trials)
+    variance = law.variance(mean, trials)
+    below = {cell: _in_cells(variance, image, cell) for cell in set(cells)}
+    found = np.empty_like(slopes)
+
+    def unknown(i: int) -> None:
+        cell, limit = cells[i], half.limits[i]
+        under = below[cell]
+        above = _in_cells(slopes[:, i], image, cell)
+        weight = np.divide(above, under, out=np.zeros_like(above), where=under > 0)
+        np.clip(weight, -limit, limit, out=weight)
+        found[:, i] = _expanded(weight, image, cell, slopes.shape[2])
+
+    list(pool.map(unknown, range(len(cells))))
+    return found
+
+
+def _in_cells(rows: Rows, image: tuple[int, int], cell: Cell) -> Rows:
+    """Sums over cells, `[row, column, bin]` of cells."""
+    cube = rows.reshape(*image, -1)
+    for axis in (2, 1, 0):
+        if cell[axis] > 1:
+            cube = np.add.reduceat(cube, np.arange(0, cube.shape[axis], cell[axis]), axis=axis)
+    return cube
+
+
+def _expanded(cube: Rows, image: tuple[int, int], cell: Cell, bins: int) -> Rows:
+    """The value of its cell for each pixel and bin."""
+    for axis, size in enumerate((*image, bins)):
+        if cell[axis] > 1:
+            cube = np.repeat(cube, cell[axis], axis=axis).take(range(size), axis=axis)
+    return cube.reshape(-1, bins)

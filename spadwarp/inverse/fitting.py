@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.inverse.coarse import blocks_of, coarse_step, in_cells
-from spadwarp.inverse.equations import Law, equations
+from spadwarp.inverse.equations import Law
 from spadwarp.inverse.estimates import Fit, Iteration
 from spadwarp.inverse.exposure import Exposure, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.report import estimates_of
-from spadwarp.inverse.solving import Solution, solve
+from spadwarp.inverse.solving import Solution
 from spadwarp.inverse.start import lidar_start
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, start_value
+from spadwarp.inverse.weighing import solved
 from spadwarp.limits import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import truth_maps
@@ -162,7 +163,6 @@ class Fitter:
         self.render = Renderer(self.scene, self.unknowns, exposure, device=device, seed=seed)
         self.prior = checked_prior(prior or {}, self.unknowns)
         self.law = detector_law(self.scene.detector, self.render.window)
-        self._is_own = np.array([one.per_pixel for one in self.unknowns])
         self._image = (self.scene.camera.height, self.scene.camera.width)
 
     # One fit
@@ -247,13 +247,21 @@ class Fitter:
     ) -> tuple[list[Half], Solution, bool]:
         """Fisher scoring with fresh photons, more of them where the simulation is noisy."""
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
-        photons, converged = max(self.photons // 4, 8000), False
+        photons, converged, level = max(self.photons // 4, 8000), False, None
         for number in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
-            own = equations(self.law, halves, trials, self.exposure.counts, pulses=self.exposure.pulses)
-            own = own.times(state.scales(self.unknowns, len(trials)))
-            pull, information = self._prior_at(state, shared)
-            solution = solve(own, self._is_own, prior=information, pull=pull)
+            level, _, solution = solved(
+                self.unknowns,
+                state.scales(self.unknowns, len(trials)),
+                level=level,
+                image=self._image,
+                prior=self._prior_at(state, shared),
+                law=self.law,
+                halves=halves,
+                trials=trials,
+                counts=self.exposure.counts,
+                pulses=self.exposure.pulses,
+            )
             gain = solution.gain
             state.iterations.append(Iteration(values=state.shared(), gain=gain, photons=photons, coarse=False))
             self._step(state, solution)
