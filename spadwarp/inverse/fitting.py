@@ -239,7 +239,7 @@ class Fitter:
             for i, one in zip(shared, step, strict=True):
                 state.move(self.unknowns[i], one)
             report(", ".join(f"{name} {value:.4g}" for name, value in state.shared().items()))
-            if (np.abs(step) < np.maximum(2.0 * error, 0.02 * largest)).all():
+            if (np.abs(step) < np.maximum(2.0 * error, 0.1 * largest)).all():
                 return
 
     def _refine(
