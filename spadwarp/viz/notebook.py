@@ -47,8 +47,8 @@ def plot(
 
     Args:
         shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: one of them, from a
-            file with its depth. An analytic result: its maps and a frame. A fit: counts and residuals. A scene: true depth
-            and reflectance, by ray casting.
+            file with its depth. An analytic result: its maps and a frame. A fit: its counts
+            and residuals. A scene: true depth and reflectance, by ray casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
