@@ -11,6 +11,7 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import (
+    HENYEY_GREENSTEIN,
     HENYEY_GREENSTEIN_GUIDE,
     henyey_greenstein_pdf,
     sample_henyey_greenstein,
@@ -141,6 +142,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
+    one_family = spec.phase.name == HENYEY_GREENSTEIN.name and not has_phase_guide
     lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
     water_at = spec.water.at
     view_of = spec.lens.view
@@ -189,16 +191,28 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         to_view_chance *= part
         choice = u01(s.flight.block[3])
         axis = snapped
-        t = phase_sample(u01_fine(s.flight.block[1]), here)
-        if on_surface:
-            axis = s.hit.normal
-            t = sample_cosine_law(u01(s.flight.block[1]))
+        directs = choice < to_lens_chance + to_view_chance
         if choice < to_lens_chance:
             axis = v
-            t = lobe_sample(u01_fine(s.flight.block[1]), medium, guiding)
-        elif choice < to_lens_chance + to_view_chance:
+        elif directs:
             axis = to_axis
-            t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), guiding.return_anisotropy)
+        elif on_surface:
+            axis = s.hit.normal
+        t = float(0.0)
+        if wp.static(one_family):
+            # One draw for all three: lanes of a warp take them side by side.
+            g = here.anisotropy
+            g = wp.where(directs, guiding.return_anisotropy, g)
+            g = wp.where(choice < to_lens_chance, guiding.anisotropy, g)
+            t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), g)
+        else:
+            t = phase_sample(u01_fine(s.flight.block[1]), here)
+            if choice < to_lens_chance:
+                t = lobe_sample(u01_fine(s.flight.block[1]), medium, guiding)
+            elif directs:
+                t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), guiding.return_anisotropy)
+        if on_surface and not directs:
+            t = sample_cosine_law(u01(s.flight.block[1]))
         new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
         if wp.static(specular):
             if on_surface and choice >= to_lens_chance + to_view_chance:
