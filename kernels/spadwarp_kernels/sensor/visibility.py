@@ -74,14 +74,13 @@ def near_depth_map(mesh: wp.Mesh, camera: Camera) -> wp.array:
 
 
 @wp.func
-def may_be_hidden(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+def may_be_hidden(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
     """Whether something may stand between the point x, x[2] > 0, and the lens; False is certain.
 
-    True for points beside the view, which the lens sees out of focus.
+    True for points beside the view (left, top, right, bottom), which the lens sees out of focus.
     """
     if near_depth.shape[0] == 0:
         return True
-    view = _map_view(camera)
     column = _texel(x[0] / x[2], view[0], view[2])
     row = _texel(x[1] / x[2], view[1], view[3])
     edge = float(_TEXELS)

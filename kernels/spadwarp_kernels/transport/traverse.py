@@ -45,7 +45,7 @@ def make_aim(spec: TransportSpec, scores: bool) -> wp.Function:
 
 
 @wp.func
-def _may_hide_behind_port(camera: Camera, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
     """True: the map is of straight lines to the lens."""
     return True
 
@@ -56,12 +56,13 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     traced here."""
     has_mesh = spec.mesh
     may_hide = may_be_hidden if spec.port is None else _may_hide_behind_port
+    view_of = spec.lens.view
 
     @wp.func
     def look(found: Scored, camera: Camera, surfaces: Surfaces) -> Scored:
         found.seen = True
         if wp.static(has_mesh):
-            if may_hide(camera, surfaces.near_depth, found.origin):
+            if may_hide(view_of(camera, camera.view), surfaces.near_depth, found.origin):
                 to = found.lens - found.origin
                 found.seen = not segment_meets_box(found.origin, to, 1.0, surfaces.lower, surfaces.upper)
                 if wp.static(brute_force):
