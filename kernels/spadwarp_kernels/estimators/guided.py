@@ -167,12 +167,10 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
         here = water_at(medium, layers, s.x)
-        to_lens_chance = guiding.probability
-        met = s.surface_count
-        if on_surface:
-            met += 1
-            # For what the water scatters on the way to the lens: where it is clear there is nothing to gain.
-            to_lens_chance = guiding.surface_probability * wp.min(2.0 * here.extinction * wp.length(s.x), 1.0)
+        # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
+        at_surface = guiding.surface_probability * wp.min(2.0 * here.extinction * wp.length(s.x), 1.0)
+        to_lens_chance = wp.where(on_surface, at_surface, guiding.probability)
+        met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_direction(s.u, medium.axis_threshold)
         v = toward_centre(camera, s.x)
         if wp.static(has_phase_guide):
