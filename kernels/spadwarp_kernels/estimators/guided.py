@@ -4,6 +4,8 @@ After Buras & Mayer 2011 (directions towards the detector), Kulla & Fajardo 2012
 al. 2013 (joint distance-angle sampling).
 """
 
+import functools
+
 import warp as wp
 
 from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
@@ -16,7 +18,7 @@ from spadwarp_kernels.phase.henyey_greenstein import (
     henyey_greenstein_pdf,
     sample_henyey_greenstein,
 )
-from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
@@ -113,6 +115,33 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     return request_flight, make_event_request(spec, flights=True)
 
 
+@functools.cache
+def make_sample_angle(phase: PhaseFunction) -> wp.Function:
+    """The Warp function ``(word, to_lens, directed, here, medium, guiding) -> float``: t = 1 - cos(theta) from the axis
+    of the lobe towards the lens, of other directed light (back into the view), or of what the water scatters."""
+    guide = phase.guide or HENYEY_GREENSTEIN_GUIDE
+    phase_sample, lobe_sample = phase.sample, guide.lobe_sample
+    one_family = phase.name == HENYEY_GREENSTEIN.name and phase.guide is None
+
+    @wp.func
+    def sample_angle(
+        word: wp.uint32, to_lens: bool, directed: bool, here: Medium, medium: Medium, guiding: Guiding
+    ) -> float:
+        xi = u01_fine(word)
+        if wp.static(one_family):
+            # One draw for all: the lanes of a warp take theirs together.
+            g = wp.where(directed, guiding.return_anisotropy, here.anisotropy)
+            return sample_henyey_greenstein(xi, wp.where(to_lens, guiding.anisotropy, g))
+        t = phase_sample(xi, here)
+        if to_lens:
+            t = lobe_sample(xi, medium, guiding)
+        elif directed:
+            t = sample_henyey_greenstein(xi, guiding.return_anisotropy)
+        return t
+
+    return sample_angle
+
+
 @wp.func
 def guided_part(weight: float, analog_weight: float, surfaces_met: int, probability: float) -> float:
     """By which an event multiplies the probability that it guides its direction, in [0, 1].
@@ -139,11 +168,10 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
 
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
-    phase_pdf, phase_sample = spec.phase.pdf, spec.phase.sample
+    phase_pdf = spec.phase.pdf
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
-    one_family = spec.phase.name == HENYEY_GREENSTEIN.name and not has_phase_guide
-    lobe_pdf, lobe_sample = guide.lobe_pdf, guide.lobe_sample
+    lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
     water_at = spec.water.at
     view_of = spec.lens.view
     has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
@@ -188,32 +216,21 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         to_lens_chance *= part
         to_view_chance *= part
         choice = u01(s.flight.block[3])
+        to_lens = choice < to_lens_chance
+        directed = choice < to_lens_chance + to_view_chance
         axis = snapped
-        directs = choice < to_lens_chance + to_view_chance
-        if choice < to_lens_chance:
+        if to_lens:
             axis = v
-        elif directs:
+        elif directed:
             axis = to_axis
         elif on_surface:
             axis = s.hit.normal
-        t = float(0.0)
-        if wp.static(one_family):
-            # One draw for all three: lanes of a warp take them side by side.
-            g = here.anisotropy
-            g = wp.where(directs, guiding.return_anisotropy, g)
-            g = wp.where(choice < to_lens_chance, guiding.anisotropy, g)
-            t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), g)
-        else:
-            t = phase_sample(u01_fine(s.flight.block[1]), here)
-            if choice < to_lens_chance:
-                t = lobe_sample(u01_fine(s.flight.block[1]), medium, guiding)
-            elif directs:
-                t = sample_henyey_greenstein(u01_fine(s.flight.block[1]), guiding.return_anisotropy)
-        if on_surface and not directs:
+        t = sample_angle(s.flight.block[1], to_lens, directed, here, medium, guiding)
+        if on_surface and not directed:
             t = sample_cosine_law(u01(s.flight.block[1]))
         new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
         if wp.static(specular):
-            if on_surface and choice >= to_lens_chance + to_view_chance:
+            if on_surface and not directed:
                 new.u = reflected
         density = phase_pdf(one_minus_cosine(snapped, new.u), here)
         if on_surface:
