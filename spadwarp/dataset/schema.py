@@ -11,6 +11,7 @@ import numpy as np
 from spadwarp.dataset.rendered import PROFILE_BINS, RenderedScene
 from spadwarp.dataset.sampling import Plan
 from spadwarp.scene import phase_function
+from spadwarp.scene.sight import port_advance
 from spadwarp.units import range_from_time
 
 __all__ = [
@@ -130,7 +131,7 @@ def scene_columns(shape: tuple[int, int]) -> dict[str, tuple[tuple[int, ...], An
 def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
     """A scene's values of `scene_columns`."""
     scene, draw = rendered.scene, rendered.draw
-    medium, source = scene.medium, plan.targets[draw.target]
+    medium, source, advance = scene.medium, plan.targets[draw.target], port_advance(scene)
     placed: Any = scene.targets[0] if scene.targets else None
     vectors = {name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")}
     config = scene.to_toml()
@@ -151,8 +152,8 @@ def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
         "attenuation_lengths": draw.attenuation_lengths,
         **{name: getattr(medium, name) for name in ("absorption", "scattering", "extinction", "group_index")},
         "anisotropy": phase_function(medium).mean_cosine,
-        "gate_near": range_from_time(scene.gate.start, medium.group_index),
-        "gate_far": range_from_time(scene.gate.stop, medium.group_index),
+        "gate_near": range_from_time(scene.gate.start, medium.group_index) + advance,
+        "gate_far": range_from_time(scene.gate.stop, medium.group_index) + advance,
         "reflectance": getattr(placed, "reflectance", np.nan),
         "pulses": scene.pulses_per_depth_frame,
         "photons": draw.photons or 0,

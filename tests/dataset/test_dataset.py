@@ -65,7 +65,14 @@ def test_every_dataset_of_a_file_has_the_same_first_dimension(folder):
             assert all(stored.attrs["unit"] and stored.attrs["description"] for stored in file.values())
 
 
-def test_label_noisy_and_clean_depth_agree(folder):
+PORTS = {"scene.camera.port": {"preset": "flat-glass"}, "scene.laser.port": "camera"}
+
+
+@pytest.mark.parametrize("changes", [None, PORTS | {"scene.medium.phase_index": "seawater"}], ids=["water", "port"])
+def test_label_noisy_and_clean_depth_agree(folder, tmp_path, changes):
+    if changes is not None:
+        folder = tmp_path / "data"
+        make(recipe(**changes), folder)
     deviations = []
     for item in iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
         noisy, clean, label, bound = (item[name][0] for name in ("noisy", "clean", "label", "bound"))
