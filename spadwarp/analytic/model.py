@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.analytic.grid import grid_backscatter, passed_by_grid
 from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
@@ -74,6 +75,7 @@ def pixel_maps(
     """
     import warp as wp
 
+    from spadwarp_kernels import BACKSCATTER_SOURCES
     from spadwarp_kernels import analytic as kernels
 
     device = pick_device(device)
@@ -92,6 +94,8 @@ def pixel_maps(
     lines = water_lines(scene)
     surfaces = [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)]
     signal, arrival = _signal(lidar, lines, surfaces, optics)
+    if scene.medium.grid is not None:
+        signal = signal * passed_by_grid(scene, views * distances[:, None])
     signal_d: Any = on_device(signal)
     arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
     lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
@@ -101,8 +105,15 @@ def pixel_maps(
             raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
         profile = backscatter_profile
     if chosen.backscatter == "single_scatter":
-        *edges, total_d = kernels.single_scatter_table(lidar, phase_d, *surfaces[:2], lines=lines_d, optics=optics)
+        scatters = lines_d
+        if scene.medium.grid is not None:  # 1/m, which the cells' own coefficients multiply
+            scatters = on_device([(lidar.photons * line.share, line.extinction, 1.0) for line in lines], wp.vec3d)
+        *edges, total_d = kernels.single_scatter_table(lidar, phase_d, *surfaces[:2], lines=scatters, optics=optics)
         table = BackscatterTable(*(part.numpy() for part in edges))
+        if scene.medium.grid is not None:
+            profile = grid_backscatter(scene, views, *table, total_d.numpy(), (start, stop))
+            total, table = _profile_table(profile, start, stop, scene.medium.pulse_speed)
+            lidar.source, total_d = BACKSCATTER_SOURCES.index("monte_carlo"), on_device(total)
     else:
         total, table = _given_backscatter(scene, profile, start, stop)
         total_d = on_device(np.broadcast_to(total, distances.shape))
@@ -238,8 +249,10 @@ def _not_covered(scene: Scene) -> list[str]:
         )
     if scene.medium.layers:
         problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
-    if scene.medium.grid is not None:
-        problems.append("medium.grid: the analytic simulator takes one water; simulate takes any")
+    if scene.medium.grid is not None and ported:
+        problems.append("analytic: medium.grid does not go with camera.port or laser.port; simulate takes both")
+    if scene.medium.grid is not None and chosen.form == "lu2024":
+        problems.append("analytic.form = 'lu2024' takes one water, and not medium.grid; 'radiometric' takes both")
     if chosen.backscatter == "single_scatter" and laser.profile == "collimated":
         problems.append(
             "analytic.backscatter = 'single_scatter' needs a diverging laser.profile, not 'collimated'; "

@@ -178,7 +178,7 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
                     medium=name,
                     extinction=scene.medium.extinction,
                     range=float(distance),
-                    optical_depth=float((distance - line.lead[0]) * scene.medium.extinction),
+                    optical_depth=_optical_depth(scene, line, float(distance)),
                     gate_start=start,
                     gate_stop=stop,
                     gate_moved=(start, stop) != gate,
@@ -189,6 +189,13 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
                 )
             )
     return rows
+
+
+def _optical_depth(scene: Scene, line: LinesOfSight, distance: float) -> float:
+    """Up to a distance on the axis, one way."""
+    if scene.medium.grid is not None:
+        return scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, distance))
+    return float((distance - line.lead[0]) * scene.medium.extinction)
 
 
 _FROM_MAPS = ("arrival", "signal", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth", "outlier_probability")
