@@ -11,6 +11,7 @@ information is that of α ≪ 1 per acquisition) and instrument responses that a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,6 @@ def pixel_maps(
     """
     import warp as wp
 
-    from spadwarp_kernels import BACKSCATTER_SOURCES
     from spadwarp_kernels import analytic as kernels
 
     device = pick_device(device)
@@ -99,24 +99,8 @@ def pixel_maps(
     signal_d: Any = on_device(signal)
     arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
     lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
-    profile = np.zeros((1, 1), np.float32)
-    if chosen.backscatter == "monte_carlo":
-        if backscatter_profile is None:
-            raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
-        profile = backscatter_profile
-    if chosen.backscatter == "single_scatter":
-        scatters = lines_d
-        if scene.medium.grid is not None:  # 1/m, which the cells' own coefficients multiply
-            scatters = on_device([(lidar.photons * line.share, line.extinction, 1.0) for line in lines], wp.vec3d)
-        *edges, total_d = kernels.single_scatter_table(lidar, phase_d, *surfaces[:2], lines=scatters, optics=optics)
-        table = BackscatterTable(*(part.numpy() for part in edges))
-        if scene.medium.grid is not None:
-            profile = grid_backscatter(scene, views, *table, total_d.numpy(), (start, stop))
-            total, table = _profile_table(profile, start, stop, scene.medium.pulse_speed)
-            lidar.source, total_d = BACKSCATTER_SOURCES.index("monte_carlo"), on_device(total)
-    else:
-        total, table = _given_backscatter(scene, profile, start, stop)
-        total_d = on_device(np.broadcast_to(total, distances.shape))
+    total, table, profile = _backscatter(scene, backscatter_profile, lidar, phase_d, surfaces[:2], on_device, optics)
+    total_d = on_device(np.broadcast_to(total, distances.shape))
     ambient = daylight_rate(
         scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
     )
@@ -205,15 +189,45 @@ def _check_alpha(scene: Scene, alpha: Map) -> None:
         )
 
 
-def _given_backscatter(
-    scene: Scene, profile: NDArray[np.float32], start: float, stop: float
-) -> tuple[Map, BackscatterTable]:
-    """Detections per pulse in the gate, and their table, of a constant rate or of a profile."""
-    if scene.analytic.backscatter == "monte_carlo":
-        return _profile_table(profile, start, stop, scene.medium.pulse_speed)
-    ends = np.array([[start * scene.medium.pulse_speed, stop * scene.medium.pulse_speed]], np.float32)
-    total = np.array([scene.analytic.backscatter_rate * (stop - start)])
-    return total, BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32))
+def _backscatter(
+    scene: Scene,
+    given: NDArray[np.float32] | None,
+    lidar: Any,
+    phase: Any,
+    sights: list[Any],
+    on_device: Callable[..., Any],
+    optics: Any,
+) -> tuple[Map, BackscatterTable, NDArray[np.float32]]:
+    """Detections per pulse in the gate, their table, and their profile if the model takes one."""
+    import warp as wp
+
+    from spadwarp_kernels import BACKSCATTER_SOURCES
+    from spadwarp_kernels import analytic as kernels
+
+    chosen, gate, speed = scene.analytic, (lidar.start, lidar.stop), scene.medium.pulse_speed
+    profile = np.zeros((1, 1), np.float32)
+    if chosen.backscatter == "constant":
+        ends = np.array([[gate[0] * speed, gate[1] * speed]], np.float32)
+        total = np.array([chosen.backscatter_rate * (gate[1] - gate[0])])
+        return total, BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32)), profile
+    if chosen.backscatter == "single_scatter":
+        # Through cells, the table of water that scatters 1/m, times what the cells do.
+        by_cells = scene.medium.grid is not None
+        rows = [
+            (lidar.photons * line.share, line.extinction, 1.0 if by_cells else line.scattering)
+            for line in water_lines(scene)
+        ]
+        found = kernels.single_scatter_table(lidar, phase, *sights, lines=on_device(rows, wp.vec3d), optics=optics)
+        paths, cumulative, total = (part.numpy() for part in found)
+        if not by_cells:
+            return total, BackscatterTable(paths, cumulative), profile
+        profile = grid_backscatter(scene, sights[0].numpy(), paths, cumulative, total, gate)
+        lidar.source = BACKSCATTER_SOURCES.index("monte_carlo")
+    elif given is None:
+        raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
+    else:
+        profile = given
+    return *_profile_table(profile, *gate, speed), profile
 
 
 def _profile_table(
