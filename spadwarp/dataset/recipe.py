@@ -7,33 +7,41 @@ uniform in the logarithm).
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import (
-    AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
     model_validator,
 )
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.dataset.distributions import (
+    Angle,
+    Distribution,
+    Names,
+    NotNegative,
+    Positive,
+    PulseCount,
+    Real,
+    Share,
+    Table,
+    constant,
+    distribution,
+)
+from spadwarp.dataset.plumes import Plume
+from spadwarp.errors import ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
-from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
 from spadwarp.scene.renamed import current_fields, current_path
-from spadwarp.scene.sections import Whole, listed
+from spadwarp.scene.sections import Whole
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 
@@ -41,108 +49,8 @@ _MOST_TRIED = 1000  # values of a field that varies
 
 SPLITS = ("train", "validation", "test")
 
-Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
 
-
-class _Table(BaseModel):
-    """One table of a recipe: frozen, strict about types, unknown keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Fields as TOML has them, without those that are None: `Recipe.from_dict` makes an equal recipe of them."""
-        return {name: _plain(value) for name, value in self if value is not None}
-
-
-class Distribution(_Table):
-    """One of `choices`, equally likely, or uniform between `low` and `high`."""
-
-    choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
-    low: float | None = Field(None, ge=-1e19, le=1e19, description="lowest value")
-    high: float | None = Field(None, ge=-1e19, le=1e19, description="highest value")
-    log: bool = Field(False, description="whether uniform in the logarithm")
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if bool(self.choices) == (self.low is not None and self.high is not None):
-            raise ValueError("needs a number, a list of choices, or low and high")
-        if self.low is not None and self.high is not None:
-            if not self.low <= self.high:
-                raise ValueError(f"low = {self.low} is outside (-inf, {self.high}], {self.high} being high")
-            if self.log and not self.low > 0:
-                raise ValueError(f"low = {self.low} is outside (0, inf), the range of a logarithm")
-            if not math.isfinite(self.high / self.low if self.log else self.high - self.low):
-                raise ValueError(f"low = {self.low} and high = {self.high} are too far apart")
-        if not all(map(_is_finite, self.choices)):
-            raise ValueError(f"holds {shown(self.choices)}, not all of which are finite")
-        return self
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest value that can be drawn."""
-        if self.choices:
-            return min(self.choices), max(self.choices)
-        assert self.low is not None and self.high is not None
-        return self.low, self.high
-
-    def draw(self, generator: np.random.Generator) -> Any:
-        """One value."""
-        if self.choices:
-            return self.choices[int(generator.integers(len(self.choices)))]
-        low, high = self.limits
-        u = float(generator.random())
-        return low * (high / low) ** u if self.log else low + (high - low) * u
-
-    def to_dict(self) -> Any:
-        """As TOML has it: a number, a list or a table."""
-        if self.choices:
-            single = len(self.choices) == 1 and not isinstance(self.choices[0], (list, tuple))
-            return self.choices[0] if single else list(self.choices)
-        return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
-
-
-def _is_finite(value: Any, depth: int = 0) -> bool:
-    """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
-    if isinstance(value, list | tuple):
-        return depth < 9 and all(_is_finite(one, depth + 1) for one in value)
-    return not isinstance(value, float) or math.isfinite(value)
-
-
-def _distribution(value: Any) -> Any:
-    if isinstance(value, (Mapping, Distribution)):
-        return value
-    return {"choices": list(value) if isinstance(value, (list, tuple)) else [value]}
-
-
-def _within(interval: str) -> AfterValidator:
-    """A distribution of numbers in a range."""
-
-    def check(value: Distribution) -> Distribution:
-        values = value.choices or value.limits
-        for one in values:
-            try:
-                check_real("value", one, interval)
-            except ArgumentError:
-                problem = f"is no number in {interval}"
-                raise ValueError(problem if len(values) == 1 else f"holds {shown(one)}, which {problem}") from None
-        return value
-
-    return AfterValidator(check)
-
-
-Positive = Annotated[Distribution, BeforeValidator(_distribution), _within("[1e-9, 1e9]")]
-NotNegative = Annotated[Distribution, BeforeValidator(_distribution), _within("[0, 1e9]")]
-PulseCount = Annotated[Distribution, BeforeValidator(_distribution), _within("[0.5, 9e18]")]
-Share = Annotated[Distribution, BeforeValidator(_distribution), _within("[0, 1]")]
-Angle = Annotated[Distribution, BeforeValidator(_distribution), _within("[-360, 360]")]
-Real = Annotated[Distribution, BeforeValidator(_distribution), _within("[-1e9, 1e9]")]
-
-
-def _constant(value: float) -> Distribution:
-    return Distribution(choices=(value,))
-
-
-class Targets(_Table):
+class Targets(Table):
     """The targets, and which of them are for validation and test; all others are for training."""
 
     builtin: Names | Literal["all"] = Field(
@@ -167,43 +75,43 @@ class Targets(_Table):
     test: Names = Field((), description="targets of the test split")
 
 
-class Pose(_Table):
+class Pose(Table):
     """Position, rotation, size and reflectance of a target."""
 
-    distance: Positive = Field(_constant(15.0), description="of the target's centre, along the optical axis [m]")
-    shift: Real = Field(_constant(0.0), description="sideways, drawn for x and for y [m]")
-    yaw_deg: Angle = Field(_constant(0.0), description="rotation about the vertical axis [°]")
-    pitch_deg: Angle = Field(_constant(0.0), description="rotation about the horizontal axis across the view [°]")
-    roll_deg: Angle = Field(_constant(0.0), description="rotation about the optical axis [°]")
-    size: Positive = Field(_constant(1.0), description="scale of the target")
+    distance: Positive = Field(constant(15.0), description="of the target's centre, along the optical axis [m]")
+    shift: Real = Field(constant(0.0), description="sideways, drawn for x and for y [m]")
+    yaw_deg: Angle = Field(constant(0.0), description="rotation about the vertical axis [°]")
+    pitch_deg: Angle = Field(constant(0.0), description="rotation about the horizontal axis across the view [°]")
+    roll_deg: Angle = Field(constant(0.0), description="rotation about the optical axis [°]")
+    size: Positive = Field(constant(1.0), description="scale of the target")
     fill: Positive | None = Field(None, description="part of the view that it fills without rotation; replaces size")
-    reflectance: Share = Field(_constant(0.5), description="Lambertian reflectance of the target")
+    reflectance: Share = Field(constant(0.5), description="Lambertian reflectance of the target")
 
 
-class Backdrop(_Table):
+class Backdrop(Table):
     """A wall behind the target."""
 
     probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
-    behind: NotNegative = Field(_constant(0.5), description="distance of the wall behind the target's centre [m]")
-    tilt_deg: Angle = Field(_constant(0.0), description="its yaw and pitch, each drawn [°]")
-    reflectance: Share = Field(_constant(0.3), description="Lambertian reflectance of the wall")
+    behind: NotNegative = Field(constant(0.5), description="distance of the wall behind the target's centre [m]")
+    tilt_deg: Angle = Field(constant(0.0), description="its yaw and pitch, each drawn [°]")
+    reflectance: Share = Field(constant(0.3), description="Lambertian reflectance of the wall")
 
 
-class Water(_Table):
+class Water(Table):
     """Turbidity of the water; other values are those of the scene."""
 
     attenuation_lengths: Positive | None = Field(None, description="extinction times distance, one way")
 
 
-class Window(_Table):
+class Window(Table):
     """The gate, as ranges."""
 
-    before: Positive = Field(_constant(1.5), description="from where it opens to the target's centre [m]")
-    behind: Positive = Field(_constant(1.0), description="from the target's centre to where it closes [m]")
+    before: Positive = Field(constant(1.5), description="from where it opens to the target's centre [m]")
+    behind: Positive = Field(constant(1.0), description="from the target's centre to where it closes [m]")
     bins: Whole = Field(1024, ge=1, le=1_000_000, description="time bins in it")
 
 
-class Exposure(_Table):
+class Exposure(Table):
     """Exposure of a frame: its pulses, or the photons that the median pixel records from the target."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
@@ -218,18 +126,18 @@ class Exposure(_Table):
         return self
 
 
-class Frames(_Table):
+class Frames(Table):
     """The depth frames of a scene."""
 
     per_scene: Whole = Field(20, ge=1, le=1_000_000, description="frames of each scene")
     backscatter_fraction: Literal["rates"] | Share = Field(
-        _constant(0.183),
+        constant(0.183),
         description='part of the pixels that report backscatter; "rates": the photon rates decide',
     )
     compression: Literal["none", "gzip"] = Field("none", description='of the frames; "none" reads fastest')
 
 
-class MonteCarlo(_Table):
+class MonteCarlo(Table):
     """Scenes that are traced photon by photon; their depth frames come from the counts of the camera."""
 
     share: float = Field(0.0, ge=0, le=1, description="part of the scenes that are traced; the others are analytic")
@@ -242,7 +150,7 @@ class MonteCarlo(_Table):
     )
 
 
-class Recipe(_Table):
+class Recipe(Table):
     """Everything a dataset depends on, checked and frozen."""
 
     name: str = Field(..., min_length=1, description="what the dataset is called")
@@ -257,11 +165,12 @@ class Recipe(_Table):
     pose: Pose = Pose()
     backdrop: Backdrop = Backdrop()
     water: Water = Water()
+    plume: Plume = Plume()
     gate: Window = Window()
     exposure: Exposure = Exposure()
     frames: Frames = Frames()
     monte_carlo: MonteCarlo = MonteCarlo()
-    vary: dict[str, Annotated[Distribution, BeforeValidator(_distribution)]] = Field(
+    vary: dict[str, Annotated[Distribution, BeforeValidator(distribution)]] = Field(
         default_factory=dict, description='further fields of the scene: "laser.preset" = ["lu2024", ...]'
     )
     trajectory: str = Field(
@@ -276,6 +185,11 @@ class Recipe(_Table):
         for name in ("targets", "gate"):
             if name in self.scene:
                 raise ValueError(f"scene.{name} does not belong to the scene: it is in the recipe's own [{name}]")
+        medium = self.scene.get("medium")
+        if self.plume.probability > 0 and isinstance(medium, Mapping) and {"layers", "grid"} & set(medium):
+            raise ValueError("plume.probability > 0 does not go with layers or a grid in scene.medium")
+        if self.plume.probability > 0 and "daylight" in self.scene:
+            raise ValueError("plume.probability > 0 does not go with scene.daylight, which takes one water")
         for field in self.vary:
             if field in ("camera.width", "camera.height") or field.split(".")[0] in ("gate", "targets"):
                 raise ValueError(f"vary.{field} cannot vary")
@@ -378,11 +292,3 @@ def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None
                 str(folder / os.path.expanduser(path)) if isinstance(path, str) else path for path in given
             ]
     return {**tables, "targets": changed}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, _Table):
-        return value.to_dict()
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value

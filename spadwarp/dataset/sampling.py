@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe
+from spadwarp.dataset.distributions import Distribution
+from spadwarp.dataset.plumes import with_plume
+from spadwarp.dataset.recipe import SPLITS, Recipe
 from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
 from spadwarp.errors import ConfigError
 from spadwarp.scene import Camera, Scene, Trajectory, load_trajectory
@@ -143,6 +145,8 @@ class Plan:
             lengths = scene.medium.extinction * distance
         else:
             scene = scene.with_overrides({"medium.extinction": lengths / distance})
+        if recipe.plume.probability > 0.0:
+            scene = with_plume(scene, recipe.plume, draw, distance)
         analytic = scene.analytic.to_dict()
         if (pulses := draw("exposure.pulses", recipe.exposure.pulses_per_depth_frame)) is not None:
             analytic["pulses_per_depth_frame"] = max(1, round(pulses))
