@@ -180,6 +180,7 @@ def test_behind_a_port_the_path_is_that_in_water(device):
         medium={"extinction": 0.2, "albedo": 0.0, "phase_index": 1.34, "group_index": 1.36},
         laser={"half_angle_deg": 2.0, "position": [0.0, 0.0, 0.6]},
         camera={"horizontal_fov_deg": 10.0, "aperture_diameter": 0.02, "port": port},
+        gate={"bins": 16},
         targets=[{**PLATE, "translation": [0.0, 0.0, 4.0]}],
         transport={"estimator": "guided"},
     )
