@@ -25,7 +25,7 @@ from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.estimators import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.limits import SEED, check_choice, check_integer, check_real
-from spadwarp.scene.sight import depth_from_time
+from spadwarp.scene.sight import depth_from_time, port_advance
 from spadwarp.units import range_from_time
 from spadwarp.viz import evaluation as drawing
 
@@ -198,7 +198,7 @@ def photon_frame(
     depth = depth_from_time(time.reshape(seen.shape), scene=scene)
     sigma = crlb_from_histogram(signal * scale, background, bin_width=gate.bin_width, pulses=1.0, irf=response)
     index = scene.medium.group_index
-    depth_gate = (range_from_time(gate.start, index), range_from_time(gate.stop, index))
+    depth_gate = tuple(range_from_time(end, index) + port_advance(scene) for end in (gate.start, gate.stop))
     features = features_of_histograms(
         counts,
         background=background[0, 0],

@@ -9,7 +9,7 @@ from spadwarp.dataset import FrameReader
 from spadwarp.files.loader import Held
 from spadwarp.frames import Reduction
 from spadwarp.frames.sequence_file import SequenceFile
-from spadwarp.scene.sight import lines_of_camera
+from spadwarp.scene.sight import lines_of_sight, port_advance
 from spadwarp.units import range_from_time
 
 __all__ = ["gate_of", "stored_depth"]
@@ -24,20 +24,20 @@ def stored_depth(held: Held) -> Reduction | None:
     if isinstance(held, AnalyticFile):
         depth = held.depth().astype(np.float64)
         intensity = np.broadcast_to(np.nan_to_num(held.maps["signal"]), depth.shape)
-        camera = held.scene.camera
+        scene = held.scene
     elif isinstance(held, FrameReader):
         items = [(item["noisy"][0], item["intensity"][0]) for item in held]
         depth = np.array([noisy for noisy, _ in items], np.float64)
         intensity = np.array([counts for _, counts in items])
-        camera = held.scene(0).camera
+        scene = held.scene(0)
     elif isinstance(held, SequenceFile) and held.best_method is not None:
         numbers = range(held.frames)
         depth = np.array([held.depth(held.best_method, number) for number in numbers], np.float64)
         intensity = np.array([held.counts(number).sum(axis=-1) for number in numbers])
-        camera = held.scene(0).camera
+        scene = held.scene(0)
     else:
         return None
-    lines = lines_of_camera(camera)
+    lines = lines_of_sight(scene)
     return Reduction(
         quantity="depth",
         values=depth,
@@ -45,7 +45,7 @@ def stored_depth(held: Held) -> Reduction | None:
         intensity=intensity,
         lines=lines,
         method="stored",
-        camera=camera,
+        camera=scene.camera,
     )
 
 
@@ -53,12 +53,12 @@ def gate_of(held: Held) -> tuple[float, float] | None:
     """Ranges at which the gate of an analytic file, a dataset or a scene that moves opens and closes [m], of all its
     scenes together."""
     if isinstance(held, AnalyticFile):
-        gate, index = held.scene.gate, held.scene.medium.group_index
-        return range_from_time(gate.start, index), range_from_time(gate.stop, index)
+        gate, index, advance = held.scene.gate, held.scene.medium.group_index, port_advance(held.scene)
+        return range_from_time(gate.start, index) + advance, range_from_time(gate.stop, index) + advance
     if isinstance(held, SequenceFile):
         start, stop = held.gate_start, held.gate_start + held.bins * held.bin_width
-        index = held.base.medium.group_index
-        return range_from_time(start, index), range_from_time(stop, index)
+        index, advance = held.base.medium.group_index, port_advance(held.base)
+        return range_from_time(start, index) + advance, range_from_time(stop, index) + advance
     if isinstance(held, FrameReader):
         gates = np.array([item["gate"] for item in held.with_fields()])
         return float(gates[:, 0].min()), float(gates[:, 1].max())

@@ -9,7 +9,9 @@ from scipy import stats
 import spadwarp
 from spadwarp.analytic import pixel_maps, scene_eye_limit
 from spadwarp.analytic.optics import as_if_bare
+from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.files.depth import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.port_rays import camera_port
@@ -251,3 +253,13 @@ def test_a_collimated_beam_behind_a_window_stays_one():
     assert found.signal.sum() == pytest.approx(photons.sum(), rel=0.02)
     lit = photons > 0.5 * photons.max()
     np.testing.assert_allclose(found.signal[lit], photons[lit], rtol=0.12)
+
+
+def test_frames_on_disk_become_points_on_the_bent_rays(tmp_path):
+    one = ported(WINDOW, "camera")
+    path = spadwarp.simulate_analytic(one, frames=2, seed=1, device="cpu").save(tmp_path / "analytic.h5")
+    file = spadwarp.load(path)
+    stored, lines = stored_depth(file), lines_of_sight(one)
+    np.testing.assert_array_equal(stored.range, lines.range_from_depth(stored.values))
+    near, far = gate_of(file)
+    assert (near, far) == pytest.approx(summary(one)["gate_range"], abs=0.02)
