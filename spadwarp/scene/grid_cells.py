@@ -56,9 +56,13 @@ class GridCells:
         own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
         return (own / self.size + 0.5) * shape
 
+    def _index(self, at: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Indices of the cells; outside the box such as no cell has."""
+        return np.clip(np.floor(at), -1, self.extinction.shape).astype(np.int32)
+
     def at(self, points: ArrayLike, outside: float) -> NDArray[np.float64]:
         """Extinction [1/m] at points of the world `[..., 3]`, with that outside the box."""
-        index = np.floor(self.in_cells(points)).astype(int)
+        index = self._index(self.in_cells(points))
         inside = ((index >= 0) & (index < self.extinction.shape)).all(axis=-1)
         clipped = np.clip(index, 0, np.array(self.extinction.shape) - 1)
         return np.where(inside, self.extinction[tuple(np.moveaxis(clipped, -1, 0))], outside)
@@ -86,7 +90,7 @@ class GridCells:
             cuts.append(np.clip(np.nan_to_num(crossing, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
         t = np.sort(np.concatenate(cuts, axis=1), axis=1)
         middle = first[:, None, :] + 0.5 * (t[:, 1:] + t[:, :-1])[..., None] * along[:, None, :]
-        index = np.floor(middle).astype(np.int32)
+        index = self._index(middle)
         inside = ((index >= 0) & (index < self.extinction.shape)).all(axis=-1)
         clipped = np.clip(index, 0, np.array(self.extinction.shape) - 1)
         extinction = np.where(inside, self.extinction[tuple(np.moveaxis(clipped, -1, 0))], outside)
