@@ -20,7 +20,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
 
     `histogram` has the dimensions (component, y, x, time); `.sum("component")` is all light, `.sel(component=
     "backscatter")` a part of it. Coordinates: time of flight [s] at the bins' centres, `path` [m] along it, pixels.
-    Attributes: photons, seed, partial and the scene as TOML.
+    `derivative`, of results that have some, has the dimension parameter before these. Attributes: photons, seed,
+    partial and the scene as TOML.
 
     Raises:
         FileError: xarray is not installed.
@@ -39,7 +40,12 @@ def to_xarray(result: Result) -> xarray.Dataset:
     }
     if result.second_moment is not None and result.photons >= 2 * result.batch_size:
         variables["standard_error"] = ((*image, "time"), result.standard_error, "1", "of the histogram of all light")
-    coordinates: dict[str, Variable] = {
+    coordinates: dict[str, Variable] = {}
+    if result.derivatives:
+        slopes = np.stack([*result.derivatives.values()])
+        variables["derivative"] = (("parameter", *cube), slopes, "1", "of the histogram, per unit of the parameter")
+        coordinates["parameter"] = (("parameter",), list(result.derivatives), "1", "by which it is differentiated")
+    coordinates |= {
         "component": (("component",), list(COMPONENTS), "1", "history of the light"),
         "time": (("time",), result.bin_centres, "s", "time of flight at the centre of the bin"),
         "path": (("time",), result.bin_centres * result.pulse_speed, "m", "geometric path, laser to target to lens"),

@@ -128,8 +128,8 @@ def _resolve(scene: Scene, name: Any, known: dict[str, Parameter]) -> Parameter:
 def derivative_units(scene: Scene, names: Sequence[str], scale: float) -> tuple[float, ...]:
     """Of each derivative's tallies [fraction of an emitted photon per unit of the parameter], a power of two.
 
-    Coarser than the histogram's by the score that a photon may have: its path, 1/b, or what a handful of scatterings or
-    bounces come to.
+    Coarser than the histogram's by about the score that the light of a bin may have: its path, 1/b, that of the most
+    telling scattering, or two bounces. The brightest bin has 16 times the room that it needs by this estimate.
     """
     known, units = _parameters(scene), list[float]()
     for name in names:
@@ -137,8 +137,8 @@ def derivative_units(scene: Scene, names: Sequence[str], scale: float) -> tuple[
         largest = {
             "absorption": scene.path_limit,
             "scattering": max(scene.path_limit, 1.0 / max(one.value, 1e-6)),
-            "anisotropy": 4.0 * (3.0 + abs(one.value)) / (1.0 - one.value**2) if one.kind == "anisotropy" else 0.0,
-            "reflectance": 4.0 / max(one.value, 1e-9),
+            "anisotropy": (3.0 + abs(one.value)) / (1.0 - one.value**2) if one.kind == "anisotropy" else 0.0,
+            "reflectance": 2.0 / max(one.value, 1e-9),
         }[one.kind]
         units.append(2.0 ** math.ceil(math.log2(largest)) / scale)
     return tuple(units)

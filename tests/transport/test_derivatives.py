@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import spadwarp
+from helpers.cli import run
 from helpers.estimators import clear_at_the_lens
 from helpers.scenes import PLATE, scene
 from helpers.statistics_of_samples import equal_means_p
@@ -225,6 +226,10 @@ def test_files_merge_and_resume(tmp_path):
         np.testing.assert_array_equal(other.derivative_tallies.tallies, whole.derivative_tallies.tallies)
     np.testing.assert_array_equal(loaded.derivative_errors[ALL[2]], whole.derivative_errors[ALL[2]])
     assert loaded.summary()["derivatives"] == list(ALL)
+    assert "derivatives  by medium.absorption, medium.scattering" in run("info", tmp_path / "result.h5").stdout
+    pytest.importorskip("xarray")
+    labelled = loaded.to_xarray().derivative.sel(parameter=ALL[1], component="backscatter")
+    np.testing.assert_array_equal(labelled, whole.derivatives[ALL[1]][2])
     with pytest.raises(spadwarp.ConfigError, match="list of derivatives"):
         spadwarp.merge([halves[0], simulated(one, "cpu", ALL[:2], 4096, uncertainty=True, shard=(2, 2))])
     with pytest.raises(spadwarp.ConfigError, match=r"the run to resume has medium.absorption, .* not medium.sc"):
