@@ -105,6 +105,7 @@ from .tally import (
     Derivatives,
     has_overflowed,
     make_derivatives,
+    tally_rates,
     to_fixed_point,
 )
 from .transport import (
@@ -257,6 +258,7 @@ __all__ = [
     "sphere_integral",
     "statistics_maps",
     "surface_choices",
+    "tally_rates",
     "to_fixed_point",
     "truth_along_kernel",
     "truth_kernel",

@@ -1,82 +1,37 @@
-"""Expected light and its derivatives: scored along the photons' histories, or as differences of moved targets."""
+"""Derivatives of expected light by the place of the targets: differences with the same photons."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from spadwarp.inverse.unknowns import moved
-from spadwarp.result import Result
-from spadwarp.transport import simulate
+from spadwarp.transport import ExpectedLight, LightTracer
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["Light", "central_difference", "traced"]
-
-Rows = NDArray[np.float32]
+__all__ = ["central_difference"]
 
 
-class Light(NamedTuple):
-    """Expected detections per pulse, float32 `[pixel, bin]`: of all light, and of the targets' alone."""
+def central_difference(
+    scene: Scene, step: float, *, first: int, photons: int, kept: dict[str, Any], **choices: Any
+) -> ExpectedLight:
+    """Derivative by the depth of the targets [1/m], from two runs with the same photons and the targets at ± `step`.
 
-    total: Rows
-    target: Rows | None
-
-
-def traced(scene: Scene, names: Sequence[str], *, apart: bool, **run: Any) -> tuple[Result, Light, dict[str, Light]]:
-    """A run of a scene: its result, its light, and the derivatives of this by `names` with the same photons.
-
-    `apart`: also the light of the targets alone; `run`: arguments of `simulate`.
+    `choices`: arguments of `LightTracer`.
     """
-    result = _run(scene, derivatives=list(names), **run) if names else _run(scene, **run)
-    rate = _detections(result)
-    slopes: dict[str, Light] = {}
-    if names:
-        stored = result.derivative_tallies
-        assert stored is not None
-        for name, tallies, unit in zip(stored.names, stored.tallies, stored.units, strict=True):
-            slopes[name] = _light(tallies, rate * (unit / result.unit), apart=apart)
-    return result, _light(result.tallies, rate, apart=apart), slopes
+    far, near = (
+        LightTracer(moved(scene, sign * step), photons=photons, kept=kept.setdefault(name, {}), **choices)(
+            first, photons
+        )[0]
+        for name, sign in (("far", 1.0), ("near", -1.0))
+    )
+    return ExpectedLight(_slope(far.total, near.total, step), _slope(far.target, near.target, step))
 
 
-def central_difference(scene: Scene, step: float, *, kept: dict[str, Any], apart: bool, **run: Any) -> Light:
-    """Derivative by the depth of the targets [1/m], from two runs with the same photons and the targets at ± `step`."""
-    sides = []
-    for sign in (1.0, -1.0):
-        place: dict[str, Any] = kept.setdefault("near" if sign < 0 else "far", {})
-        result = _run(moved(scene, sign * step), kept=place, **run)
-        sides.append(_light(result.tallies, _detections(result), apart=apart))
-    far, near = sides
-    half = np.float32(0.5 / step)
-    target = None if far.target is None or near.target is None else (far.target - near.target) * half
-    return Light((far.total - near.total) * half, target)
+def _slope(far: Any, near: Any, step: float) -> Any:
+    import warp as wp
 
-
-def _detections(result: Result) -> NDArray[np.float64]:
-    """Expected detections per pulse for each tally unit, `[pixel, 1]`."""
-    scene = result.scene
-    return result.tally_value.reshape(-1, 1) * (scene.laser.photons_per_pulse * scene.detections_per_photon)
-
-
-def _run(scene: Scene, **run: Any) -> Result:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of rounding in faint components, once an iteration
-        return simulate(scene, **run)
-
-
-def _light(tallies: NDArray[np.int64], rate: NDArray[np.float64], *, apart: bool) -> Light:
-    """Rows of tallies `[component, H, W, T]`; the first two components are of the targets."""
-    bins = tallies.shape[-1]
-
-    def rows(part: NDArray[np.int64]) -> Rows:
-        return (part.sum(axis=0).reshape(-1, bins) * rate).astype(np.float32)
-
-    if not apart:
-        return Light(rows(tallies), None)
-    target = rows(tallies[:2])
-    return Light(target + rows(tallies[2:]), target)
+    if far is None:
+        return None
+    return wp.array((far.numpy() - near.numpy()) * (0.5 / step), dtype=wp.float32, device=far.device)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device
 from spadwarp.frames import InstrumentResponse, Receiver, detector_response
 from spadwarp.frames.window import Window
-from spadwarp.inverse.derivatives import Light, central_difference, traced
+from spadwarp.inverse.derivatives import central_difference
 from spadwarp.inverse.shifting import shifted
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, with_values
 from spadwarp.scene import noise_rate
 from spadwarp.scene.sight import lines_of_sight
+from spadwarp.transport import ExpectedLight, LightTracer
 
 if TYPE_CHECKING:
     from spadwarp.inverse.exposure import Exposure
@@ -97,15 +98,23 @@ class Renderer:
         """Groups of `photons` · `batches` photons each, which are independent of each other."""
         shared = {name: float(np.mean(value)) for name, value in values.items()}
         scene = self._with_focus(with_values(self.scene, shared))
+        names = [one.name for one in self.unknowns if one.is_light]
+        scored = self._tracer(scene, photons, names)
+        plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
+        self.truth = scored.truth
+        receiver = self._receiver(scene, values)
+        place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
         groups = []
         for _ in range(halves):
-            light, slopes = self._traced(scene, photons)
-            receiver = self._receiver(scene, values)
-            place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
+            number = self._take(photons)
+            light, slopes = scored(number, photons)
+            if any(one.name == DEPTH for one in self.unknowns):
+                choices: Any = {"seed": self.seed, "device": self.device, "apart": self.apart, "kept": self._kept}
+                slopes[DEPTH] = central_difference(scene, self.depth_step, first=number, photons=photons, **choices)
             first = _rates(receiver, light, place)
             group = [first]
             for _ in range(batches - 1):
-                group.append(_rates(receiver, self._light(scene, photons), place))
+                group.append(_rates(receiver, plain(self._take(photons), photons)[0], place))
             rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
             groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
         return groups
@@ -114,25 +123,21 @@ class Renderer:
     def _limits(self) -> Rows:
         return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
 
-    def _run(self, photons: int) -> dict[str, Any]:
-        """Arguments of `simulate` for photons that were not traced before."""
+    def _take(self, photons: int) -> int:
+        """The first of photons that were not traced before."""
         first, self.photons = self.photons, self.photons + photons
-        return {"photons": photons, "first_photon": first, "seed": self.seed, "device": self.device}
+        return first
 
-    def _light(self, scene: Scene, photons: int) -> Light:
-        run = self._run(photons)
-        result, light, _ = traced(scene, (), apart=self.apart, kept=self._kept.setdefault("scene", {}), **run)
-        self.truth = result.truth
-        return light
-
-    def _traced(self, scene: Scene, photons: int) -> tuple[Light, dict[str, Light]]:
-        run, names = self._run(photons), [one.name for one in self.unknowns if one.is_light]
-        kept = self._kept.setdefault("scene", {})
-        result, light, slopes = traced(scene, names, apart=self.apart, kept=kept, **run)
-        self.truth = result.truth
-        if any(one.name == DEPTH for one in self.unknowns):
-            slopes[DEPTH] = central_difference(scene, self.depth_step, kept=self._kept, apart=self.apart, **run)
-        return light, slopes
+    def _tracer(self, scene: Scene, photons: int, names: Sequence[str]) -> LightTracer:
+        return LightTracer(
+            scene,
+            photons=photons,
+            seed=self.seed,
+            device=self.device,
+            derivatives=names,
+            apart=self.apart,
+            kept=self._kept.setdefault("scored" if names else "plain", {}),
+        )
 
     def _with_focus(self, scene: Scene) -> Scene:
         """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved."""
@@ -191,7 +196,7 @@ class _Placement:
                 factor *= np.asarray(values[one.name]) / shared[one.name]
         return cls(delay, factor)
 
-    def change(self, receiver: Receiver, light: Light) -> Rows:
+    def change(self, receiver: Receiver, light: ExpectedLight) -> Rows:
         """What it adds to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
         assert light.target is not None
         target = _through(receiver, light.target, with_noise=False)
@@ -206,21 +211,19 @@ def bins_per_metre(scene: Scene) -> NDArray[np.float64]:
     return (ends[1] - ends[0]) / (2.0 * step * scene.medium.pulse_speed * scene.gate.bin_width)
 
 
-def _through(receiver: Receiver, rows: Rows, *, with_noise: bool) -> Rows:
-    import warp as wp
-
-    source: Any = wp.array(rows, dtype=wp.float32, device=receiver.noise.device)
-    return (receiver.hazard(source) if with_noise else receiver.slope(source)).numpy()
+def _through(receiver: Receiver, rows: Any, *, with_noise: bool) -> Rows:
+    found: Rows = (receiver.hazard(rows) if with_noise else receiver.slope(rows)).numpy()
+    return found
 
 
-def _rates(receiver: Receiver, light: Light, place: _Placement | None) -> Rows:
+def _rates(receiver: Receiver, light: ExpectedLight, place: _Placement | None) -> Rows:
     """λ of light."""
     rates = _through(receiver, light.total, with_noise=True)
     return rates if place is None else rates + place.change(receiver, light)
 
 
 def _slopes(
-    receiver: Receiver, slopes: Mapping[str, Light], unknowns: Sequence[Unknown], place: _Placement | None
+    receiver: Receiver, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown], place: _Placement | None
 ) -> Rows:
     """Derivatives of λ, `[unknown, pixel, bin]`."""
     widths = np.diff(receiver.window.edges).astype(np.float32)

@@ -1,6 +1,7 @@
 """Photon transport: a scene in, a `Result`, truth maps or photon records out."""
 
 from spadwarp.transport.derivatives import derivative_names, resolve_derivatives
+from spadwarp.transport.light import ExpectedLight, LightTracer
 from spadwarp.transport.loading import prepare_kernels
 from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
 from spadwarp.transport.simulation import Progress, provenance, simulate
@@ -9,6 +10,8 @@ from spadwarp.transport.truth import truth_maps
 
 __all__ = [
     "PHOTON_CAPACITY",
+    "ExpectedLight",
+    "LightTracer",
     "PhotonRecords",
     "Progress",
     "derivative_names",

@@ -2,6 +2,7 @@
 
 from .batches import Batches
 from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
+from .rates import tally_rates
 from .scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives, make_derivatives
 from .tally import COMPONENTS, Contribution, Scores, deposit, has_overflowed, tally_index, to_fixed_point
 
@@ -23,6 +24,7 @@ __all__ = [
     "has_overflowed",
     "make_derivatives",
     "tally_index",
+    "tally_rates",
     "to_fixed_point",
     "to_ledger",
 ]

@@ -1,0 +1,93 @@
+"""Expected light that stays on its device: for programs that render a scene again and again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spadwarp.device import pick_devices
+from spadwarp.result import Truth
+from spadwarp.result.result import photons_per_position
+from spadwarp.scene import Scene
+from spadwarp.transport.local_workers import LocalWorkers
+from spadwarp.transport.plan import make_plan
+
+__all__ = ["ExpectedLight", "LightTracer"]
+
+
+class ExpectedLight(NamedTuple):
+    """Expected detections per pulse, Warp float32 `[pixel, bin]`; of all light, and of the targets' alone, or None."""
+
+    total: Any
+    target: Any
+
+
+class LightTracer:
+    """Traces photons of one scene on one device, part after part, without copies to the host.
+
+    Args:
+        scene: What to trace.
+        photons: Of a part at most.
+        seed: 64 bits.
+        device: As in `simulate`; the first of several.
+        derivatives: Names, as in `simulate`.
+        apart: Whether the light of the targets is wanted apart.
+        kept: As in `simulate`.
+
+    Raises what `simulate` raises.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        photons: int,
+        seed: int,
+        device: str | None = None,
+        derivatives: Sequence[str] = (),
+        apart: bool = False,
+        kept: dict[str, Any] | None = None,
+    ) -> None:
+        plan = make_plan(
+            scene,
+            photons=photons,
+            seed=seed,
+            first_photon=0,
+            shard=None,
+            batches=False,
+            relative_error=None,
+            resume=None,
+            launch_size=None,
+            derivatives=derivatives or None,
+        )
+        workers = LocalWorkers(plan, pick_devices(device)[:1], kept=kept)
+        self._scene, self._apart, self._unit = scene, apart, 1.0 / plan.scale
+        self._names, self._worker = plan.derivatives, workers.workers[0]
+        self.truth: Truth = workers.truth()
+
+    def __call__(self, first: int, photons: int) -> tuple[ExpectedLight, dict[str, ExpectedLight]]:
+        """Light of the photons `first` … `first + photons`, and its derivatives by name with the same photons."""
+        worker = self._worker
+        worker.clear()
+        worker.trace((first, first + photons), stopped=threading.Event())
+        scene, data = self._scene, worker.data
+        per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
+        value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
+        slopes = {}
+        for p, name in enumerate(self._names):
+            unit = 1.0 / float(worker.model.derivatives.scale[p])
+            slopes[name] = self._light(data.gradients, value * unit, len(self._names), p)
+        return self._light(data.tally, value * self._unit, 1, 0), slopes
+
+    def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
+        import warp as wp
+
+        from spadwarp_kernels import tally_rates
+
+        scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
+        which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
+        target = tally_rates(tally, scale, components=(0, 2), **which) if self._apart else None
+        return ExpectedLight(tally_rates(tally, scale, **which), target)
