@@ -167,15 +167,18 @@ class Fitter:
 
     # One fit
 
-    def fit(self, *, start: Mapping[str, float] | None = None, progress: Progress | None = None) -> Fit:
-        """Fits the exposure from `start`, as `spadwarp.fit` does."""
+    def fit(
+        self, *, start: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
+    ) -> Fit:
+        """Fits the exposure from `start`, as `spadwarp.fit` does; `near`: it is within some standard errors already."""
         began = time.perf_counter()
         first = self.render.photons
         state = self._start(start)
         begin = state.shared()
         report = (lambda text: None) if progress is None else lambda text: progress(f"fit: {text}", 0, 0)
         trials = self.exposure.left() if self.law.first_photon else self._all_pulses()
-        self._approach(state, trials, report)
+        if not near:
+            self._approach(state, trials, report)
         halves, solution, converged = self._refine(state, trials, report)
         return estimates_of(
             scene=self.scene,

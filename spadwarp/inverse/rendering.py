@@ -151,17 +151,18 @@ class Renderer:
         return scene.model_copy(update={"camera": scene.camera.model_copy(update={"focus_distance": focus})})
 
     def _receiver(self, scene: Scene, values: Values) -> Receiver:
-        gate, camera = scene.gate, scene.camera
+        gate, camera, detector = scene.gate, scene.camera, scene.detector
         ambient = None
         if scene.daylight is not None and self.truth is not None:
             ambient = noise_rate(scene, self.truth)[..., 0] - scene.detector.noise_rate
         background = np.asarray(values.get(BACKGROUND, 0.0))
         if background.ndim:
-            own = np.reshape(background, (camera.height, camera.width)) - scene.detector.ambient_rate
+            own = np.reshape(background, (camera.height, camera.width))
+            detector = detector.model_copy(update={"ambient_rate": 0.0})
             ambient = own if ambient is None else ambient + own
         response: InstrumentResponse | None = self.exposure.irf
         return Receiver.of(
-            scene.detector,
+            detector,
             scene.laser,
             shape=(camera.height, camera.width, gate.bins),
             axis=(gate.start, gate.bin_width),
