@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.model import source_name
 from spadwarp.errors import ConfigError
-from spadwarp.frames import crlb_from_histogram, detect, detector_response, first_photon_probabilities
+from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.estimators import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import merge
@@ -38,6 +38,8 @@ Floats = NDArray[np.float64]
 
 SIDE = 16
 """Largest width and height of the window [pixels]."""
+MOST_NOISE = 0.95
+"""Part of the information that may be noise; a bound from what is left of more would be noise itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,8 @@ class Pilot:
         brightest: Detections of light per pulse of the brightest hundredth of the pixels.
         bound: Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N.
         shot_noise: The same without background and pile-up.
+        information_noise: Part of the runs' information on the depth that was their noise, which `bound` and
+            `shot_noise` leave out.
         floor: Estimator → median |error| of depth that is left after any number of pulses [m].
         bias: Estimator → median error, positive if too far [m].
         unscattered_floor: The same as `floor`, of unscattered light alone: slopes and edges within a pixel, bins.
@@ -69,6 +73,7 @@ class Pilot:
     brightest: float
     bound: float
     shot_noise: float
+    information_noise: float
     floor: dict[str, float]
     bias: dict[str, float]
     unscattered_floor: dict[str, float]
@@ -166,7 +171,7 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
         }
     signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
-    bound, shot = _bounds(both, (first, second), device)
+    bound, shot, information_noise = _bounds(both, (first, second), seen, device)
     noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
@@ -175,8 +180,9 @@ def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None
         backscatter=median(both.component("backscatter").sum(axis=-1) * scale),
         noise=noise,
         brightest=float(np.quantile(both.detections.sum(axis=-1), 0.99)),
-        bound=_known_median(bound[seen]),
-        shot_noise=_known_median(shot[seen]),
+        bound=bound,
+        shot_noise=shot,
+        information_noise=information_noise,
         floor={name: abs(bias[name]) if even else _finite_median(np.abs(errors[name][seen])) for name in errors},
         bias=bias,
         unscattered_floor={name: _finite_median(np.abs(error[seen])) for name, error in alone.items()},
@@ -199,12 +205,6 @@ def _as_traced(traced: Scene, wanted: Scene) -> Scene:
 def _finite_median(values: Floats) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else math.inf
-
-
-def _known_median(values: Floats) -> float:
-    """With infinite ones."""
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else math.inf
 
 
 def _depth_error(result: Result, frames: Frames, histogram: Floats | None, method: Any, device: str | None) -> Floats:
@@ -234,10 +234,15 @@ def _return(signal: Floats, background: Floats, result: Result) -> tuple[Floats,
     return peak, level
 
 
-def _bounds(result: Result, runs: tuple[Result, Result], device: str | None) -> tuple[Floats, Floats]:
-    """Bounds of depth for one pulse [m], `[H, W]`: as the detector records it, and without background and pile-up.
+def _bounds(
+    result: Result, runs: tuple[Result, Result], seen: NDArray[np.bool_], device: str | None
+) -> tuple[float, float, float]:
+    """Bounds of depth for one pulse [m], medians: as the detector records it, and without background and pile-up; and
+    the part of the information that was noise of the runs, for which the bounds are larger.
 
-    The difference of the runs says how much of the information is noise; inf where all of it is.
+    From products of the slopes of both runs, which noise does not change in the mean. One pixel has too few photons to
+    say what part is noise, and few bright photons rule a mean over pixels: medians of both are compared. Inf where
+    nearly all is noise.
     """
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
@@ -247,12 +252,22 @@ def _bounds(result: Result, runs: tuple[Result, Result], device: str | None) -> 
     background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     options: dict[str, Any] = {
         "bin_width": scene.gate.bin_width,
-        "pulses": 1,
         "irf": detector_response(scene.detector, scene.laser),
-        "signal_variance": np.square(0.5 * (first - second)),
+        "signal_halves": (first, second),
         "device": device,
     }
     law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
     slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
-    bound = crlb_from_histogram(signal, background, law=law, **options)
-    return bound * slope, crlb_from_histogram(signal, 0.0, **options) * slope
+
+    def bound(background: Any, law: Any) -> tuple[float, float]:
+        information, noise = information_from_histogram(signal, background, law=law, **options)
+        known = seen & (information > 0)
+        if not known.any():
+            return math.inf, 1.0
+        part = float(np.median(noise[known]) / np.median(information[known]))
+        left = 1.0 - part if part < MOST_NOISE else 0.0
+        with np.errstate(divide="ignore"):
+            return float(np.median(slope[known] / np.sqrt(left * information[known]))), part
+
+    recorded, part = bound(background, law)
+    return recorded, bound(0.0, "poisson")[0], part

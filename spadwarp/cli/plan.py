@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 from spadwarp.cli._tables import new_table, short
 
 _PLANE = "for a plane square to the optical axis, not for the scene's target"
+_MUCH_NOISE = 1.0 / 3.0  # Part of the information of the run.
 
 
 @app.command()
@@ -120,6 +121,11 @@ def plan(
         say(f"What would help: {found.advice}.")
         if found.pilot.run_noise > 0.5 * found.terms["forward scattering"]:
             say("The Monte Carlo run is too short to know the floor: it may be smaller; --photons takes more.")
+        if found.pilot.information_noise > _MUCH_NOISE:
+            say(
+                f"The Monte Carlo run is short for the bound: {100 * found.pilot.information_noise:.0f} % of what its "
+                "histograms say of the depth was noise, and is left out; --photons takes more."
+            )
         if write is not None:
             say(f"written: {write}")
     outputs.write_json({"scene": scene_path, **found.to_dict(), "files": [] if write is None else [write]})

@@ -1,6 +1,6 @@
 """Frames of a SPAD camera: counts, arrival times, depth, the Cramér–Rao bound, files."""
 
-from spadwarp.frames.cramer_rao import crlb, crlb_from_histogram
+from spadwarp.frames.cramer_rao import crlb, crlb_from_histogram, information_from_histogram
 from spadwarp.frames.depth import Reduction, depth_frame, depth_of
 from spadwarp.frames.estimators import METHODS, Method, arrival_time
 from spadwarp.frames.file import FramesFile, is_frames_file
@@ -42,6 +42,7 @@ __all__ = [
     "detect",
     "detector_response",
     "first_photon_probabilities",
+    "information_from_histogram",
     "instrument_response",
     "is_frames_file",
     "monte_carlo_noise",

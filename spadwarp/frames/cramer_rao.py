@@ -14,12 +14,11 @@ from spadwarp.limits import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.scene import noise_rate
 
-__all__ = ["crlb", "crlb_from_histogram"]
+__all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 
 Map = NDArray[np.float64]
 
 
-@kernel_errors()
 def crlb_from_histogram(
     signal_cube: ArrayLike,
     background_cube: ArrayLike,
@@ -29,6 +28,7 @@ def crlb_from_histogram(
     irf: InstrumentResponse | float | ArrayLike | None = None,
     law: Literal["poisson", "first_photon"] = "poisson",
     signal_variance: ArrayLike | None = None,
+    signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
     device: Any = None,
 ) -> Map:
     """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
@@ -48,6 +48,8 @@ def crlb_from_histogram(
             estimate. Its noise would count as information, and the bound would be too small: a slope that is a sum of
             bins with weights w has Σ w² var more in the mean of its square, which is subtracted, for independent bins
             and to first order: where more than a third of the information is noise, the bound comes out too large.
+        signal_halves: Two independent estimates whose mean is `signal_cube`, in place of `signal_variance`: a product
+            of their slopes has no noise in its mean, whatever the bins share.
         device: Warp device; default: the first GPU, else the CPU.
 
     Returns:
@@ -55,6 +57,40 @@ def crlb_from_histogram(
 
     Raises:
         ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
+    """
+    pulses = check_real("pulses", pulses, "(0, 1e30]")
+    information, noise = information_from_histogram(
+        signal_cube,
+        background_cube,
+        bin_width=bin_width,
+        irf=irf,
+        law=law,
+        signal_variance=signal_variance,
+        signal_halves=signal_halves,
+        device=device,
+    )
+    with np.errstate(divide="ignore"):
+        sigma = 1.0 / np.sqrt(pulses * np.maximum(information - noise, 0.0))
+    return np.where(information > 0, sigma, np.nan)
+
+
+@kernel_errors()
+def information_from_histogram(
+    signal_cube: ArrayLike,
+    background_cube: ArrayLike,
+    *,
+    bin_width: float,
+    irf: InstrumentResponse | float | ArrayLike | None = None,
+    law: Literal["poisson", "first_photon"] = "poisson",
+    signal_variance: ArrayLike | None = None,
+    signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
+    device: Any = None,
+) -> tuple[Map, Map]:
+    """Fisher information on the delay per pulse, and what of it is noise of a Monte Carlo estimate, float64 `[...]`
+    [1/s²].
+
+    The noise is an estimate for all pixels together: in one pixel it may be larger than the information, or negative.
+    Arguments and errors as in `crlb_from_histogram`.
     """
     import warp as wp
 
@@ -66,10 +102,8 @@ def crlb_from_histogram(
     if background.shape not in ((), (bins,), signal.shape) or signal.size == 0:
         raise ArgumentError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
     for name, cube in (("signal_cube", signal), ("background_cube", background)):
-        if not (np.isfinite(cube).all() and (cube >= 0).all()):
-            raise ArgumentError(f"{name} holds a value outside [0, inf)")
+        _check_cube(name, cube, signal.shape if name == "signal_cube" else background.shape)
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
-    pulses = check_real("pulses", pulses, "(0, 1e30]")
     check_choice("law", law, ("poisson", "first_photon"))
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
@@ -81,29 +115,43 @@ def crlb_from_histogram(
         wp.array(slope_taps, dtype=wp.float64, device=device),
         first_photon=law == "first_photon",
     ).numpy()
-    is_known = information > 0
-    if signal_variance is not None:
+    noise = np.zeros_like(information)
+    total = np.asarray(signal + background, np.float64).reshape(-1, bins)
+    if signal_halves is not None:
+        first, second = (np.asarray(half, np.float64) for half in signal_halves)
+        for half in (first, second):
+            _check_cube("signal_halves", half, signal.shape)
+        # The product of two slopes is the square of their mean less the square of half their difference.
+        noise = _information_of_noise(0.5 * (first - second).reshape(-1, bins), total, taps, slope_taps, law)
+    elif signal_variance is not None:
         variance = np.asarray(signal_variance, np.float64)
-        if variance.shape != signal.shape or not (np.isfinite(variance).all() and (variance >= 0).all()):
-            raise ArgumentError(
-                f"signal_variance has shape {variance.shape} or a value outside [0, inf); {signal.shape}"
-            )
-        total = np.asarray(signal + background, np.float64).reshape(-1, bins)
-        noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law)
-        information = np.maximum(information - noise, 0.0)
-    with np.errstate(divide="ignore"):
-        sigma = bin_width / np.sqrt(pulses * information)
-    return np.where(is_known, sigma, np.nan).reshape(signal.shape[:-1])
+        _check_cube("signal_variance", variance, signal.shape)
+        noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law, is_variance=True)
+    shape = signal.shape[:-1]
+    return information.reshape(shape) / bin_width**2, noise.reshape(shape) / bin_width**2
 
 
-def _information_of_noise(variance: Map, total: Map, taps: Map, slope_taps: Map, law: str) -> Map:
-    """What independent noise of the bins adds to the mean of the Fisher information per pulse, in 1/bins²."""
+def _check_cube(name: str, cube: NDArray[Any], shape: tuple[int, ...]) -> None:
+    if cube.shape != shape:
+        raise ArgumentError(f"{name} has shape {cube.shape}; {shape} is needed")
+    if not (np.isfinite(cube).all() and (cube >= 0).all()):
+        raise ArgumentError(f"{name} holds a value outside [0, inf)")
+
+
+def _information_of_noise(
+    noise: Map, total: Map, taps: Map, slope_taps: Map, law: str, *, is_variance: bool = False
+) -> Map:
+    """What noise adds to the mean of the Fisher information per pulse, in 1/bins²: noise of the bins, or the variance
+    of bins that are independent."""
     from scipy.ndimage import convolve1d
 
     added = np.empty(len(total))
     for i, row in enumerate(total):  # one pixel at a time: cubes are large
         rate = convolve1d(row, taps, mode="constant")
-        squares = convolve1d(variance[i], slope_taps**2, mode="nearest")
+        if is_variance:
+            squares = convolve1d(noise[i], slope_taps**2, mode="nearest")
+        else:
+            squares = np.square(convolve1d(noise[i], slope_taps, mode="nearest"))
         if law == "first_photon":
             squares, rate = squares * np.exp(-np.cumsum(rate)), -np.expm1(-rate)
         added[i] = np.divide(squares, rate, out=np.zeros_like(rate), where=rate > 0).sum()

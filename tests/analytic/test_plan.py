@@ -53,6 +53,14 @@ def test_terms_add_up(found):
 
 
 @pytest.mark.physics
+def test_a_short_run_has_the_bound_of_a_long_one(found):
+    """And says how much of what it saw was noise."""
+    short = proposal(photons=20_000).pilot
+    assert found.pilot.information_noise < 0.5 < short.information_noise < 0.9
+    assert short.bound == pytest.approx(found.pilot.bound, rel=0.15)
+
+
+@pytest.mark.physics
 def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     """Independent photons, all pixels; many pulses leave the floor alone."""
     whole = found.scene.with_overrides(transport={"photons": 1_000_000, "seed": 99})

@@ -110,6 +110,31 @@ def test_noise_of_the_simulation_does_not_count_as_information():
         assert mended.mean() == pytest.approx(truth, abs=4 * error + 0.02 * truth)
 
 
+def test_products_of_halves_have_no_noise_whatever_the_bins_share():
+    """Events that leave light in four bins: their variances alone would say too little noise."""
+    expected, level, events = gaussian(6.0, counts=1.0), 0.05, 60.0
+    rng = np.random.default_rng(4)
+
+    def half():
+        drawn = 0.25 * rng.poisson(expected * events, (600, 240)) / events
+        return sum(np.roll(drawn, shift, axis=-1) for shift in range(4))
+
+    halves = half(), half()
+    middle = 0.5 * (halves[0] + halves[1])
+    spread = sum(np.roll(expected, shift) for shift in range(4)) / 4.0
+    for law in ("poisson", "first_photon"):
+        options = {"background": level, "law": law, "irf": 3.0 * FWHM_PER_SIGMA * BIN}
+        truth = bound(spread, **options) ** -2
+        variance = np.square(0.5 * (halves[0] - halves[1]))
+        by_variance, by_halves = (
+            1.0 / bound(middle, **options, **noise) ** 2
+            for noise in ({"signal_variance": variance}, {"signal_halves": halves})
+        )
+        error = by_halves.std() / np.sqrt(len(middle))
+        assert by_halves.mean() == pytest.approx(truth, abs=4 * error + 0.02 * truth)
+        assert abs(by_variance.mean() - truth) > 2 * abs(by_halves.mean() - truth)
+
+
 @pytest.mark.filterwarnings("ignore:.*one of 40 batches")
 def test_a_result_with_standard_errors_has_a_bound_without_their_noise():
     murky = scene(
