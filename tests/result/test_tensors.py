@@ -47,6 +47,23 @@ def test_tallies_of_the_caller(scene, result, kind, options):
         assert np.array_equal(seen, result.tallies)
 
 
+def test_results_stay_on_the_device(scene, device):
+    """Tallies, histograms and frames are tensors where the photons were traced, with the numbers of the host's."""
+    mine = torch.full(SHAPE, 5, dtype=torch.int64, device=device)
+    traced = spadwarp.simulate(scene, device=device, tallies=mine)
+    expected = spadwarp.simulate(scene, device=device)
+    view = spadwarp.result.to_torch(traced, tallies=mine)
+    frames, host = spadwarp.detect(view, seed=5), spadwarp.detect(expected, seed=5, device=device)
+    for tensor, numbers in (
+        (view.tallies, expected.tallies),
+        (view.histogram, expected.histogram),
+        (frames.counts, host.counts),
+        (frames.arrival_time("matched"), host.arrival_time("matched", device=device)),
+    ):
+        assert tensor.device == mine.device
+        assert np.array_equal(tensor.cpu().numpy(), numbers, equal_nan=numbers.dtype.kind == "f")
+
+
 def test_results_share_their_memory(result):
     view = spadwarp.result.to_torch(result)
     assert view.tallies.data_ptr() == result.tallies.ctypes.data

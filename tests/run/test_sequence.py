@@ -43,11 +43,11 @@ def moving(base, tmp_path_factory):
     return simulate_sequence(base, folder / "poses.csv", folder / "sequence.h5", **options)
 
 
-def test_a_refitted_mesh_gives_the_bits_of_one_that_is_built(base, poses):
+def test_a_refitted_mesh_gives_the_bits_of_one_that_is_built(base, poses, device):
     kept = {}
     for scene in load_trajectory(poses).scenes(base):
-        one = spadwarp.simulate(scene, photons=3000, seed=3, device="cpu", kept=kept)
-        other = spadwarp.simulate(scene, photons=3000, seed=3, device="cpu")
+        one = spadwarp.simulate(scene, photons=3000, seed=3, device=device, kept=kept)
+        other = spadwarp.simulate(scene, photons=3000, seed=3, device=device)
         assert one.tallies.any() and np.array_equal(one.tallies, other.tallies)
         assert np.array_equal(one.truth.depth, other.truth.depth, equal_nan=True)
     assert len(kept) == 1

@@ -1,5 +1,6 @@
 """The full camera: Monte Carlo transport of photons through the water and against the shapes, world by world."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -62,6 +63,21 @@ def _advance_kernel(offset: wp.array(dtype=wp.uint64), count: wp.uint64):
     offset[0] = offset[0] + count
 
 
+@dataclasses.dataclass(frozen=True)
+class _Lane:
+    """What cameras that are traced one after the other share; lanes run side by side on a GPU.
+
+    Attributes:
+        stream: None for the device's current one.
+        data: Its tally and cursor; the ledger and the offset are those of all lanes.
+        light: Detections per pulse, `[pixels, bins of the tally]`.
+    """
+
+    stream: wp.Stream | None
+    data: Data
+    light: wp.array
+
+
 class SpadTracer(WorldCameras):
     """As `SpadCamera`, with all scattering: photons are traced through the water and against the shapes.
 
@@ -77,12 +93,13 @@ class SpadTracer(WorldCameras):
         photons: Of a step and camera, 1 ... 2^26.
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
+        lanes: Cameras that a GPU traces side by side, each with a tally: 24 B a pixel and bin of it.
         public_tree: See `make_surfaces`.
 
     Attributes:
         rates, histogram, counts, depth, true_depth, normal, albedo, step: As of `SpadCamera`; `rates` have the noise of
             the photons that were traced.
-        data: Ledger of the last step, for `read_ledger`, and the tally of the last camera.
+        data: Ledger of the last step, for `read_ledger`, and the tally of one of the cameras.
 
     Raises:
         ArgumentError: A number out of range, a world without shapes, or arrays that do not fit.
@@ -99,6 +116,7 @@ class SpadTracer(WorldCameras):
         frame: str = "optical",
         estimator: str = "guided",
         oversampling: int = 4,
+        lanes: int = 4,
         public_tree: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
@@ -119,10 +137,10 @@ class SpadTracer(WorldCameras):
         self._parts = check_integer("oversampling", oversampling, 1, 1024)
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(taps, dtype=float, device=self.device)
-        shape = (self.config.height * self.config.width, self._parts * self.config.bins)
-        self._light = wp.zeros(shape, dtype=float, device=self.device)
+        self._lane_count = min(check_integer("lanes", lanes, 1, 64), self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
+        self._lanes: list[_Lane] = []
         self.data: Data | None = None
 
     def update(self, camera_q: wp.array, body_q: wp.array | None = None) -> None:
@@ -131,26 +149,34 @@ class SpadTracer(WorldCameras):
         self._meshes.place(camera_q, self._optical, self.config.gate_paths[1])
         if not self._models:
             self._build()
-        config, detection, data = self.config, self._detection, self.data
-        rates = self.rates.reshape((self.cameras, config.height * config.width, config.bins))
-        factor = config.photons * config.pde / (self._models[0].scale * self.photons)
-        dark = config.dark_rate * config.bin_path / config.speed
+        data, models = self.data, self._models
         data.ledger.zero_()
-        for v, model in enumerate(self._models):
-            surfaces = model.surfaces
-            inputs = [self._face_shape[v], self.shapes.table]
-            outputs = [surfaces.reflectance, surfaces.corner_reflectance]
-            wp.launch(_albedo_kernel, surfaces.order.size, inputs, outputs, device=self.device)
-            update_surfaces(surfaces, model.mesh)
-            data.tally.zero_()
-            launch_transport(
-                self._spec, model, data, seed=config.seed, first_id=v * self.photons, photon_count=self.photons
-            )
-            wp.launch(_light_kernel, self._light.shape, [data.tally, factor], [self._light], device=self.device)
-            inputs = [self._light, dark, self._taps, self._lowest]
-            wp.launch(_response_kernel, rates[v].shape, inputs, [rates[v]], device=self.device)
+        for lane in self._lanes[1:]:
+            lane.stream.wait_stream(self.device.stream)
+        for v in range(self.cameras):
+            lane = self._lanes[v % len(self._lanes)]
+            with wp.ScopedStream(lane.stream, sync_enter=False):
+                self._trace(v, models[v], lane)
+        for lane in self._lanes[1:]:
+            self.device.stream.wait_stream(lane.stream)
         wp.launch(_advance_kernel, 1, [data.offset, self.cameras * self.photons], device=self.device)
-        detection.launch()
+        self._detection.launch()
+
+    def _trace(self, v: int, model: Model, lane: _Lane) -> None:
+        """Rates of one camera, on the device's current stream."""
+        config, surfaces, photons = self.config, model.surfaces, self.photons
+        inputs = [self._face_shape[v], self.shapes.table]
+        outputs = [surfaces.reflectance, surfaces.corner_reflectance]
+        wp.launch(_albedo_kernel, surfaces.order.size, inputs, outputs, device=self.device)
+        update_surfaces(surfaces, model.mesh)
+        lane.data.tally.zero_()
+        launch_transport(self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons)
+        factor = config.photons * config.pde / (model.scale * photons)
+        wp.launch(_light_kernel, lane.light.shape, [lane.data.tally, factor], [lane.light], device=self.device)
+        rates = self.rates[v].reshape((config.height * config.width, config.bins))
+        dark = config.dark_rate * config.bin_path / config.speed
+        inputs = [lane.light, dark, self._taps, self._lowest]
+        wp.launch(_response_kernel, rates.shape, inputs, [rates], device=self.device)
 
     def rebuild(self) -> None:
         """Builds the trees anew at the next step, for where things are then: faster rays where they have moved far.
@@ -199,6 +225,15 @@ class SpadTracer(WorldCameras):
         self._spec = TransportSpec(self._estimator, stepped=True, **surface_choices(models[0].surfaces))
         if self.data is None:
             self.data = make_data(models[0])
+            self._lanes = [self._make_lane(k, models[0]) for k in range(self._lane_count)]
+
+    def _make_lane(self, k: int, model: Model) -> _Lane:
+        data, stream = self.data, None
+        if k > 0:
+            own = make_data(model)
+            data, stream = dataclasses.replace(data, tally=own.tally, cursor=own.cursor), wp.Stream(self.device)
+        pixels = self.config.height * self.config.width
+        return _Lane(stream, data, wp.zeros((pixels, model.gate.bins), dtype=float, device=self.device))
 
     def _textures(self, owner: np.ndarray) -> "Textures | None":
         """The shapes' images for the faces of one camera's mesh."""

@@ -56,9 +56,9 @@ def distances(surfaces, device, count=20_000):
 
 def test_the_tree_is_read_as_warp_writes_it(device):
     """Warp's private structs: `pack_bvh` finds each face once, in boxes that hold it, whatever the builder."""
-    for constructor in ("sah", "median", *(["lbvh"] if wp.get_device(device).is_cuda else [])):
+    for constructor in ("sah", "median", "cubql", *(["lbvh"] if wp.get_device(device).is_cuda else [])):
         mesh, points = ball(device)
-        mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor)
+        mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
         try:
             nodes, _, order = (one.numpy() for one in pack_bvh(mesh, 1.2))
         except Exception as error:
@@ -104,6 +104,21 @@ def test_surfaces_follow_moving_points(public_tree, device):
     fresh = distances(sk.make_surfaces(new), device)[0]
     assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
     assert (np.abs(mine - before) > 1e-3).mean() > 0.1
+
+
+@pytest.mark.parametrize("constructor", ["sah", "cubql"])
+def test_surfaces_of_a_refitted_mesh(constructor, device):
+    """`simulate(kept=...)` makes surfaces of the mesh that it has kept, refitted."""
+    kept, points = ball(device)
+    mesh = wp.Mesh(wp.clone(kept.points), kept.indices, bvh_constructor=constructor, bvh_leaf_size=1)
+    moved = (points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)).astype(np.float32)
+    for one in (mesh, kept):
+        one.points.assign(moved)
+    mesh.refit()
+    new = wp.Mesh(kept.points, kept.indices)
+    mine, hers = distances(sk.make_surfaces(mesh), device)
+    fresh = distances(sk.make_surfaces(new), device)[0]
+    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
 
 
 def test_a_camera_map_cannot_follow(device):
