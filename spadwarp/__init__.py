@@ -38,9 +38,61 @@ _ROOMS = {
 }
 _HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["__version__", *_HOMES]
+__all__ = [  # written out for type checkers
+    "ArgumentError",
+    "ConfigError",
+    "DeviceError",
+    "FileError",
+    "Frames",
+    "MeshError",
+    "Ray",
+    "Result",
+    "Scene",
+    "SpadwarpError",
+    "__version__",
+    "arrival_time",
+    "budget",
+    "check",
+    "crlb",
+    "data_frame",
+    "detect",
+    "export",
+    "load",
+    "load_result",
+    "load_scene",
+    "merge",
+    "plan",
+    "simulate",
+    "simulate_analytic",
+    "sweep",
+    "truth_maps",
+]
 
+# Type checkers take "as" for public, and without `__getattr__` they find misspelled names.
 if TYPE_CHECKING:
+    from spadwarp import (
+        analytic as analytic,
+        benchmark as benchmark,
+        checks as checks,
+        dataset as dataset,
+        denoise as denoise,
+        device as device,
+        doctor as doctor,
+        errors as errors,
+        files as files,
+        frames as frames,
+        interop as interop,
+        io as io,
+        mesh as mesh,
+        parallel as parallel,
+        result as result,
+        run as run,
+        scene as scene,
+        transport as transport,
+        validate as validate,
+        viz as viz,
+        water as water,
+    )
     from spadwarp.analytic import budget, plan, simulate_analytic, sweep
     from spadwarp.checks import check
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
@@ -53,14 +105,14 @@ if TYPE_CHECKING:
     from spadwarp.run import export
     from spadwarp.scene import Scene, load_scene
     from spadwarp.transport import simulate, truth_maps
+else:
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(f"spadwarp.{_HOMES[name]}"), name)
-    if name in _ROOMS:
-        return import_module(f"spadwarp.{name}")
-    raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
+    def __getattr__(name: str) -> Any:
+        if name in _HOMES:
+            return getattr(import_module(f"spadwarp.{_HOMES[name]}"), name)
+        if name in _ROOMS:
+            return import_module(f"spadwarp.{name}")
+        raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -92,6 +92,7 @@ def test_every_public_name_is_there_whatever_was_imported():
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if module.name.split(".")[-1] != "__main__":
                 importlib.import_module(module.name)
+    assert set(spadwarp.__all__) == {"__version__", *spadwarp._HOMES}
     for name in spadwarp.__all__:
         assert getattr(spadwarp, name) is not None
         assert not inspect.ismodule(getattr(spadwarp, name)), name
@@ -109,11 +110,13 @@ def test_type_hints_are_for_those_who_import_it(package):
 
 _PLANTED = """
 import spadwarp
+from spadwarp import load_scene
 from spadwarp_kernels.detection import nothing  # wrong
 
 scene = spadwarp.load_scene("plane_5m")
 result = spadwarp.simulate(scene, photons="many")  # wrong
 result.depht()  # wrong
+spadwarp.simulat(scene)  # wrong
 seed: str = result.seed  # wrong
 frames = spadwarp.detect(result, pulses=1000, frames=[1], seed=1)  # wrong
 counts = spadwarp.detect(result, pulses=1000, frames=2, seed=1).counts
@@ -129,6 +132,7 @@ def test_a_type_checker_finds_planted_errors(tmp_path):
     program = tmp_path / "program.py"
     program.write_text(_PLANTED)
     options = [
+        "--strict",
         "--follow-imports=silent",
         "--no-site-packages",
         "--ignore-missing-imports",
