@@ -1,6 +1,7 @@
 """The shapes of each camera's world as one triangle mesh in the camera's optical frame, placed anew on the device."""
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -193,7 +194,10 @@ class CameraMeshes:
         meshes = []
         for v, indices in enumerate(self._indices):
             points = self.points[int(self._ends[v]) : int(self._ends[v + 1])]
-            meshes.append(wp.Mesh(points, wp.array(indices.ravel(), dtype=int, device=self.device)))
+            indices = wp.array(indices.ravel(), dtype=int, device=self.device)
+            # The fastest to walk, by measurement.
+            kind: dict[str, Any] = {"bvh_constructor": "cubql", "bvh_leaf_size": 1} if self.device.is_cuda else {}
+            meshes.append(wp.Mesh(points, indices, **kind))
         return meshes
 
 
