@@ -132,8 +132,8 @@ def make_data(
     )
 
 
-# Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing, which in a launch
-# of few photons is many of them for each thread.
+# Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing. A launch of few
+# photons has fewer, with several photons each.
 CUDA_THREADS = 1 << 19
 CUDA_THREADS_OF_FEW = 1 << 16
 PHOTONS_OF_A_THREAD = 8

@@ -22,9 +22,8 @@ def _depth_kernel(
     # Out:
     depth: wp.array(dtype=float),
     counts: wp.array(dtype=int),
-    step: wp.array(dtype=wp.int64),
 ):
-    """Planar depth, the counts of all bins, and the number of the next step. Launch: cameras x pixels."""
+    """Planar depth and the counts of all bins. Launch: cameras x pixels."""
     row = wp.tid()
     pixel = row % view.shape[0]
     total = int(0)
@@ -36,8 +35,11 @@ def _depth_kernel(
         z = depth_of_path(laser, view[pixel], gate_start + arrival[row] * bin_path)
         if z > 0.0:
             depth[row] = z
-    if row == 0:
-        step[0] = step[0] + wp.int64(1)
+
+
+@wp.kernel(enable_backward=False)
+def _advance_kernel(step: wp.array(dtype=wp.int64)):
+    step[0] = step[0] + wp.int64(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -89,17 +91,23 @@ class Detection:
             half_width=-lowest_tap - 1,
         )
 
-    def launch(self) -> None:
-        """Counts and depth of one step; nothing is allocated or read."""
-        config = self.config
-        histogram = self.histogram.reshape(self.rows)
-        first_photon_step(
-            self.rates.reshape(self.rows), pulses=config.pulses, frame=self.step, seed=config.seed, counts=histogram
+    def launch(self, cameras: range) -> None:
+        """Counts and depth of some cameras; nothing is allocated or read."""
+        config, pixels = self.config, self.view.size
+        rows = range(cameras.start * pixels, cameras.stop * pixels)
+        rates, counts = self.rates.reshape(self.rows), self.histogram.reshape(self.rows)
+        first_photon_step(rates, pulses=config.pulses, frame=self.step, seed=config.seed, counts=counts, rows=rows)
+        histogram, arrival, depth, total = (
+            array[rows.start : rows.stop]
+            for array in (counts, self._arrival, self.depth.flatten(), self.counts.flatten())
         )
-        self._estimate(histogram, self._arrival)
-        inputs = [self._arrival, self.view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
-        outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
-        wp.launch(_depth_kernel, self.rows[0], [*inputs, histogram], outputs, device=self.depth.device)
+        self._estimate(histogram, arrival)
+        inputs = [arrival, self.view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
+        wp.launch(_depth_kernel, len(rows), [*inputs, histogram], [depth, total], device=depth.device)
+
+    def advance(self) -> None:
+        """The next step, after `launch` of all cameras."""
+        wp.launch(_advance_kernel, 1, [self.step], device=self.step.device)
 
     def points(self, pose: wp.transform, out: wp.array) -> None:
         """Points of the depth image in another frame than the optical one."""
