@@ -117,7 +117,7 @@ def main():
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--bins", type=int, default=256)
     parser.add_argument("--photons", type=float, default=1e6, help="of a step and world")
-    parser.add_argument("--lanes", type=int, default=4, help="cameras that SpadTracer traces side by side on a GPU")
+    parser.add_argument("--lanes", type=int, default=16, help="cameras that SpadTracer traces side by side on a GPU")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--device", help='"cpu" or "cuda:0"; by default the GPU, if there is one')
     options = parser.parse_args()

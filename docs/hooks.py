@@ -2,7 +2,8 @@
 
 Links in the sources lead from file to file, so that they work where the files are read; here they become those of the
 site. What a link leads to that is not on the site keeps its text. Notebooks are executed; those with outputs are kept
-in out/notebooks until the notebook changes.
+in out/notebooks until the notebook changes. Tests put those that they have executed there, if
+SPADWARP_EXECUTED_NOTEBOOKS names that folder.
 """
 
 from __future__ import annotations

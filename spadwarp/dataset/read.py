@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
+import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -200,11 +202,43 @@ class SpadDataset(FrameReader):
     def __getitem__(self, index: int) -> dict[str, Any]:
         import torch
 
-        item = super().__getitem__(index)
-        return {
-            name: torch.from_numpy(value) if isinstance(value, np.ndarray) else torch.tensor(value)
-            for name, value in item.items()
-        }
+        _collate_ours()
+        return SpadItem(
+            (name, torch.from_numpy(value) if isinstance(value, np.ndarray) else torch.tensor(value))
+            for name, value in super().__getitem__(index).items()
+        )
+
+
+class SpadItem(dict[str, Any]):
+    """Tensors of `SpadDataset` by name. A worker of a `DataLoader` hands a batch of them over in one piece of shared
+    memory, not one for each name: three quarters of the processor time."""
+
+
+@functools.cache
+def _collate_ours() -> None:
+    """Tells torch's `default_collate` what to do with items, in this process."""
+    from torch.utils.data._utils.collate import default_collate_fn_map
+
+    default_collate_fn_map[SpadItem] = _collate
+
+
+def _collate(items: list[SpadItem], *, collate_fn_map: Any = None) -> dict[str, Any]:
+    """A batch of items: tensors by name, their first dimension the items."""
+    import torch
+
+    if torch.utils.data.get_worker_info() is None:
+        return {name: torch.stack([item[name] for item in items]) for name in items[0]}
+    batch: dict[str, Any] = {}
+    starts: dict[str, int] = {}
+    end = 0
+    for name, first in items[0].items():
+        starts[name] = end // first.element_size()
+        end += -(-len(items) * math.prod(first.shape) * first.element_size() // 64) * 64  # each begins at a cache line
+    storage = torch.UntypedStorage._new_shared(end)
+    for name, first in items[0].items():
+        batch[name] = torch.empty(0, dtype=first.dtype).set_(storage, starts[name], (len(items), *first.shape))
+        torch.stack([item[name] for item in items], out=batch[name])
+    return batch
 
 
 def iterate_dataset(

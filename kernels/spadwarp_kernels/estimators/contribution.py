@@ -231,7 +231,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    confocal, reflecting = spec.confocal, spec.reflecting
+    confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
     water_extinction = spec.water.extinction
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
@@ -272,8 +272,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
             extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
+            component = wp.where(wp.static(merged), BALLISTIC, request.component)
             found.contribution.value = value_of(camera, extinction, weight, scattering, link)
-            found.contribution.index = tally_index(camera, gate, pixel, path + link.path, request.component)
+            found.contribution.index = tally_index(camera, gate, pixel, path + link.path, component)
         found.lens = link.end
         return found
 

@@ -35,8 +35,8 @@ class TransportSpec(NamedTuple):
         public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
-        way_back: `Limits.max_path` holds with the way back to the lens: a history ends where no light of it can come to
-            the lens by then.
+        merged: The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is below
+            one unit do not tell components then.
         port: What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
             water.
         laser_port: The same of the laser and `Laser.port`.
@@ -64,7 +64,7 @@ class TransportSpec(NamedTuple):
     reflecting: bool = False
     public_tree: bool = False
     stepped: bool = False
-    way_back: bool = False
+    merged: bool = False
     port: PortKind | None = None
     laser_port: PortKind | None = None
     grid: Water | None = None

@@ -39,6 +39,7 @@ from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
+from spadwarp_kernels.tally.tally import COMPONENTS
 
 if TYPE_CHECKING:
     from .launch import Data, Model
@@ -90,6 +91,8 @@ def check_spec(spec: Any) -> None:
         raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
     if spec.reflecting and not spec.bounded:
         raise ArgumentError("spec.reflecting = True needs spec.bounded = True")
+    if spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.derivatives):
+        raise ArgumentError("spec.merged goes with guided and next_event, without spec.reflecting and spec.derivatives")
     _check_kinds(spec)
 
 
@@ -281,7 +284,8 @@ def _check_scan(model: Model, estimator: Estimator) -> None:
 
 def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estimator, photon_count: int) -> None:
     device = model.device
-    size = check_integer("bins of the tally", model.tally_size, 1) if estimator.scores else None
+    bins = model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
+    size = check_integer("bins of the tally", bins, 1) if estimator.scores else None
     check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
     if spec.derivatives and size is not None:
         size = check_integer("bins of data.gradients", size * len(spec.derivatives), 1)

@@ -132,11 +132,8 @@ def make_data(
     )
 
 
-# Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing. A launch of few
-# photons has fewer, with several photons each.
+# Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing.
 CUDA_THREADS = 1 << 19
-CUDA_THREADS_OF_FEW = 1 << 16
-PHOTONS_OF_A_THREAD = 8
 
 
 def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> None:
@@ -171,7 +168,7 @@ def launch_transport(
     first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
     seed = check_seed(seed)
     check_launch(spec, model, data, photon_count)
-    threads = _cuda_threads(photon_count) if model.device.is_cuda else 1
+    threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
     data.cursor.zero_()
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
@@ -197,11 +194,6 @@ def launch_transport(
         device=model.device,
         block_dim=BLOCK_SIZE,
     )
-
-
-def _cuda_threads(photon_count: int) -> int:
-    threads = max(photon_count // PHOTONS_OF_A_THREAD, min(photon_count, CUDA_THREADS_OF_FEW))
-    return min(-(-threads // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS)
 
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:

@@ -20,15 +20,7 @@ from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
 from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
-from spadwarp_kernels.tally.ledger import (
-    DIRECTED,
-    EXIT,
-    MAX_COLLISIONS,
-    MAX_PATH,
-    ROULETTE,
-    WEIGHT_CUTOFF,
-    add_to_ledger,
-)
+from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
 
@@ -223,7 +215,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     `flies_on`: see `make_flies`.
     """
     has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
-    way_back = spec.way_back
     survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
     derives, event_scores = bool(spec.derivatives), make_event_scores(spec)
@@ -264,10 +255,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             new.weight.value *= survival.part
         new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
         new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
-        if wp.static(way_back):
-            # Beyond the rounding of a path of many flights.
-            if new.reason < 0 and s.path + wp.length(s.x) > 1.0001 * limits.max_path + camera.aperture_radius:
-                new.reason = MAX_PATH
         if not flies(new.reason):
             return new
         reflected = s.u

@@ -170,19 +170,3 @@ def test_transport_by_public_queries_and_by_steps(device):
     stepped = spec._replace(stepped=True)
     assert np.array_equal(tally(model, stepped), light)
     assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
-
-
-@pytest.mark.parametrize("estimator", ["next_event", "guided"])
-def test_what_cannot_come_back_within_the_gate_ends(estimator, device):
-    """`way_back` ends histories early and takes no light from the histogram."""
-    mesh, points = ball(device)
-    mesh.points.assign(points + np.array([0.0, 0.0, 3.0], np.float32))
-    mesh.refit()
-    model = small_model(mesh, sk.make_surfaces(mesh, 0.5))
-    spec, light, collisions = sk.TransportSpec(estimator), [], []
-    for one in (spec, spec._replace(way_back=True)):
-        data = sk.make_data(model)
-        sk.launch_transport(one, model, data, seed=3, first_id=0, photon_count=20_000)
-        light.append(data.tally.numpy())
-        collisions.append(sk.read_ledger(data)[1]["water_collisions"])
-    assert light[0].any() and np.array_equal(*light) and collisions[1] < 0.95 * collisions[0]
