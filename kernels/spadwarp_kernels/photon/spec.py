@@ -35,8 +35,8 @@ class TransportSpec(NamedTuple):
         public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
-        merged: The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is below
-            one unit do not tell components then.
+        merged: The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is
+            below one unit do not tell components then.
         port: What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
             water.
         laser_port: The same of the laser and `Laser.port`.

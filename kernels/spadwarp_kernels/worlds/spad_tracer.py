@@ -92,7 +92,7 @@ class SpadTracer(WorldCameras):
         photons: Of a step and camera, 1 ... 2^26.
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
-        lanes: Cameras that a GPU traces side by side, each with a tally and its light: 12 B a pixel and bin of the tally.
+        lanes: Cameras that a GPU traces side by side, each with memory of its own: 12 B a pixel and bin of the tally.
         public_tree: See `make_surfaces`.
 
     Attributes:

@@ -170,3 +170,10 @@ def test_transport_by_public_queries_and_by_steps(device):
     stepped = spec._replace(stepped=True)
     assert np.array_equal(tally(model, stepped), light)
     assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
+    # One tally for all components.
+    small = wp.zeros(light.size // 3, dtype=wp.int64, device=device)
+    data = dataclasses.replace(sk.make_data(model, histogram=False), tally=small)
+    sk.launch_transport(spec._replace(merged=True), model, data, seed=3, first_id=0, photon_count=20_000)
+    assert np.array_equal(small.numpy(), light.reshape(3, -1).sum(axis=0))
+    with pytest.raises(sk.ArgumentError, match="merged goes with guided and next_event"):
+        tally(model, sk.TransportSpec("analog", merged=True))
