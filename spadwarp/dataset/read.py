@@ -228,15 +228,13 @@ def _collate(items: list[SpadItem], *, collate_fn_map: Any = None) -> dict[str, 
 
     if torch.utils.data.get_worker_info() is None:
         return {name: torch.stack([item[name] for item in items]) for name in items[0]}
-    batch: dict[str, Any] = {}
-    starts: dict[str, int] = {}
-    end = 0
-    for name, first in items[0].items():
-        starts[name] = end // first.element_size()
-        end += -(-len(items) * math.prod(first.shape) * first.element_size() // 64) * 64  # each begins at a cache line
-    storage = torch.UntypedStorage._new_shared(end)
-    for name, first in items[0].items():
-        batch[name] = torch.empty(0, dtype=first.dtype).set_(storage, starts[name], (len(items), *first.shape))
+    shapes = {name: (len(items), *first.shape) for name, first in items[0].items()}
+    sizes = [math.prod(shape) * items[0][name].element_size() for name, shape in shapes.items()]
+    starts = [0, *np.cumsum([-(-size // 64) * 64 for size in sizes]).tolist()]  # each at the beginning of a cache line
+    memory = torch.empty(0, dtype=torch.uint8).set_(torch.UntypedStorage._new_shared(starts[-1]))
+    batch = {}
+    for (name, shape), start, size in zip(shapes.items(), starts, sizes, strict=False):
+        batch[name] = memory[start : start + size].view(items[0][name].dtype).view(shape)
         torch.stack([item[name] for item in items], out=batch[name])
     return batch
 
