@@ -40,7 +40,6 @@ Floats = NDArray[np.float64]
 _ANGLES = np.linspace(0.0, math.pi, 1441)  # of scattering
 _BAND_NODES = 13
 _PART_PIXELS = 1 << 16
-_DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
 
 class _Field(NamedTuple):
@@ -125,7 +124,7 @@ def daylight_radiance(
         reflectance: Of it, Lambertian `[...]`.
 
     Raises:
-        ConfigError: A scene without `[daylight]`, or whose camera looks down through the surface.
+        ConfigError: A scene without `[daylight]`.
         ArgumentError: A wavelength out of range.
     """
     seen = _Seen.of(scene, np.asarray(view, np.float64), distance, normal, reflectance)
@@ -207,12 +206,6 @@ class _Seen(NamedTuple):
         if port is None:
             return cls(view, far, faces, shade, 0.0, 1.0, shape)
         down = _daylight(scene).down @ rotation_matrix(scene.camera.rotation_deg)
-        if port.shape == "flat" and not port.thickness and down @ np.array(port.normal) > _DOWNWARDS:
-            raise ConfigError(
-                "daylight does not go with a camera.port that is the surface, seen from above: the sky that it "
-                "reflects is not modelled",
-                source=None if scene.source is None else str(scene.source),
-            )
         start, direction, lead, _ = port.enter(np.zeros(3), view)
         passes = np.isfinite(lead)
         passed = port.transmission(np.zeros(3), view) * (port.index[0] / port.index[2]) ** 2

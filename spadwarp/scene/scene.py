@@ -39,6 +39,8 @@ from spadwarp.units import path_from_time
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
+_DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
+
 
 class Scene(BaseModel):
     """Everything a run depends on, checked and frozen."""
@@ -104,6 +106,13 @@ class Scene(BaseModel):
                     port.indices(self.laser.wavelength_nm)
                 except ValueError as error:
                     raise ValueError(f"{section}.port.{error}") from None
+        if self.daylight is not None and camera is not None and camera.shape == "flat" and not camera.thickness:
+            normal = rotation_matrix(self.camera.rotation_deg) @ camera.axis
+            if self.daylight.down @ normal > _DOWNWARDS:
+                raise ValueError(
+                    "daylight does not go with a camera.port that is the surface, seen from above: the sky that it "
+                    "reflects is not modelled"
+                )
         if self.scan.mode != "none" and (camera is not None or laser is not None):
             if laser != "camera":
                 raise ValueError("scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both")
