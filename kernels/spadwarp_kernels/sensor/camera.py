@@ -141,11 +141,12 @@ def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.
 @wp.func
 def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
-    # Selected rather than branched to: half the lanes of a warp go either way.
+    # Selected rather than branched to: half the lanes of a warp go either way. Along the plane the crossing is infinite.
     crossing = -value / slope
-    lower = wp.where(slope > 0.0, wp.max(interval[0], crossing), interval[0])
-    upper = wp.where(slope < 0.0, wp.min(interval[1], crossing), interval[1])
-    return wp.vec2(lower, wp.where(slope == 0.0 and value <= 0.0, -1.0, upper))
+    rising = slope >= 0.0
+    lower = wp.where(rising, wp.max(interval[0], crossing), interval[0])
+    upper = wp.where(rising, interval[1], wp.min(interval[1], crossing))
+    return wp.vec2(lower, upper)
 
 
 @wp.func
