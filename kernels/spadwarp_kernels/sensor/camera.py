@@ -175,13 +175,10 @@ def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
     z = x[2]
     # Radius of the circle of confusion, at the distance of x.
     blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
-    return (
-        z > 0.0
-        and x[0] > view[0] * z - blur
-        and x[0] < view[2] * z + blur
-        and x[1] > view[1] * z - blur
-        and x[1] < view[3] * z + blur
+    inside = wp.min(
+        wp.min(x[0] - view[0] * z, view[2] * z - x[0]), wp.min(x[1] - view[1] * z, view[3] * z - x[1])
     )
+    return z > 0.0 and inside > -blur
 
 
 @wp.func
