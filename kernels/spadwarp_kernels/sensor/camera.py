@@ -141,7 +141,8 @@ def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.
 @wp.func
 def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
-    # Selected rather than branched to: half the lanes of a warp go either way. Along the plane the crossing is infinite.
+    # Selected rather than branched to: half the lanes of a warp go either way. For a flight along the plane the
+    # crossing is infinite.
     crossing = -value / slope
     rising = slope >= 0.0
     lower = wp.where(rising, wp.max(interval[0], crossing), interval[0])
@@ -175,9 +176,7 @@ def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
     z = x[2]
     # Radius of the circle of confusion, at the distance of x.
     blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
-    inside = wp.min(
-        wp.min(x[0] - view[0] * z, view[2] * z - x[0]), wp.min(x[1] - view[1] * z, view[3] * z - x[1])
-    )
+    inside = wp.min(wp.min(x[0] - view[0] * z, view[2] * z - x[0]), wp.min(x[1] - view[1] * z, view[3] * z - x[1]))
     return z > 0.0 and inside > -blur
 
 
