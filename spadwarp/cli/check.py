@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
 
 import spadwarp
 from spadwarp.cli import _options as opt
@@ -16,6 +19,10 @@ from spadwarp.units import with_prefix
 def check(
     scene_path: opt.ScenePath,
     mesh: opt.Mesh = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw the water cut open, with laser, camera and targets."),
+    ] = None,
     overrides: opt.Overrides = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -26,14 +33,17 @@ def check(
     Exit code 0 with or without warnings, 2 for a scene that is not valid.
 
     \b
-    Example:
+    Examples:
       spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
+      spadwarp check sediment_4m --picture water.png
     """
     from spadwarp.checks import summary
     from spadwarp.mesh import build_mesh
 
     scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides)
-    outputs = opt.check_outputs(json=json_path, inputs=(scene_path, *scene.files), overwrite=overwrite)
+    outputs = opt.check_outputs(
+        files={"--picture": picture}, json=json_path, inputs=(scene_path, *scene.files), overwrite=overwrite
+    )
     triangles = build_mesh(scene)
     messages, numbers = spadwarp.check(scene, triangles), summary(scene, triangles)
     faces = 0 if triangles is None else triangles.face_count
@@ -45,6 +55,10 @@ def check(
             say(str(message))
     if not quiet and not any(message.level == "warning" for message in messages):
         say(f"{scene_path}: valid, no warnings")
+    if picture is not None:
+        spadwarp.viz.draw_water(scene, picture, triangles)
+        if not quiet:
+            say(f"written: {picture}")
     found = [dataclasses.asdict(message) for message in messages]
     outputs.write_json({"scene": scene_path, "faces": faces, **numbers, "messages": found})
 

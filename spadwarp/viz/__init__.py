@@ -13,6 +13,7 @@ from spadwarp.viz.targets import describe_targets, draw_mesh, draw_targets
 from spadwarp.viz.transient_video import video
 from spadwarp.viz.validation import draw_validation
 from spadwarp.viz.viewer import view
+from spadwarp.viz.water import draw_water
 
 __all__ = ["describe_targets", "draw_analytic", "draw_budget", "draw_dataset", "draw_denoised", "draw_depth"]
 __all__ += [
@@ -24,5 +25,6 @@ __all__ += [
     "draw_sweep",
     "draw_targets",
     "draw_validation",
+    "draw_water",
 ]
 __all__ += ["html", "plot", "progress_bar", "video", "view"]

@@ -38,8 +38,7 @@ class Grid:
         block_edge: Cells along the edges of a block.
         block_size: Number of blocks along the three edges of the box; the last may be incomplete.
         block_majorant: Largest c in each block [1/m].
-        block_mean: Mean c of each block [1/m].
-        block_deviation: Largest difference from it in the block [1/m].
+        block_control: Mean c of each block, and the largest difference from it in the block [1/m].
     """
 
     turn: wp.mat33
@@ -51,13 +50,12 @@ class Grid:
     block_edge: int
     block_size: wp.vec3i
     block_majorant: wp.array(dtype=float)
-    block_mean: wp.array(dtype=float)
-    block_deviation: wp.array(dtype=float)
+    block_control: wp.array(dtype=wp.vec2)
 
 
 @wp.struct
 class GridLine:
-    """A line x + t u through the cells, or blocks, of a grid.
+    """A line x + t u through the cells of a grid.
 
     Attributes:
         begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
@@ -101,18 +99,18 @@ def _inverse(d: float) -> float:
 
 
 @wp.func
-def grid_line(grid: Grid, edge: int, size: wp.vec3i, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
-    """The part of the line x + t u, 0 <= t <= length, in the box, through blocks of `edge` cells, `size` of them."""
+def grid_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
+    """The part of the line x + t u, 0 <= t <= length, in the box."""
     line = GridLine()
-    scale = 1.0 / float(edge)
-    p = scale * (grid.turn * x + grid.shift)
-    d = scale * (grid.turn * u)
+    size = grid.size
+    p = grid.turn * x + grid.shift
+    d = grid.turn * u
     line.inverse = wp.vec3(_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
     line.shift = -wp.cw_mul(p, line.inverse)
     line.end = length
     for i in range(3):
         low = line.shift[i]
-        high = scale * float(grid.size[i]) * line.inverse[i] + line.shift[i]
+        high = float(size[i]) * line.inverse[i] + line.shift[i]
         line.begin = wp.max(line.begin, wp.min(low, high))
         line.end = wp.min(line.end, wp.max(low, high))
     for i in range(3):
@@ -179,15 +177,106 @@ def grid_cell(grid: Grid, x: wp.vec3) -> int:
 
 
 @wp.func
-def grid_block(grid: Grid, x: wp.vec3) -> int:
-    """Index of the block at a point [m]; -1 outside the box."""
-    p = grid.turn * x + grid.shift
-    i = int(wp.floor(p[0]))
-    j = int(wp.floor(p[1]))
-    k = int(wp.floor(p[2]))
-    inside = i >= 0 and j >= 0 and k >= 0 and i < grid.size[0] and j < grid.size[1] and k < grid.size[2]
-    row = (i // grid.block_edge) * grid.block_size[1] + j // grid.block_edge
-    return wp.where(inside, row * grid.block_size[2] + k // grid.block_edge, -1)
+def cell_on_line(grid: Grid, p: wp.vec3, d: wp.vec3, t: float) -> int:
+    """Index of the cell at p + t d, in cells, of a line within the box; the nearest one for what rounding puts beside
+    it."""
+    i = wp.clamp(int(p[0] + t * d[0]), 0, grid.size[0] - 1)
+    j = wp.clamp(int(p[1] + t * d[1]), 0, grid.size[1] - 1)
+    k = wp.clamp(int(p[2] + t * d[2]), 0, grid.size[2] - 1)
+    return (i * grid.size[1] + j) * grid.size[2] + k
+
+
+@wp.struct
+class BlockLine:
+    """A line x + t u through the blocks of a grid.
+
+    Attributes:
+        begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
+        p, d: x and u in cells.
+        step: By which t rises through a block, by axis [m].
+        stride: What a step along each axis adds to the index of the block.
+    """
+
+    begin: float
+    end: float
+    p: wp.vec3
+    d: wp.vec3
+    step: wp.vec3
+    stride: wp.vec3i
+
+
+@wp.struct
+class BlockPlace:
+    """A place on a line.
+
+    Attributes:
+        t: Where it is [m].
+        stop: Where it leaves the block, or the line ends [m].
+        block: Index of the block.
+        at: Where the line meets the next planes between blocks, by axis [m].
+    """
+
+    t: float
+    stop: float
+    block: int
+    at: wp.vec3
+
+
+@wp.func
+def block_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> BlockLine:
+    """The part of the line x + t u, 0 <= t <= length, in the box."""
+    line = BlockLine()
+    line.p = grid.turn * x + grid.shift
+    line.d = grid.turn * u
+    line.end = length
+    for i in range(3):
+        inverse = _inverse(line.d[i])
+        low = -line.p[i] * inverse
+        high = (float(grid.size[i]) - line.p[i]) * inverse
+        line.begin = wp.max(line.begin, wp.min(low, high))
+        line.end = wp.min(line.end, wp.max(low, high))
+        line.step[i] = float(grid.block_edge) * wp.abs(inverse)
+    row = grid.block_size[2]
+    layer = grid.block_size[1] * row
+    line.stride = wp.vec3i(
+        wp.where(line.d[0] < 0.0, -layer, layer), wp.where(line.d[1] < 0.0, -row, row), wp.where(line.d[2] < 0.0, -1, 1)
+    )
+    return line
+
+
+@wp.func
+def first_block(grid: Grid, line: BlockLine) -> BlockPlace:
+    """Where a line that meets the box enters it."""
+    place = BlockPlace()
+    place.t = line.begin
+    edge = float(grid.block_edge)
+    for i in range(3):
+        number = wp.clamp(wp.floor((line.p[i] + line.begin * line.d[i]) / edge), 0.0, float(grid.block_size[i] - 1))
+        place.block = place.block * grid.block_size[i] + int(number)
+        plane = edge * wp.where(line.d[i] < 0.0, number, number + 1.0)
+        place.at[i] = (plane - line.p[i]) * _inverse(line.d[i])
+    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
+    return place
+
+
+@wp.func
+def next_block(grid: Grid, line: BlockLine, here: BlockPlace) -> BlockPlace:
+    """Where the line enters the next block; planes are counted by steps, since blocks are few."""
+    place = here
+    place.t = here.stop
+    x = here.at[0] <= here.stop
+    y = not x and here.at[1] <= here.stop
+    z = not x and not y
+    place.at = wp.vec3(
+        wp.where(x, here.at[0] + line.step[0], here.at[0]),
+        wp.where(y, here.at[1] + line.step[1], here.at[1]),
+        wp.where(z, here.at[2] + line.step[2], here.at[2]),
+    )
+    stride = wp.where(x, line.stride[0], wp.where(y, line.stride[1], line.stride[2]))
+    # Rounding may let a line leave the box a step late: no index leaves the arrays.
+    place.block = wp.clamp(here.block + stride, 0, grid.block_majorant.shape[0] - 1)
+    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
+    return place
 
 
 def make_grid(
@@ -248,8 +337,8 @@ def make_grid(
     blocks = block_statistics(arrays["extinction"], edge_cells)
     grid.block_edge = edge_cells
     grid.block_size = wp.vec3i(*blocks[0].shape)
-    for name, values in zip(("majorant", "mean", "deviation"), blocks, strict=True):
-        setattr(grid, f"block_{name}", wp.array(values.ravel(), dtype=float, device=device))
+    grid.block_majorant = wp.array(blocks[0].ravel(), dtype=float, device=device)
+    grid.block_control = wp.array(np.stack([b.ravel() for b in blocks[1:]], axis=1), dtype=wp.vec2, device=device)
     return grid
 
 

@@ -10,12 +10,21 @@ import warp as wp
 from spadwarp_kernels.random.philox import u01, u01_open
 from spadwarp_kernels.random.splitmix import splitmix
 
-from .grid import first_place, grid_block, grid_cell, grid_line, next_place
+from .grid import (
+    block_line,
+    cell_on_line,
+    first_block,
+    first_place,
+    grid_cell,
+    grid_line,
+    next_block,
+    next_place,
+)
 from .layers import Layers, Profile, ProfileSample, Water
 from .water import Medium
 
 # Pieces of a flight in which `guided` draws its points from the extinction of the block in the middle.
-_PIECES = wp.constant(12)
+_PIECES = wp.constant(10)
 
 
 @wp.func
@@ -28,7 +37,7 @@ def _over(depth: float, extinction: float) -> float:
 def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
     """Optical depth of the cells between x and x + length u."""
     grid = layers.grid
-    line = grid_line(grid, 1, grid.size, x, u, length)
+    line = grid_line(grid, x, u, length)
     if line.begin >= line.end:
         return medium.extinction * length
     depth = medium.extinction * (length - (line.end - line.begin))
@@ -43,7 +52,7 @@ def depth_along(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: 
 def distance_to(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, depth: float) -> float:
     """Distance [m] from x along u to an optical depth of the cells; 1e30: there is none."""
     grid = layers.grid
-    line = grid_line(grid, 1, grid.size, x, u, 1.0e30)
+    line = grid_line(grid, x, u, 1.0e30)
     before = medium.extinction * line.begin
     if line.begin >= line.end or depth <= before:
         return _over(depth, medium.extinction)
@@ -99,6 +108,10 @@ def draw_by_blocks(
     wanted = int(-1)
     if given >= 0.0:
         wanted = wp.min(int(given / step), _PIECES - 1)
+    scale = 1.0 / float(grid.block_edge)
+    along = (scale * step) * (grid.turn * u)
+    p = scale * (grid.turn * x + grid.shift) + 0.5 * along
+    size = scale * wp.vec3(float(grid.size[0]), float(grid.size[1]), float(grid.size[2]))
     rest = float(xi)
     passed = float(1.0)
     total = float(0.0)
@@ -107,9 +120,11 @@ def draw_by_blocks(
     extinction = float(0.0)
     k = int(0)
     while k < _PIECES:  # not unrolled: registers are few
-        block = grid_block(grid, x + (float(k) + 0.5) * step * u)
-        c = grid.block_mean[wp.max(block, 0)]
-        c = wp.where(block >= 0, c, medium.extinction) + 0.1 / width
+        c = float(medium.extinction)
+        if wp.min(p[0], wp.min(p[1], p[2])) >= 0.0 and p[0] < size[0] and p[1] < size[1] and p[2] < size[2]:
+            c = grid.block_control[(int(p[0]) * grid.block_size[1] + int(p[1])) * grid.block_size[2] + int(p[2])][0]
+        p += along
+        c += 0.1 / width
         left = wp.exp(-c * step)
         share = passed * wp.min(c * step, 1.0)
         passed *= left
@@ -166,63 +181,63 @@ def regular_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, l
 def delta_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     """Free flight [m] by delta tracking: from xi the first tentative collision, from the seed the others."""
     grid = layers.grid
-    line = grid_line(grid, grid.block_edge, grid.block_size, x, u, 1.0e30)
+    line = block_line(grid, x, u, 1.0e30)
     rest = -wp.log(xi)
     before = medium.extinction * line.begin
     if line.begin >= line.end or rest <= before:
         return _over(rest, medium.extinction)
     rest -= before
-    place = first_place(line, grid.block_size)
+    place = first_block(grid, line)
     number = int(0)
     while place.t < line.end:
-        majorant = grid.block_majorant[place.cell]
-        leave = wp.min(place.leave, line.end)
-        kept = majorant * (leave - place.t)
+        # First through the blocks, then the collision: the lanes of a warp do either together.
+        majorant = float(grid.block_majorant[place.block])
+        while majorant * (place.stop - place.t) < rest and place.stop < line.end:
+            rest -= majorant * (place.stop - place.t)
+            place = next_block(grid, line, place)
+            majorant = grid.block_majorant[place.block]
+        kept = majorant * (place.stop - place.t)
         if kept < rest:
-            rest -= kept
-            place = next_place(line, place)
-        else:
-            place.t = wp.min(place.t + _over(rest, majorant), leave)
-            number += 1
-            words = splitmix(seed, number)
-            cell = grid_cell(grid, x + place.t * u)
-            extinction = grid.extinction[wp.max(cell, 0)]
-            if cell >= 0 and u01(words[0]) * majorant < extinction:
-                return place.t
-            rest = -wp.log(u01_open(words[1]))
+            return line.end + _over(rest - kept, medium.extinction)
+        place.t = wp.min(place.t + _over(rest, majorant), place.stop)
+        number += 1
+        words = splitmix(seed, number)
+        if u01(words[0]) * majorant < grid.extinction[cell_on_line(grid, line.p, line.d, place.t)]:
+            return place.t
+        rest = -wp.log(u01_open(words[1]))
     return line.end + _over(rest, medium.extinction)
 
 
 @wp.func
 def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     """Extinction [1/m] whose exp(-mean length) has the expectation of what passes between x and x + length u; by
-    residual ratio tracking."""
+    residual ratio tracking about the mean extinction of the blocks."""
     grid = layers.grid
-    line = grid_line(grid, grid.block_edge, grid.block_size, x, u, length)
+    line = block_line(grid, x, u, length)
     if line.begin >= line.end:
         return medium.extinction
     depth = medium.extinction * (length - (line.end - line.begin))
     part = float(1.0)
     number = int(1)
     rest = -wp.log(u01_open(splitmix(seed, number)[1]))
-    place = first_place(line, grid.block_size)
+    place = first_block(grid, line)
     while place.t < line.end:
-        mean = grid.block_mean[place.cell]
-        deviation = grid.block_deviation[place.cell]
-        leave = wp.min(place.leave, line.end)
-        kept = deviation * (leave - place.t)
-        if kept < rest:
-            rest -= kept
-            depth += mean * (leave - place.t)
-            place = next_place(line, place)
-        else:
-            t = wp.min(place.t + _over(rest, deviation), leave)
-            depth += mean * (t - place.t)
-            place.t = t
+        control = grid.block_control[place.block]
+        while control[1] * (place.stop - place.t) < rest and place.stop < line.end:
+            rest -= control[1] * (place.stop - place.t)
+            depth += control[0] * (place.stop - place.t)
+            place = next_block(grid, line, place)
+            control = grid.block_control[place.block]
+        t = wp.min(place.t + _over(rest, control[1]), place.stop)
+        if control[1] * (place.stop - place.t) < rest:
+            t = place.stop
+        depth += control[0] * (t - place.t)
+        hit = t < line.end
+        place.t = t
+        if hit:
             number += 1
-            cell = grid_cell(grid, x + t * u)
-            if cell >= 0:
-                part *= wp.clamp(1.0 - (grid.extinction[cell] - mean) / deviation, 0.0, 2.0)
+            extinction = grid.extinction[cell_on_line(grid, line.p, line.d, t)]
+            part *= wp.max(1.0 - (extinction - control[0]) / wp.max(control[1], 1.0e-30), 0.0)
             rest = -wp.log(u01_open(splitmix(seed, number)[1]))
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 

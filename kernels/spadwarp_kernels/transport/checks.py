@@ -184,8 +184,8 @@ def _check_grid(grid: Grid, device: wp.Device) -> None:
     edge = check_integer("model.layers.grid.block_edge", grid.block_edge, 1)
     if sizes["block_size"] != [-(-count // edge) for count in sizes["size"]]:
         raise ArgumentError(f"model.layers.grid: {sizes['block_size']} blocks of {edge} cells; see make_grid")
-    for name in ("block_majorant", "block_mean", "block_deviation"):
-        check_array(f"model.layers.grid.{name}", getattr(grid, name), wp.float32, (blocks,), device)
+    for name, kind in (("block_majorant", wp.float32), ("block_control", wp.vec2)):
+        check_array(f"model.layers.grid.{name}", getattr(grid, name), kind, (blocks,), device)
 
 
 def _check_laser(spec: TransportSpec, model: Model) -> None:
