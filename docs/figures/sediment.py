@@ -20,17 +20,22 @@ GATE = (34.5, 38.5)  # [ns], about the target
 Floats = NDArray[np.float64]
 
 
+def _times(result: Result) -> Floats:
+    """Middles of the bins [ns]."""
+    return 0.5e9 * (result.bin_edges[1:] + result.bin_edges[:-1])
+
+
 def images(result: Result) -> tuple[Floats, Floats]:
     """Expected detections per pulse by pixel: of all light, as the eye or a camera without a gate sees it, and within
     the gate."""
     values = result.detections
-    times = 1e9 * 0.5 * (result.time_edges[1:] + result.time_edges[:-1])
+    times = _times(result)
     return values.sum(axis=-1), values[..., (times >= GATE[0]) & (times < GATE[1])].sum(axis=-1)
 
 
 def target_share(result: Result) -> tuple[float, float]:
     """Part of the light that comes from the target, of all light and within the gate."""
-    times = 1e9 * 0.5 * (result.time_edges[1:] + result.time_edges[:-1])
+    times = _times(result)
     inside = (times >= GATE[0]) & (times < GATE[1])
     water, whole = result.component("backscatter"), result.histogram
     return 1.0 - float(water.sum() / whole.sum()), 1.0 - float(water[..., inside].sum() / whole[..., inside].sum())
@@ -44,14 +49,15 @@ def draw(path: Path, photons: int, device: str | None) -> None:
     print("part of the light that comes from the target: all light {:.3f}, gate {:.3f}".format(*target_share(result)))
     figure = style.new_figure(style.PAGE, 4.4)
     (side, histogram), (whole, gated) = figure.subplots(2, 2)
-    image = draw_slice(side, scene, build_mesh(scene), 1, scene.medium.range.extinction)
+    image = draw_slice(side, scene, build_mesh(scene), 1)
     figure.colorbar(image, ax=side, label="extinction [1/m]")
     side.set_title("from the side")
-    times = 1e9 * 0.5 * (result.time_edges[1:] + result.time_edges[:-1])
+    times = _times(result)
     for name, (label, colour) in style.COMPONENTS.items():
-        values = result.component(name)[12:20, 12:20].mean(axis=(0, 1))
+        values = result.component(name)[18:30, 18:30].mean(axis=(0, 1))
         histogram.semilogy(times, np.where(values > 0, values, np.nan), color=colour, label=label, lw=1.0)
     histogram.axvspan(*GATE, color="0.9")
+    histogram.set_ylim(bottom=1e-19)
     histogram.set_xlabel("time of flight [ns]")
     histogram.set_ylabel("light per bin")
     histogram.set_title("middle of the image; grey: the gate")

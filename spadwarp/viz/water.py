@@ -40,20 +40,22 @@ def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None,
     mesh = build_mesh(scene) if mesh is None else mesh
     axes = figure.subplots(1, 2)
     for axis, across, title in zip(axes, (0, 1), ("from above", "from the side"), strict=True):
-        image = draw_slice(axis, scene, mesh, across, scene.medium.range.extinction)
+        image = draw_slice(axis, scene, mesh, across)
         axis.set_title(title)
     figure.colorbar(image, ax=axes, label="extinction [1/m]", shrink=0.9)
     return save(figure, path)
 
 
-def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int, top: float) -> Any:
-    """One plane through the optical axis: z to the right, x (`across` 0) or y (1) downwards, colours up to `top` [1/m];
-    the image drawn."""
+def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int) -> Any:
+    """One plane through the optical axis: z to the right, x (`across` 0) or y (1) downwards; the image drawn."""
     depth, half = _extent(scene, mesh)
     z = np.linspace(0.0, depth, _STEPS)
     side = np.linspace(-half, half, max(2, round(2.0 * half / depth * _STEPS)))
     points = np.zeros((len(side), len(z), 3))
     points[..., across], points[..., 2] = side[:, None], z
+    top = max(water.extinction for water in scene.medium.waters)
+    if scene.medium.grid is not None:  # but the densest cells
+        top = max(top, float(np.percentile(grid_cells(scene.medium).extinction, 99.5)))
     image = axis.imshow(
         _extinction(scene, points), extent=(0.0, depth, half, -half), cmap=BOUND_MAP, vmin=0.0, vmax=top, aspect="equal"
     )
