@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["lidar_start"]
 
 _LEAST_COUNTS, _LEAST_BINS = 200, 12
+_LEAST_SPAN = 1.3  # last over first range, for a slope that says something of the water
 _NEARER = 0.95  # of the range of the nearest target
 _SHARE = 0.2  # of the scattering that the slope contains: most of it goes on forward
 
@@ -44,6 +45,8 @@ def lidar_start(scene: Scene, exposure: Exposure, *, device: str | None = None) 
     rate = -np.log1p(-np.minimum(counts / left, 0.99)) - scene.detector.noise_rate * dt
     inside &= (rate > 0) & (counts > 0)
     if inside.sum() < _LEAST_BINS or counts[inside].sum() < _LEAST_COUNTS:
+        return {}
+    if distance[inside][-1] < _LEAST_SPAN * distance[inside][0]:
         return {}
     x, y = distance[inside], np.log(rate[inside] * distance[inside] ** 2)
     slope, level = np.polyfit(x, y, 1, w=np.sqrt(counts[inside]))

@@ -24,6 +24,7 @@ SMALLER = {
     r"--photons \S+": "--photons 5e3",
     r"^(spadwarp simulate (?!.*--resume).*)": r"\1 --set camera.width=16 --set camera.height=12",
     r"^(spadwarp simulate (?!.*(--photons|--resume)).*)": r"\1 --photons 5e3",
+    r"^(spadwarp fit .*)": r"\1 --set camera.width=16 --set camera.height=12",
     r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
     r"--pulses 20000": "--pulses 500",
     r"(--trajectory \S+)": r"\1 --photons 5e3 --set camera.width=16 --set camera.height=12",
