@@ -103,6 +103,17 @@ def _valid_calls():
     faces = {"mesh": mesh, "reflectance": _filled(12), "textures": textures, "specular": 0.1, "roughness": 0.2}
     layers = {"start": [0.0, 1.0], "extinction": [1.0, 1.0], "albedo": [0.5, 0.5], "anisotropy": [0.1, 0.1]}
     calls = {
+        "tally rates": (
+            sk.tally_rates,
+            {
+                "tally": tallies(),
+                "scale": wp.ones(2, dtype=wp.float64, device="cpu"),
+                "bins": 2,
+                "components": (0, 3),
+                "parameters": 1,
+                "parameter": 0,
+            },
+        ),
         "launch": (
             sk.launch_transport,
             {

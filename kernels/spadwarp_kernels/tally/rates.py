@@ -57,11 +57,14 @@ def tally_rates(
     check_array("tally", tally, wp.int64, (None,))
     check_array("scale", scale, wp.float64, (None,), tally.device)
     bins, parameters = check_integer("bins", bins, 1), check_integer("parameters", parameters, 1)
+    if not (isinstance(components, tuple | list) and len(components) == 2):
+        raise ArgumentError("components is not a pair such as (0, 3)")
     first, stop = (check_integer("components", one, 0) for one in components)
+    parameter = check_integer("parameter", parameter, 0)
     pixels = scale.shape[0]
     if tally.size != 3 * pixels * bins * parameters:
         raise ArgumentError(f"tally has {tally.size} values; {3 * pixels * bins * parameters} are needed")
-    if not (first < stop <= 3) or not 0 <= parameter < parameters or tally.size >= 2**31:
+    if not (first < stop <= 3) or parameter >= parameters or tally.size >= 2**31:
         raise ArgumentError(f"components {first} to {stop} or parameter {parameter} is outside the tally")
     rates: Any = wp.empty((pixels, bins), dtype=float, device=tally.device)
     inputs = [tally, scale, first, stop, parameters, parameter, rates]
