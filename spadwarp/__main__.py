@@ -12,9 +12,10 @@ def main() -> None:
     if address_space() is not None:
         # OpenBLAS reserves memory for a thread a core, and waits for ever for what the limit keeps from it.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    else:
+        gc.set_threshold(20_000)  # loading modules makes many objects that stay: a tenth of a second less
     try:
         need_memory(0.5, "spadwarp")
-        gc.set_threshold(20_000)  # loading modules makes many objects that stay: a tenth of a second less
         from spadwarp.cli import app
 
         app(prog_name="spadwarp")

@@ -69,7 +69,7 @@ _KINDS: tuple[tuple[str, str, str, dict[str, Fraction]], ...] = (
         "a frequency",
         "20 MHz",
         "Hz",
-        {"1/s": Fraction(1), "/s": Fraction(1), "cps": Fraction(1), "kcps": Fraction(1000)},
+        {"1/s": Fraction(1), "/s": Fraction(1), "cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)},
     ),
     ("an energy", "150 nJ", "J", {}),
     ("a power", "20 mW", "W", {}),
@@ -106,9 +106,10 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(.*?
 def quantity(text: str, unit: str) -> float:
     """The number of a text such as "150 nJ" in another unit of its kind, such as "J"; correctly rounded.
 
-    Units: m, s, Hz, J and W with the prefixes f p n u µ m k M G; cm, min, h, deg, °, rad, mrad, 1/s, cps, 1/m, 1/cm,
-    1/km, mg/m³, g/kg, °C, %. Raises `ValueError` for text without a number or unit, an unknown unit (capitals
-    count: "mJ" and "MJ" differ), and a unit of another kind; its text begins with a verb, to be put behind the value.
+    Units: m, s, Hz, J and W with the prefixes f p n u µ m k M G; cm, min, h, deg, °, rad, mrad, 1/s, cps, kcps, Mcps,
+    1/m, 1/cm, 1/km, mg/m³, g/kg, °C, %. Raises `ValueError` for text without a number or unit, an unknown unit
+    (capitals count: "mJ" and "MJ" differ), and a unit of another kind; its text begins with a verb, to be put behind
+    the value.
     """
     kind, example, factor = UNITS[unit]
     if factor not in (1, UNITS[example.partition(" ")[2]][2]):

@@ -145,8 +145,9 @@ def plan(
     depth_error, margin = _number("depth_error", depth_error, "m"), _number("margin", margin, "m")
     time, eye_exposure = _number("time", time, "s"), _number("eye_exposure", eye_exposure, "s")
     eye_distance = None if eye_distance is None else _number("eye_distance", eye_distance, "m")
-    for name, value in {"depth_error": depth_error, "time": time, "eye_exposure": eye_exposure}.items():
-        check_real(name, value, "[1e-9, 1e9]")
+    check_real("depth_error", depth_error, "[1e-9, 1e9] m")
+    for name, value in {"time": time, "eye_exposure": eye_exposure}.items():
+        check_real(name, value, "[1e-9, 1e9] s")
     photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)
     margin = check_real("margin", margin, "[0, 1e6] m")
     check_choice("method", method, METHODS)

@@ -194,7 +194,7 @@ def _limit(scene: Scene, pilot: Pilot, terms: dict[str, float], pulses: int, met
     largest = max(("shot noise", "background", "forward scattering", "pile-up"), key=terms.__getitem__)
     if largest == "background":
         return "backscatter" if pilot.backscatter >= pilot.noise else "dark counts and ambient light"
-    if largest == "forward scattering" and pilot.unscattered_floor[method] > 0.5 * pilot.floor[method]:
+    if largest == "forward scattering" and 0.5 * pilot.floor[method] < pilot.unscattered_floor[method] < math.inf:
         bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
         return "bin width" if pilot.floor[method] <= bin_range else "pixel size"
     if largest == "shot noise" and pulses * pilot.peak > _MANY_PHOTONS:

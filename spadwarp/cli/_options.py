@@ -167,11 +167,12 @@ def read_scene(
     path: Path, *, mesh: Path | None, overrides: list[str] | None, photons: int | None = None, seed: int | None = None
 ) -> Scene:
     """The scene with the options applied: first `--mesh`, then `--set`, then the others."""
-    scene = spadwarp.load_scene(path)
-    if mesh is not None:
+    if mesh is None:
+        scene = spadwarp.load_scene(path, overrides)
+    else:
         # What sized the old target says nothing about the new one.
-        scene = scene.with_overrides({"targets[0]": {"mesh": str(mesh), "scale": None, "subdivisions": None}})
-    scene = scene.with_overrides(overrides or [])
+        replaced = {"targets[0]": {"mesh": str(mesh), "scale": None, "subdivisions": None}}
+        scene = spadwarp.load_scene(path, replaced).with_overrides(overrides or [])
     given = {"photons": photons, "seed": seed}
     return scene.with_overrides(transport={name: value for name, value in given.items() if value is not None})
 

@@ -9,6 +9,7 @@ import typer
 import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, say
+from spadwarp.limits import suggestion
 
 KINDS = {
     "scenes": "spadwarp simulate NAME",
@@ -36,7 +37,8 @@ def examples(
     if name is not None:
         found = [paths[name] for paths in known.values() if name in paths]
         if not found:
-            raise typer.BadParameter(f"{name!r} is not one of `spadwarp examples`", param_hint="NAME")
+            hint = suggestion(name, [one for paths in known.values() for one in paths])
+            raise typer.BadParameter(f"{name!r} is not one of `spadwarp examples`{hint}", param_hint="NAME")
         for path in found:
             say(path.read_text(encoding="utf-8").rstrip())
         return

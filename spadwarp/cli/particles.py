@@ -69,6 +69,12 @@ def particles(
     mie = {"--index": index, "--concentration": concentration}
     if (small is None and large is None) == (index is None):
         raise typer.BadParameter("give --small and --large, or --index with --concentration and sizes")
+    others = {"--slope": slope, "--smallest": smallest, "--largest": largest, "--median": median}
+    others |= {"--deviation": deviation, "--diameter": diameter, "--concentration": concentration}
+    if index is None and (given := [name for name, value in others.items() if value is not None]):
+        raise typer.BadParameter(f"goes with --index, not with --small and --large: {', '.join(given)}")
+    if out is not None and out.suffix.lower() != ".csv":
+        raise typer.BadParameter(f"{out} does not end in .csv, as medium.phase_table must", param_hint="--out")
     if index is None:
         parts = spadwarp.water.kopelevich_particles(wavelength_nm, small=small or 0.0, large=large or 0.0)
         text = f"Kopelevich, {small or 0:g} ppm below and {large or 0:g} ppm above 1 um"

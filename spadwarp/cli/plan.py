@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -205,10 +206,14 @@ def _terms(found: Proposal) -> Table:
     for name, value in found.terms.items():
         table.add_row(name, short(1000 * value), about[name])
         if name == "forward scattering":
+            alone = pilot.unscattered_floor[found.method]
+            unscattered = (
+                f"unscattered light alone: {1000 * alone:.3g}" if alone < math.inf else "all light is scattered"
+            )
             table.add_row(
                 "",
                 "",
                 f"from {opt.count(pilot.photons)} traced photons, ±{1000 * pilot.run_noise:.2g} a pixel; "
-                f"unscattered light alone: {1000 * pilot.unscattered_floor[found.method]:.3g}",
+                + unscattered,
             )
     return table

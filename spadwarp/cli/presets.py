@@ -21,9 +21,9 @@ def presets(
     overwrite: opt.Overwrite = False,
     json_path: opt.Json = None,
 ) -> None:
-    """Named waters, lasers and detectors with their sources.
+    """Named waters, lasers, cameras, ports, detectors and gates with their sources.
 
-    Cameras, ports and gates too. A scene selects one by `preset = "NAME"` in the section of that name.
+    A scene selects one by `preset = "NAME"` in the section of that name.
     The waters are for about 532 nm; `spadwarp water` computes other wavelengths.
 
     \b

@@ -15,7 +15,7 @@ import spadwarp
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import INTERRUPTED, app, complain, fail, say
 from spadwarp.cli._progress import progress
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ConfigError, address_space
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -131,7 +131,7 @@ def simulate(
         photons, scene = None if photons is None else earlier.scene.transport.photons, earlier.scene
     else:
         if scene_path is None or out is None:
-            raise typer.BadParameter("is missing", param_hint="SCENE" if scene_path is None else "--out")
+            raise _missing(scene_path)
         scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
         photons = None
     if records:
@@ -177,6 +177,11 @@ def simulate(
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
+
+
+def _missing(scene_path: Path | None) -> typer.BadParameter:
+    hint, text = ("--out", "a directory, --out out/") if scene_path else ("SCENE", "a scene file, or --resume DIR")
+    return typer.BadParameter(f"is missing; give {text}", param_hint=hint)
 
 
 def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:
@@ -237,7 +242,7 @@ def _prepared(scene: Scene, device: str | None, engine: Ray | None) -> ModuleTyp
     """
     if engine is None:
         spadwarp.transport.prepare_kernels(device)
-    if scene.output.png or scene.output.pdf:
+    if (scene.output.png or scene.output.pdf) and address_space() is None:
         threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True).start()
     return importlib.import_module("spadwarp.run")
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.parsing import parse_json, read_text
 from spadwarp.io.text import write_text
 from spadwarp.limits import check_integer, check_real, parse_number, shown
@@ -55,7 +55,10 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
         FileError: The file cannot be read.
         ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
     """
-    text = read_text(path, largest=_LARGEST)
+    try:
+        text = read_text(path, largest=_LARGEST)
+    except FileError as error:
+        raise FileError(f"camera.calibration = {error}") from None
     try:
         return _fields(_entries(text))
     except ValueError as error:

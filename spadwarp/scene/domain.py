@@ -57,7 +57,10 @@ class Domain(Section):
         for name in self.reflecting:
             bound = self.bounds[name.endswith("high")]["xyz".index(name[0])]
             if math.isinf(bound):
-                raise ValueError(f"outside_index.{name}: the domain has no such face; shape = {self.shape!r}")
+                raise ValueError(
+                    f"outside_index.{name}: the domain has no such face with shape = {self.shape!r}; a slab has z_low "
+                    "and z_high, a box all six, each where lower or upper is finite"
+                )
         return self
 
     @property

@@ -63,6 +63,8 @@ class Laser(Section):
                 f"half_angle_deg = {self.half_angle_deg} is outside (0, 90), the range of a {self.profile} profile"
             )
         if (self.profile == "measured") != (self.profile_image is not None):
+            if self.profile_image is None:
+                raise ValueError("needs profile_image with profile = 'measured': the path of an image of the beam")
             raise ValueError(f"profile_image = {self.profile_image!r} does not go with profile = {self.profile!r}")
         if self.linewidth_nm > 0.2 * self.wavelength_nm:
             raise ValueError(

@@ -112,7 +112,9 @@ def _preset(section: str, fields: Mapping[str, Any]) -> Preset | None:
 def preset_hint(section: str, word: Any) -> str:
     """What to add to an error about a word in place of a table: how a preset is taken."""
     known = PRESETS.get(section, {})
-    return f'; a preset is taken by {{preset = "{word}"}}' if word in known else suggestion(word, list(known))
+    if word in known:
+        return f'; a preset is taken by {{preset = "{word}"}}'
+    return suggestion(word, list(known)) or ("" if len(known) > 8 else f"; presets are {', '.join(map(repr, known))}")
 
 
 def _merge_coefficients(merged: Table, layer: Mapping[str, Any]) -> None:
@@ -192,7 +194,8 @@ def _parse_value(value: str, text: str) -> Any:
         table = parse_toml(f"value = {value}")
     except ConfigError as error:
         if value[0] in "\"'[{":
-            raise ConfigError(f"override {shown(text)}: {error}") from None
+            hint = "; TOML writes a table as {name = value}" if re.search(r"[\"'\w]\s*:", value) else ""
+            raise ConfigError(f"override {shown(text)}: {error}{hint}") from None
         try:
             return parse_number(value)  # .9 and 5. are not TOML, but mean numbers
         except ValueError:

@@ -90,7 +90,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     cause = problem.get("ctx", {}).get("error")
     if kind in ("missing", "too_short", "too_long"):  # of a list
         name = key_text(key[: max(i for i, part in enumerate(key) if isinstance(part, str)) + 1])
-        return f"{name} = {shown(value)} has the wrong number of values"
+        return f"{name} = {shown(value)} has the wrong number of values{_count(info)}"
     entry = f"{name} = {shown(value)}" + (" (an override)" if overridden else "")
     if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
         whole_table = isinstance(value, (Mapping, BaseModel))
@@ -105,13 +105,15 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         words = "".join(f" and not {word!r}" for word in choices)
         return f"{entry} is outside {_interval(info)}{words}{_percentage(info, value)}"
     if choices and kind in _KINDS and isinstance(value, str):
-        return f"{entry} is neither {_KINDS[kind]} nor {' nor '.join(map(repr, choices))}"
+        words = " nor ".join(map(repr, choices))
+        return f"{entry} is neither {_KINDS[kind]} nor {words}{_instead(key, info, kind, value)}"
     if choices:
         others = [cause.args[2]] if cause is not None and len(cause.args) > 2 else []
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
         return f"{entry} is not one of {listed}{_suggest(value, choices)}"
     if kind in _KINDS:
-        return f"{entry} is not {_KINDS[kind]}{_instead(key, info, kind, value)}"
+        what = _numbers(info) if kind == "tuple_type" else ""
+        return f"{entry} is not {_KINDS[kind]}{what}{_instead(key, info, kind, value)}"
     message = problem["msg"]
     return f"{entry}: {message[0].lower()}{message[1:]}"
 
@@ -128,7 +130,7 @@ def _factor(key: Key, value: Any) -> str:
 def _percentage(info: FieldInfo, value: Any) -> str:
     """What to add where a ratio within [0, 1] is given in per cent."""
     bounds, number = _limits(info), isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or field_unit(info) != "1" or bounds.low < 0.0 or bounds.high != 1.0 or not 1 < value <= 100:
+    if not number or field_unit(info) != "1" or bounds.low < 0.0 or bounds.high != 1.0 or not 2 <= value <= 100:
         return ""
     return f'; did you mean "{value:g} %"?' if 0.01 * value in bounds else ""
 
@@ -139,7 +141,29 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
         return f" of tables; write [[{key_text(key)}]]"
     if kind in ("model_type", "model_attributes_type") and isinstance(value, str) and info is not None:
         return "".join(preset_hint(getattr(one, "section", ""), value) for one in list(_models(info.annotation))[:1])
+    if kind in ("model_type", "model_attributes_type") and info is not None:
+        fields = [name for one in list(_models(info.annotation))[:1] for name in one.model_fields]
+        return f" of {', '.join(fields[:8])}{', ...' if len(fields) > 8 else ''}"
     return _factor(key, value)
+
+
+def _sizes(annotation: Any) -> Iterator[int]:
+    """How many values the lists of an annotation have."""
+    parts = typing.get_args(annotation)
+    if typing.get_origin(annotation) is tuple and ... not in parts:
+        yield len(parts)
+    for part in parts:
+        yield from _sizes(part)
+
+
+def _count(info: FieldInfo | None) -> str:
+    size = None if info is None else next(_sizes(info.annotation), None)
+    return "" if size is None else f"; {size} are needed"
+
+
+def _numbers(info: FieldInfo | None) -> str:
+    size = None if info is None else next(_sizes(info.annotation), None)
+    return "" if size is None else f" of {size} values"
 
 
 def _fields(model: type[BaseModel], key: Key) -> list[str]:

@@ -46,7 +46,10 @@ class Port(Section):
         if getattr(self, needed) is None:
             raise ValueError(f"needs {needed} with shape = {self.shape!r}")
         if getattr(self, other) is not None:
-            raise ValueError(f"{other} = {getattr(self, other)} does not go with shape = {self.shape!r}")
+            raise ValueError(
+                f"{other} = {getattr(self, other)} does not go with shape = {self.shape!r}; a flat port has distance, "
+                "a dome has radius"
+            )
         if self.shape == "flat" and any(self.offset):
             raise ValueError(f"offset = {list(self.offset)} goes with shape = 'dome' only")
         if self.shape == "dome" and self.normal != (0.0, 0.0, 1.0):

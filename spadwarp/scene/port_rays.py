@@ -56,6 +56,16 @@ class PortGeometry:
             return self.distance + self.thickness
         return self.radius + self.thickness - math.hypot(*self.centre)
 
+    def outside(self, x: ArrayLike) -> str:
+        """Why a point is not inside; empty where it is."""
+        if self.shape == "flat":
+            ahead = self.distance - float(np.asarray(x) @ np.array(self.normal))
+            return "" if ahead > 0.0 else f"it is {-ahead:.4g} m beyond the window's inner face"
+        away = math.dist(np.ravel(x), self.centre)
+        return (
+            "" if away < self.radius else f"it is {away:.4g} m from the dome's centre, the radius is {self.radius:g} m"
+        )
+
     def enter(self, x: ArrayLike, u: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
         """Rays from x inside along unit vectors u, `[..., 3]`, up to where they enter the water.
 

@@ -28,6 +28,7 @@ from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
 from spadwarp.scene.output import Output
 from spadwarp.scene.port import Port
+from spadwarp.scene.port_rays import camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
 from spadwarp.scene.quantities import with_units
 from spadwarp.scene.scan import Scan
@@ -121,6 +122,21 @@ class Scene(BaseModel):
                     f"scan.distance = {self.scan.distance} does not go with a port, behind which beam and line of "
                     "sight can be parallel alone: inf"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _inside_their_ports(self) -> Self:
+        through = camera_port(self)
+        if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
+            raise ValueError(f"camera.port: the lens is outside: {why}; change offset or radius")
+        through, position = laser_port(self), list(self.beam.position)
+        if through is not None and (why := through.outside(position)):
+            way_out = (
+                "move the laser, or give it a port of its own: [laser.port]"
+                if self.laser.port == "camera"
+                else "change it"
+            )
+            raise ValueError(f"laser.position = {position} is outside laser.port: {why}; {way_out}")
         return self
 
     @classmethod
@@ -273,7 +289,10 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     path = example_or_path(path, "scenes")
     if path.suffix.lower() in (*MESH_ENDINGS, ".h5", ".hdf5") and path.is_file():
         raise FileError(f"{path}: not a scene{used(path)}")
-    return _build(read_toml(path), overrides=overrides, source=path)
+    tables = read_toml(path)
+    if "scene" in tables and "laser" not in tables:
+        raise ConfigError("a recipe of a dataset, for `spadwarp dataset make`, not a scene", source=str(path))
+    return _build(tables, overrides=overrides, source=path)
 
 
 def template() -> str:

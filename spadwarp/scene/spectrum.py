@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.parsing import read_columns
 
 if TYPE_CHECKING:
@@ -166,7 +166,10 @@ def _gaussian(offset: Any) -> Any:
 
 
 def _table(field: str, path: str, columns: dict[str, str]) -> tuple[Floats, Floats]:
-    rows = read_columns(Path(path), columns)
+    try:
+        rows = read_columns(Path(path), columns)
+    except FileError as error:
+        raise FileError(f"{field} = {error}") from None
     if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0.0).any():
         raise ConfigError(f"{field}: {path}: two rows or more with rising wavelengths are needed")
     if not rows[:, 1].max() > 0.0:

@@ -111,7 +111,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 def _names(cells: list[str]) -> tuple[str, ...]:
     names = tuple(cell.strip() for cell in cells)
     if names[0] != "time" or len(names) < 2:
-        raise ValueError(f"{shown(','.join(names))} is not time and names of fields, such as camera.position[0]")
+        raise ValueError(f"{shown(','.join(names))} is not time and names of fields, such as time,camera.position[0]")
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise ValueError(f"{shown(twice)} is there twice")
     return names

@@ -34,7 +34,7 @@ class Workers(Protocol):
     Attributes:
         first_block: Photons of a worker's first block, which shows how fast it is.
         must_rest: Whether `tallies` changes while any of them traces.
-        timing: Seconds of "setup" and "compile".
+        timing: Seconds of "setup" and "compile"; of "truth" where it was traced with them.
     """
 
     first_block: int

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from spadwarp.device import pick_devices
+from spadwarp.errors import address_space
 
 if TYPE_CHECKING:
     import warp as wp
@@ -37,6 +38,8 @@ def prepare_kernels(device: str | None = None) -> None:
     import spadwarp_kernels as sk
 
     devices = pick_devices(device)
+    if address_space() is not None:  # where memory is limited, two threads that compile may be too many
+        return
 
     def load() -> None:
         for one in devices:
@@ -53,4 +56,9 @@ def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Future[Non
         for device in devices:
             sk.load_transport_kernel(spec, device)
 
-    return _thread().submit(load)
+    if address_space() is None:
+        return _thread().submit(load)
+    load()
+    done = Future[None]()
+    done.set_result(None)
+    return done

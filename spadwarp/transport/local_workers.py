@@ -70,9 +70,10 @@ class LocalWorkers:
         for device in devices:
             with device_errors(device):
                 models.append(build_model(plan.scene, device, plan.mesh, **choices))
+        built = time.perf_counter()
         with device_errors(devices[0]):
             self._truth = trace_truth(plan.scene, models[0])
-            built = time.perf_counter()
+            traced = time.perf_counter()
             loading.result()
         settings: dict[str, Any] = {
             "seed": plan.seed,
@@ -82,7 +83,7 @@ class LocalWorkers:
             "derivatives": plan.derivatives,
         }
         self.workers = [DeviceWorker(model, spec, tallies=tallies, **settings) for model in models]
-        self.timing = {"setup": built - began, "compile": time.perf_counter() - built}
+        self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
         self._busy: set[DeviceWorker] = set()
         self._stopped = threading.Event()

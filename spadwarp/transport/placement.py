@@ -27,7 +27,9 @@ def check_domain(scene: Scene, camera: bool) -> None:
             name, slack = f"{name}, its axis behind the port", 1e-6
             point = port.enter(position, axis_of)[0]
             if not np.isfinite(point).all():
-                raise config_error(scene, f"{name}: light along the axis does not get through the port")
+                raise config_error(
+                    scene, f"{name}: light along the axis does not get through the port: turn the axis or the port"
+                )
         for axis, value, low, high in zip(
             "xyz", to_world(scene.camera, point).tolist(), *scene.domain.bounds, strict=True
         ):

@@ -237,7 +237,7 @@ class _Run:
         import spadwarp_kernels as sk
 
         total, timing, made = self._workers.tallies(), dict(self._workers.timing), provenance()
-        timing |= {"truth": self._truth_seconds, "trace": time.perf_counter() - self._began}
+        timing = {"truth": self._truth_seconds, **timing, "trace": time.perf_counter() - self._began}
         made |= self._workers.metadata()
         if self._resumed is None:
             check_capacity(total.tallies)

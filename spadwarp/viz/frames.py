@@ -120,7 +120,7 @@ def _plot_counts(frames: Frames, counts: NDArray[Any], maps: DepthMaps | None, a
         arrival_line(axis, float(maps.arrival[row, column]), edges)
     top = float(max(counts.max(), expected.max(), 1.0))
     scale = "counts per bin"
-    if top > 50 * max(float(np.median(expected)), 0.02):
+    if top > max(10.0, 50 * float(np.median(expected))):
         axis.set_yscale("symlog", linthresh=1.0)
         scale += " (linear to 1, then log)"
         axis.set_yticks([0] + [10**e for e in range(int(np.log10(top)) + 1)])

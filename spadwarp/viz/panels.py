@@ -166,9 +166,12 @@ def shown_limits(image: NDArray[Any], *, beyond: float = 0.0, margin: float = 0.
 
 
 def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, float]:
-    """Limits that show the true depth with a margin, or the measured depth where no target is in view."""
+    """Limits that show the true depth and the errors about it, or the measured depth where no target is in view."""
     if np.isfinite(truth).any():
-        return shown_limits(truth, margin=0.05)
+        low, high = shown_limits(truth, margin=0.05)
+        error = measured - truth
+        spare = error_limit(error) if np.isfinite(error).any() else 0.0
+        return low - spare, high + spare
     return shown_limits(measured, beyond=1.0, margin=0.05)
 
 

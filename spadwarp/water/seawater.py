@@ -38,6 +38,7 @@ _RANGES = {
     "salinity": (0.0, 40.0),
     "chlorophyll": (0.0, 30.0),
 }
+_UNITS = {"wavelength_nm": "nm", "temperature": "°C", "salinity": "g/kg", "chlorophyll": "mg/m³"}
 
 _DEPOLARIZATION = 0.039  # of light scattered by 90° (Farinato & Rowell 1976)
 
@@ -227,7 +228,7 @@ def check_ranges(**values: ArrayLike) -> None:
         except (TypeError, ValueError):
             raise ArgumentError(f"{name} = {shown(value)} is not a number") from None
         if not ((array >= low) & (array <= high)).all():
-            raise ArgumentError(f"{name} = {shown(value)} is outside [{low:g}, {high:g}]")
+            raise ArgumentError(f"{name} = {shown(value)} is outside [{low:g}, {high:g}] {_UNITS[name]}")
 
 
 def _value(array: Any) -> Value:
