@@ -15,6 +15,7 @@ __all__ = ["loss_of"]
 _FLOOR = 3e-6  # mean square over the gate below which a crop is good enough: 55 dB
 _FINE_FLOOR = 1e-7  # the same for histograms, whose many photons give finer depths
 _WATER = 0.001  # weight of depth where nothing is hit
+_TARGET, _OTHERS = 0.3, 0.04  # weights of the cross-entropies of "sees a target" and of the other two logits
 _NEAR = 0.015  # part of the gate within which a reported depth counts as the target's
 
 
@@ -32,8 +33,9 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
         reported = chosen[:, :1].detach() if chosen.shape[1] else batch.frame[:, :1]
         right = batch.hit * ((depth.detach() - batch.clean).abs() < CLOSE)
         true = batch.hit * ((reported - batch.clean).abs() < _NEAR)
-        for part, wanted in zip(logits.split(1, dim=1), (batch.hit, right, true), strict=True):
-            error = error + 0.04 * F.binary_cross_entropy_with_logits(part, wanted)
+        wanted = (_TARGET, batch.hit), (_OTHERS, right), (_OTHERS, true)
+        for part, (share, truth) in zip(logits.split(1, dim=1), wanted, strict=True):
+            error = error + share * F.binary_cross_entropy_with_logits(part, truth)
     if chosen.shape[1]:  # the candidates' errors, so that one is chosen and not a mean of several
         candidates = torch.cat([batch.frame[:, :1], 0.5 + batch.frame[:, 3 : 3 + POOLED]], dim=1)
         square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1:], dim=1)

@@ -75,7 +75,7 @@ NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "usdn": USDN,
     "dncnn": DnCNN,
     "pyramid": PyramidNet,
-    "histograms": partial(PyramidNet, widths=(4, 5, 8, 10, 12), last=8, refines=False, histograms=True),
+    "histograms": partial(PyramidNet, widths=(4, 5, 8, 10, 12), fine=0, refines=False, votes=False, histograms=True),
 }
 """Networks by the name that recipes and commands use."""
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import MOST, SEEN
 from spadwarp.denoise.symmetric import SymmetricConv, SymmetricWindow, symmetric_mean
+from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
 __all__ = ["CLOSE", "LONGEST_DELAY", "OUTPUTS", "PyramidNet"]
 
@@ -78,14 +79,17 @@ class PyramidNet(nn.Module):
         self,
         *,
         widths: tuple[int, ...] = (4, 5, 8, 10, 14),
-        last: int = 6,
+        last: int = 8,
+        fine: int = 1,
         refines: bool = True,
+        votes: bool = True,
         histograms: bool = False,
     ) -> None:
         super().__init__()
-        self.refines = refines
+        self.refines, self.votes = refines, votes
         pairs, deep = list(pairwise(widths)), len(widths) - 1
-        self.enter = SymmetricConv(6, widths[0], 3, lifts=True)
+        self.enter = SymmetricConv(6 + VOTES * votes, widths[0], 3, lifts=True)
+        self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False) if votes else None
         self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
         self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
         self.before = nn.ModuleList(
@@ -94,13 +98,13 @@ class PyramidNet(nn.Module):
         )
         self.after = nn.ModuleList(_Residual(width) for width in widths[1:-1])
         self.finish = SymmetricConv(widths[0], widths[0], 3)
+        self.polish = nn.ModuleList(_Residual(widths[0]) for _ in range(fine))
         self.spread = SymmetricConv(widths[0], last, 1)
         near = 2 * self.radius + 1
         self.near = SymmetricWindow(last, near)
         self.wide = nn.ModuleList(SymmetricWindow(last, 3) for _ in self.boxes)
-        self.scalars = nn.Conv2d(
-            last, 5 + refines, 1
-        )  # of the network's own depth, weight and value; logits; reach of refining
+        # Weight and value of the network's own depth; logits; reach of refining; weight of the depth voted for.
+        self.scalars = nn.Conv2d(last, 5 + refines + votes, 1)
         self.enter_features: nn.Module | None = None
         with torch.no_grad():  # begins near the identity
             assert self.scalars.bias is not None
@@ -110,7 +114,7 @@ class PyramidNet(nn.Module):
                     if bias.ndim == 1:
                         bias.fill_(-2.0)
             self.scalars.weight.mul_(0.3)
-            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, -1.0][: 5 + refines]))
+            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, *[-1.0] * refines, *[-2.0] * votes]))
         if histograms:
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
@@ -129,7 +133,8 @@ class PyramidNet(nn.Module):
         if bottom or right:
             frame = F.pad(frame, (0, right, 0, bottom), mode="replicate")
         depth, reported = frame[:, :1].float(), frame[:, 1:2].float()
-        x = self._features(frame)
+        votes = neighbour_votes(depth, reported) if self.votes else None
+        x = self._features(frame, votes)
         scalars = self.scalars(symmetric_mean(x)).float()
         delay: Tensor | None = None
         extra: list[Tensor] = []
@@ -139,7 +144,10 @@ class PyramidNet(nn.Module):
         own, own_value, others = scalars[:, :1], scalars[:, 1:2], scalars[:, 2:5]
         values, trusts = _candidates(depth, reported, others[:, 2:], self.radius, self.boxes, self.steps)
         heads = [self.near(x), *(window(x) for window in self.wide)]
-        parts = [torch.cat(heads, dim=1), trusts, own, values, own_value, scalars[:, 5:]]
+        if votes is not None:
+            own = torch.cat([own, scalars[:, -1:] - 1e4 * (votes.support <= 0.0)], dim=1)
+            own_value = torch.cat([own_value, votes.depth - 0.5], dim=1)
+        parts = [torch.cat(heads, dim=1), trusts, own, values, own_value, scalars[:, 5 : 5 + self.refines]]
         if torch.is_grad_enabled() or x.is_cuda:
             found = _answer(*parts)
         else:  # strips of a few rows stay in a CPU's cache
@@ -150,11 +158,16 @@ class PyramidNet(nn.Module):
             found = _decided(found, frame[:, 3:].float()) - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 
-    def _features(self, frame: Tensor) -> Tensor:
+    def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""
         depth, reported, density = (channel.contiguous() for channel in frame[:, :3].split(1, dim=1))
         ranked = [rank - depth for rank in ranks(depth)]
-        x = self.enter(torch.cat([(depth - 0.5) * reported, reported, 0.25 * density, *ranked], dim=1))
+        scalars = [(depth - 0.5) * reported, reported, 0.25 * density, *ranked]
+        if votes is not None:
+            scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
+        x = self.enter(torch.cat(scalars, dim=1))
+        if votes is not None and self.enter_agreement is not None:
+            x = x + self.enter_agreement(votes.agreement)
         if self.enter_features is not None:
             x = x + self.enter_features(frame[:, 3 : 3 + SEEN])
         skipped = []
@@ -165,6 +178,8 @@ class PyramidNet(nn.Module):
             finer = F.interpolate(self.up[level](x), scale_factor=2.0, mode="bilinear", align_corners=False)
             x = skipped[level] + finer
             x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
+        for layer in self.polish:
+            x = layer(x)
         return F.relu(self.spread(F.relu(x)))
 
     def _chosen(self, depth: Tensor, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:

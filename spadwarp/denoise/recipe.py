@@ -51,7 +51,9 @@ Shares = Annotated[tuple[Share, Share], *_CHECKS]
 class Noise(_Table):
     """What the noise of a training is drawn from: `[lowest, highest]`, or a part of the samples."""
 
-    backscatter: Shares = Field((0.0, 0.6), description="part of the pixels that report backscatter")
+    backscatter: Shares = Field(
+        (0.0, 0.6), description="part of the pixels that report backscatter; low ones are drawn more often"
+    )
     sigma_scale: Positive = Field(
         (0.3, 8.0), description="factor on a scene's Cramér–Rao bound, uniform in the logarithm"
     )

@@ -64,7 +64,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
     depth = _background(side, random)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
-    number = torch.where(random.coin(0.12), 0, 1 + random.integer(_THINGS))
+    number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
     for slot in range(_THINGS):
         apart = random.between((-0.6, 0.6), 2) * side
         at = torch.where(together[:, None], centre + 0.35 * apart, apart)

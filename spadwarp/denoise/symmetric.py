@@ -15,13 +15,13 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-__all__ = ["GROUP", "SymmetricConv", "SymmetricWindow", "symmetric_mean"]
+__all__ = ["GROUP", "SymmetricConv", "SymmetricWindow", "symmetric_mean", "turned"]
 
 GROUP = 8
 """Turns and reflections of a square."""
 
 
-def _turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
+def turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
     """An image `[..., k, k]` acted on by one of the eight elements."""
     return np.rot90(np.flip(image, -1) if element >= 4 else image, element % 4, axes=(-2, -1))
 
@@ -30,11 +30,11 @@ def _turned(image: NDArray[np.int64], element: int) -> NDArray[np.int64]:
 def _left_quotients() -> NDArray[np.int64]:
     """Index of g⁻¹ h for elements g and h, `[8, 8]`."""
     probe = np.arange(9).reshape(3, 3)
-    images = [_turned(probe, element).tolist() for element in range(GROUP)]
+    images = [turned(probe, element).tolist() for element in range(GROUP)]
     table = np.empty((GROUP, GROUP), np.int64)
     for g in range(GROUP):
         for other in range(GROUP):  # g ∘ other = h
-            product = _turned(_turned(probe, other), g).tolist()
+            product = turned(turned(probe, other), g).tolist()
             table[g, images.index(product)] = other
     return table
 
@@ -44,7 +44,7 @@ def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
     """Places in a filter `[channels, size, size]` that the expanded one `[8, channels, size, size]` takes, flat."""
     places = np.arange(channels * size * size).reshape(channels, size, size)
     quotients = _left_quotients()
-    parts = [_turned(places[quotients[g]] if channels == GROUP else places, g) for g in range(GROUP)]
+    parts = [turned(places[quotients[g]] if channels == GROUP else places, g) for g in range(GROUP)]
     return torch.from_numpy(np.ascontiguousarray(np.stack(parts))).flatten()
 
 

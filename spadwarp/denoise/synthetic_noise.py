@@ -23,6 +23,7 @@ BINS = 64
 """Bins of a backscatter profile over the gate."""
 
 _COUNT_BINS = 192  # of the histograms behind frames with few photons
+_RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
 _TAPS = 9  # a response extends over this many bins to each side
 
 
@@ -121,7 +122,8 @@ def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) 
     late = (sigma * random.between((0.5, 3.0), 1, 1)) * -torch.log1p(-random.uniform(*clean.shape[1:]))
     reported = reported + torch.where(random.coin(noise.tail, 1, 1), late, 0.0)
     none = random.coin(0.0 if always_replaced else 0.1)
-    share = torch.where(none, 0.0, random.between(noise.backscatter))[:, None, None]
+    rare = random.uniform().pow(_RARER) * (noise.backscatter[1] - noise.backscatter[0])
+    share = torch.where(none, 0.0, noise.backscatter[0] + rare)[:, None, None]
     # Dark pixels report backscatter more often.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     darker = (sigma / typical.clamp_min(1e-9)[:, None, None]).clamp(0.3, 2.5)
