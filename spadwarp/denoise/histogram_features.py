@@ -134,8 +134,8 @@ def _edges(device: torch.device) -> Tensor:
 def _shape(above: Tensor, background: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
     """Shares of the excess between `EDGES` around the anchor over the gate `[B, H, W]`, and its significances."""
     edges = anchor[..., None] + _edges(above.device)
-    level = _within(background[:, None, None, :].cumsum(dim=-1), edges[..., [0, -1]])[..., 0]
-    pixel = _within(above.cumsum(dim=-1), edges[..., [0, -1]])[..., 0] / (level + 1.0).sqrt()
+    level = _within(background[:, None, None, :].cumsum(dim=-1), edges[..., :: len(EDGES) - 1])[..., 0]
+    pixel = _within(above.cumsum(dim=-1), edges[..., :: len(EDGES) - 1])[..., 0] / (level + 1.0).sqrt()
     excess = 49.0 * _within(pooled(above, 7).cumsum(dim=-1), edges)
     spread = ((excess.sum(dim=-1) + 49.0 * level).clamp_min(0.0) + 1.0).sqrt()
     shares = excess / (excess.abs().sum(dim=-1) + spread)[..., None]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import MOST, SEEN
-from spadwarp.denoise.symmetric import SymmetricConv, SymmetricWindow, symmetric_mean
+from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
 from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
 __all__ = ["CLOSE", "LONGEST_DELAY", "OUTPUTS", "PyramidNet"]
@@ -115,6 +115,15 @@ class PyramidNet(nn.Module):
                         bias.fill_(-2.0)
             self.scalars.weight.mul_(0.3)
             self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, *[-1.0] * refines, *[-2.0] * votes]))
+            if self.enter_agreement is not None:
+                # Begins with the depth voted for, and with features that count little: noise in the weights would at
+                # first teach the features to vanish, after which they learn no more.
+                self.scalars.bias[-1] = 3.0
+                for layer in (self.scalars, self.near, *self.wide):
+                    layer.weight.mul_(0.1)
+                for layer in (self.enter_agreement, *self.up):
+                    layer.weight.mul_(0.3)
+                self.enter.weight[:, -VOTES:].mul_(0.3)
         if histograms:
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
@@ -135,19 +144,17 @@ class PyramidNet(nn.Module):
         depth, reported = frame[:, :1].float(), frame[:, 1:2].float()
         votes = neighbour_votes(depth, reported) if self.votes else None
         x = self._features(frame, votes)
-        scalars = self.scalars(symmetric_mean(x)).float()
         delay: Tensor | None = None
         extra: list[Tensor] = []
         if self.enter_features is not None:
             depth, delay, extra = self._chosen(depth, frame[:, 3:].float(), x)
             reported = torch.ones_like(depth)
-        own, own_value, others = scalars[:, :1], scalars[:, 1:2], scalars[:, 2:5]
+        weights, own, others, reach = self._heads(x)
         values, trusts = _candidates(depth, reported, others[:, 2:], self.radius, self.boxes, self.steps)
-        heads = [self.near(x), *(window(x) for window in self.wide)]
+        values, trusts = [*values, 0.5 + own], [*trusts, torch.zeros_like(depth)]
         if votes is not None:
-            own = torch.cat([own, scalars[:, -1:] - 1e4 * (votes.support <= 0.0)], dim=1)
-            own_value = torch.cat([own_value, votes.depth - 0.5], dim=1)
-        parts = [torch.cat(heads, dim=1), trusts, own, values, own_value, scalars[:, 5 : 5 + self.refines]]
+            values, trusts = [*values, votes.depth], [*trusts, 1e4 * (votes.support > 0.0) - 1e4]
+        parts = weights, torch.cat(trusts, dim=1), torch.cat(values, dim=1), reach
         if torch.is_grad_enabled() or x.is_cuda:
             found = _answer(*parts)
         else:  # strips of a few rows stay in a CPU's cache
@@ -180,7 +187,27 @@ class PyramidNet(nn.Module):
             x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
         for layer in self.polish:
             x = layer(x)
-        return F.relu(self.spread(F.relu(x)))
+        return F.relu(self.spread(F.relu(x)), inplace=True)
+
+    def _heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Weights of all depths, the network's own depth, the three logits and the reach of refining, `[B, n, H, W]`.
+
+        The layers that these come from are applied as one.
+        """
+        layers = [window.filters() for window in (self.near, *self.wide)]
+        # Weights of the own depth and of the one voted for; then what is no weight. Slices, not a list of rows, which
+        # would have to be copied to the GPU.
+        order = [slice(0, 1), *[slice(-1, None)] * self.votes, slice(1, 5), *[slice(5, 6)] * self.refines]
+        assert self.scalars.bias is not None
+        for rows in order:
+            weight = self.scalars.weight[rows, :, 0, 0].repeat_interleave(GROUP, 1) / GROUP
+            layers.append((weight, self.scalars.bias[rows]))
+        filters, biases = (torch.cat(parts) for parts in zip(*layers, strict=True))
+        filters = filters[:, :, None, None].contiguous(memory_format=torch.channels_last)
+        found = F.conv2d(x, filters, biases).float()
+        logits = 3 + self.refines
+        weights, own, others = found.split([found.shape[1] - 1 - logits, 1, logits], dim=1)
+        return weights, own, others[:, :3], others[:, 3:]
 
     def _chosen(self, depth: Tensor, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """A depth for each pixel, the delay of its light; and that depth and the candidates' logits as outputs."""
@@ -196,15 +223,14 @@ class PyramidNet(nn.Module):
         return chosen, LONGEST_DELAY * torch.sigmoid(head[:, -1:]), [chosen, logits]
 
 
-def _answer(heads: Tensor, trusts: Tensor, own: Tensor, values: Tensor, own_value: Tensor, reach: Tensor) -> Tensor:
+def _answer(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
     """Weighted mean of the values, then one in which those far from it count less, `[B, 1, H, W]`.
 
     What comes from another surface keeps little part in the answer. The fall with distance is a power, not an
     exponential: a depth that is not trusted stays so where it is near. At `_WIDEST` sigmoid(reach) it is a quarter.
     There is no second mean where `reach` has no channel.
     """
-    weight = torch.softmax(torch.cat([heads.float() + trusts, own], dim=1), dim=1)
-    values = torch.cat([values, 0.5 + own_value], dim=1)
+    weight = torch.softmax(weights + trusts, dim=1)
     found = (weight * values).sum(dim=1, keepdim=True)
     if reach.shape[1]:
         near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
@@ -242,11 +268,11 @@ def _median(scores: Tensor) -> Tensor:
 
 def _candidates(
     depth: Tensor, reported: Tensor, true: Tensor, radius: int, boxes: tuple[int, ...], steps: tuple[int, ...]
-) -> tuple[Tensor, Tensor]:
-    """Depths around each pixel and the logarithms of their certainty, `[B, n, H, W]`."""
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Depths around each pixel and the logarithms of their certainty, each `[B, 1, H, W]`."""
     certainty = torch.sigmoid(true) * reported
-    values = [_windows(depth, 2 * radius + 1, 1)]
-    trusts = [_windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), 2 * radius + 1, 1)]
+    values = _windows(depth, 2 * radius + 1, 1)
+    trusts = _windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), 2 * radius + 1, 1)
     both = torch.cat([certainty * depth, certainty], dim=1)
     for box, step in zip(boxes, steps, strict=True):
         coarse = 1 if box < 16 else 4
@@ -257,18 +283,18 @@ def _candidates(
         if coarse > 1:
             mean = F.interpolate(mean, scale_factor=float(coarse), mode="bilinear", align_corners=False)
         share = mean[:, 1:] + 1e-6
-        values.append(_windows(mean[:, :1] / share, 3, step))
-        trusts.append(_windows(torch.log(share), 3, step))
-    return torch.cat(values, dim=1), torch.cat(trusts, dim=1)
+        values += _windows(mean[:, :1] / share, 3, step)
+        trusts += _windows(torch.log(share), 3, step)
+    return values, trusts
 
 
-def _windows(image: Tensor, side: int, step: int) -> Tensor:
-    """`[B, 1, H, W]` to `[B, side², H, W]`: the values `step` pixels apart around each pixel."""
+def _windows(image: Tensor, side: int, step: int) -> list[Tensor]:
+    """The values of an image `[B, 1, H, W]` at `side`² places `step` pixels apart around each pixel."""
     height, width = image.shape[-2:]
     reach = side // 2 * step
     padded = F.pad(image, (reach, reach, reach, reach), mode="replicate")
     starts = range(0, 2 * reach + 1, step)
-    return torch.cat([padded[..., y : y + height, x : x + width] for y in starts for x in starts], dim=1)
+    return [padded[..., y : y + height, x : x + width] for y in starts for x in starts]
 
 
 def ranks(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -114,11 +114,16 @@ class SymmetricWindow(nn.Module):
         self.register_buffer("classes", index, persistent=False)
         self.register_buffer("places", _expansion(side, 1).clone(), persistent=False)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def filters(self) -> tuple[Tensor, Tensor]:
+        """Weights `[side², 8 inputs]` and biases `[side²]` of a layer of 1 × 1 pixels."""
         assert isinstance(self.places, Tensor) and isinstance(self.classes, Tensor)
         inputs, area = self.weight.shape
         weight = self.weight.index_select(1, self.places).view(inputs * GROUP, area)
-        return F.conv2d(x, weight.t()[:, :, None, None].contiguous(), self.bias.index_select(0, self.classes))
+        return weight.t(), self.bias.index_select(0, self.classes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight, bias = self.filters()
+        return F.conv2d(x, weight[:, :, None, None].contiguous(), bias)
 
 
 def symmetric_mean(x: Tensor) -> Tensor:

@@ -127,7 +127,7 @@ class Run:
         rate, decay = recipe.optimiser.learning_rate, recipe.optimiser.weight_decay
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=torch.tensor(rate, device=workers.device) if workers.is_cuda else rate,
-            weight_decay=decay, fused=workers.is_cuda, capturable=workers.is_cuda,
+            weight_decay=decay, betas=(0.9, 0.99), fused=workers.is_cuda, capturable=workers.is_cuda,
         )  # fmt: skip
         self.generator = torch.Generator(workers.device).manual_seed(recipe.seed * 1009 + workers.rank)
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
