@@ -283,8 +283,10 @@ def _estimate_depth(
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
     gate_stop = histograms.gate_start + bins * float(histograms.bin_width or 0.0)
+    depth = reduced.values.astype(np.float32)
+    depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
     return DepthReading(
-        depth=reduced.values.astype(np.float32),
+        depth=depth,
         frames=reduced.frames > 1,
         gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
         profile=_profile(histograms),

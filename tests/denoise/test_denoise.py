@@ -30,7 +30,7 @@ from spadwarp.denoise.recipe import load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
 from spadwarp.denoise.training_run import read_scenes
-from spadwarp.frames import record_frames
+from spadwarp.frames import instrument_response, record_frames
 from spadwarp.io.exr import write_exr
 
 
@@ -171,6 +171,23 @@ def test_histograms_become_depth_first(tmp_path):
         files.denoise_file(tmp_path / "counts.npy", tmp_path)
     with pytest.raises(ArgumentError, match="bin width is missing"):
         files.read_depth(tmp_path / "counts.npy", group_index=index, gate_start=0.0)
+
+
+def test_a_peak_before_the_pulse_is_no_depth(tmp_path):
+    """Noise in the first bin of a gate that opens with the pulse: its centre may lie before it."""
+    counts = np.random.default_rng(2).poisson(0.05, (16, 16, 128)).astype(np.uint16)
+    counts[..., 60:63] += 3
+    counts[4, 5], counts[4, 5, 0] = 0, 30
+    np.save(tmp_path / "counts.npy", counts)
+    found = files.denoise_file(
+        tmp_path / "counts.npy",
+        tmp_path / "out",
+        bin_width=80e-12,
+        gate_start=0.0,
+        group_index=1.0,
+        irf=instrument_response(pulse_fwhm=0.0, jitter_fwhm=350e-12),
+    )
+    assert np.median(found.depth) == pytest.approx(61.5 * 80e-12 * 299_792_458 / 2, abs=0.01)
 
 
 def test_what_cannot_be_read(tmp_path):
