@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.agreement import agreeing_depths
 from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.gates import gate_of_target
@@ -220,28 +219,8 @@ def estimate_frames(
         found[some] = start + width * np.clip(output[:, 0], 0.0, 1.0)
         if output.shape[1] > 1:
             probability[some], confidence[some] = output[:, 1], output[:, 2]
-        if model == "pyramid":
-            for index in range(first, min(first + part, len(inputs))):
-                _keep_agreeing(frames, index, gates[index], found[index], probability[index])
         if progress is not None:
             progress("frames", min(first + part, len(inputs)), len(inputs))
     return Estimate(
         np.where(empty, np.float32(np.nan), found), np.where(empty, np.float32(0.0), probability), confidence
     )
-
-
-def _keep_agreeing(
-    frames: DepthFrames,
-    index: int,
-    gate: NDArray[np.float64],
-    found: NDArray[np.float32],
-    probability: NDArray[np.float32],
-) -> None:
-    """Puts depths that agree with those beside them into the answer of a frame, where it took them for backscatter."""
-    width = gate[1] - gate[0]
-    depth, answer = ((values - gate[0]) / width for values in (frames.depth[index], found))
-    density = frames.density[index] * np.float32(width / (frames.gate[1] - frames.gate[0]))
-    kept = agreeing_depths(depth, answer, density)
-    probability[kept] = np.maximum(probability[kept], np.float32(0.99))
-    kept &= np.abs(depth - answer) > 0.01
-    found[kept] = frames.depth[index][kept]

@@ -37,15 +37,16 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
     torch = require_torch()
     from safetensors.torch import load_file
 
-    from spadwarp.denoise.networks import network_of
+    from spadwarp.denoise.networks import build_network
 
     path = _weights_path(model, weights)
     named = _header(path).get("model", model)
     if named != model:
         raise FileError(f"{path}: weights of {named!r}, not of {model!r}")
     try:
+        network: Any = build_network(model)
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
-        network: Any = network_of(model, values)
+        network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own

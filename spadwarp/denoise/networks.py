@@ -9,7 +9,7 @@ the gate, `[batch, 1, height, width]`; PyramidNet also the logits of `spadwarp.d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -20,8 +20,7 @@ from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.pyramid import PyramidNet
 from spadwarp.errors import ArgumentError
 
-__all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "network_of"]
-__all__ += ["reads_histograms"]
+__all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
 
 
 class USDN(nn.Module):
@@ -86,17 +85,6 @@ def build_network(name: str) -> nn.Module:
     if name not in NETWORKS:
         raise ArgumentError(f"model = {name!r} is not one of {', '.join(map(repr, NETWORKS))}")
     return NETWORKS[name]()
-
-
-def network_of(name: str, weights: Mapping[str, Tensor]) -> nn.Module:
-    """A network that these weights fit, with the weights: `name` of this version, or the PyramidNet before votes.
-
-    Raises what `load_state_dict` does where they do not fit.
-    """
-    earlier = name == "pyramid" and "spread.bias" in weights and "enter_agreement.weight" not in weights
-    network = PyramidNet(last=6, fine=0, votes=False) if earlier else build_network(name)
-    network.load_state_dict(weights)
-    return network
 
 
 def reads_histograms(network: nn.Module) -> bool:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.losses import loss_of
 from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import build_network, network_of, reads_histograms
+from spadwarp.denoise.networks import build_network, reads_histograms
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch
 from spadwarp.errors import ConfigError, FileError
@@ -117,7 +117,7 @@ class Run:
         torch.manual_seed(recipe.seed)
         network: Any = build_network(recipe.model)
         if recipe.start is not None:
-            network = network_of(recipe.model, load_network(recipe.start).state_dict())
+            network.load_state_dict(load_network(recipe.start).state_dict())
         self.network = network.to(workers.device).to(memory_format=torch.channels_last)
         self.learner = self.network
         if workers.size > 1:

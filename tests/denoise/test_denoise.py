@@ -179,14 +179,9 @@ def test_a_peak_before_the_pulse_is_no_depth(tmp_path):
     counts[..., 60:63] += 3
     counts[4, 5], counts[4, 5, 0] = 0, 30
     np.save(tmp_path / "counts.npy", counts)
-    found = files.denoise_file(
-        tmp_path / "counts.npy",
-        tmp_path / "out",
-        bin_width=80e-12,
-        gate_start=0.0,
-        group_index=1.0,
-        irf=instrument_response(pulse_fwhm=0.0, jitter_fwhm=350e-12),
-    )
+    known = {"bin_width": 80e-12, "gate_start": 0.0, "group_index": 1.0}
+    response = instrument_response(pulse_fwhm=0.0, jitter_fwhm=350e-12)
+    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", irf=response, **known)
     assert np.median(found.depth) == pytest.approx(61.5 * 80e-12 * 299_792_458 / 2, abs=0.01)
 
 

@@ -91,6 +91,7 @@ def test_every_pixel_has_a_depth_and_the_mask_is_a_choice():
     masked = denoised(noisy, mask=0.5)
     assert np.array_equal(np.isnan(masked), found.target_probability < 0.5)
     assert np.mean(np.isnan(masked) == np.isnan(clean)) > 0.98
+    found = estimate(np.where(np.isnan(clean), np.nan, noisy_frame(clean, 0.55)), gate=GATE, device="cpu")
     right = np.abs(found.depth - clean) < 0.01 * 2.5
     assert found.confidence[right].mean() > found.confidence[np.isfinite(clean) & ~right].mean()
     with pytest.raises(ArgumentError, match=r"mask = 1\.5"):
