@@ -17,7 +17,7 @@ from spadwarp.viz import style
 EXTINCTIONS = (0.1, 0.3, 0.6, 1.0)
 DISTANCE = 5.0
 WATER = "absorption,scattering,reflectance"
-PULSES = 10**6
+PULSES = 1000
 
 
 def scene(extinction: float) -> Scene:
