@@ -112,7 +112,7 @@ def main(name, exposures, device, photons, truth_photons, seconds):
         shares.append(max(one.simulation for one in fit.estimates.values()))
     values = np.array(rows, float)
     print(
-        f"{name}: {len(rows)} fits; median {np.median(times):.2f} s; the simulation is {100 * np.median(shares):.2g} % of "
+        f"{name}: {len(rows)} fits; median {np.median(times):.2f} s, simulation {100 * np.median(shares):.2g} % of "
         "the largest variance"
     )
     for column, one in enumerate([*known, "depth"]):
