@@ -1,5 +1,6 @@
 """Files of other programs: what they say is read, what they do not say is asked for or said."""
 
+import inspect
 import os
 from pathlib import Path
 
@@ -89,7 +90,9 @@ def test_frames_stay_frames_in_every_format(tmp_path):
     ptufile = pytest.importorskip("ptufile")
     frames = np.stack([COUNTS, 2 * COUNTS, COUNTS])
     np.save(tmp_path / "a.npy", frames)
-    ptufile.imwrite(tmp_path / "a.ptu", frames, has_frames=True, global_resolution=50e-9, tcspc_resolution=4e-12)
+    newer = "dims" in inspect.signature(ptufile.imwrite).parameters
+    axes = {"dims": "TYXH"} if newer else {"has_frames": True}
+    ptufile.imwrite(tmp_path / "a.ptu", frames, **axes, global_resolution=50e-9, tcspc_resolution=4e-12)
     for name in ("a.npy", "a.ptu"):
         assert np.array_equal(read_histograms(tmp_path / name, **START).values, frames), name
         summed = read_histograms(tmp_path / name, sum_frames=True, **START).values
