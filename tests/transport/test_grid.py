@@ -1,5 +1,6 @@
 """Water cell by cell: against one water, layers and quadrature; the estimators against each other."""
 
+import itertools
 import math
 
 import h5py
@@ -227,3 +228,28 @@ def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, de
     first, last = ((path**2 - 0.01) / (2.0 * path) for path in edges[[0, -1]])
     total = quad(gaussian, first, last, epsabs=1e-14, limit=200)[0]
     assert mean.sum() == pytest.approx(total, rel=0.003, abs=4.0 * math.sqrt((error**2).sum()))
+
+
+@pytest.mark.parametrize("tracking", TRACKING)
+def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp_path, device):
+    """Two cells, a step from c 0.3 to 1.2 at z = 1.25 m; 0.3 % of each bin, and 4 standard errors."""
+    c, b = np.array([0.3, 1.2]), np.array([0.24, 0.6])
+    path = tmp_path / "halves.npz"
+    np.savez(path, extinction=c.reshape(1, 1, 2), scattering=b.reshape(1, 1, 2), size=[80.0, 80.0, 40.0])
+    edges = np.arange(1.5, 4.01, 0.25)
+    grid = {"file": str(path), "translation": [0.0, 0.0, 1.25], "tracking": tracking}
+    one = _pencil({"grid": grid}, edges, "guided")
+
+    def brought(z):
+        """Both ways cross the step at the same part of their length."""
+        near = min(1.25 / z, 1.0)
+        tau = (c[0] * near + c[1] * (1.0 - near)) * (z + math.hypot(0.1, z))
+        return float(_brought(one, z, b[int(z > 1.25)], tau))
+
+    ends = (edges**2 - 0.01) / (2.0 * edges)
+    expected = np.array(
+        [quad(brought, low, high, points=[1.25], epsabs=1e-15)[0] for low, high in itertools.pairwise(ends)]
+    )
+    mean, error = _measured(one, 100_000, 8, device)
+    assert (np.abs(mean - expected) < 4.0 * error + 0.003 * expected).all(), (mean - expected) / error
+    assert (error < 0.01 * expected).all()
