@@ -71,6 +71,14 @@ def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
     return case
 
 
+def _grid(r: random.Random, corpus: Corpus) -> Case:
+    name = r.choice(("cells.npz", "cells.h5"))
+    files = {"grid.toml": corpus["grid.toml"].replace(b"cells.npz", name.encode())}
+    files[name] = mutations.in_bytes(r, corpus[name])
+    run = ("simulate", "grid.toml", "--photons", "100", "--out", "out", "--quiet", *CPU)
+    return Case(r.choice((("check", "grid.toml"), run)), files, ("out",))
+
+
 def _recipe(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("recipe.toml", "recipe.toml", "training.toml"))
     injected = r.random() < 0.3
@@ -176,6 +184,7 @@ def _command_line(r: random.Random, corpus: Corpus) -> Case:
 CATEGORIES: dict[str, Callable[[random.Random, Corpus], Case]] = {
     "scene": _scene,
     "recipe": _recipe,
+    "grid": _grid,
     "calibration": _beside_a_scene("camera.yaml", "camera.json", "camera.xml"),
     "table": _beside_a_scene("phase.csv", "irf.csv", "beam.npy"),
     "mesh": _mesh,

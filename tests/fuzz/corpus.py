@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import trimesh
 
@@ -71,6 +72,8 @@ reflectance = "from_file"
 photons = 500
 """
 
+GRID = SCENE.replace(b"[laser]", b'[medium.grid]\nfile = "cells.npz"\ntranslation = [0.0, 0.0, 1.0]\n[laser]', 1)
+
 CAMERA = b"""%YAML:1.0
 ---
 image_width: 10
@@ -126,7 +129,8 @@ COUNTS = np.random.default_rng(1).poisson(1.0, (8, 10, 30)).astype(np.uint16)
 def make_corpus(folder: Path) -> None:
     """Writes all files; takes a few seconds."""
     for name, content in {
-        "scene.toml": SCENE, "calibrated.toml": CALIBRATED, "camera.yaml": CAMERA, "training.toml": TRAINING,
+        "scene.toml": SCENE, "grid.toml": GRID, "calibrated.toml": CALIBRATED, "camera.yaml": CAMERA,
+        "training.toml": TRAINING,
         "camera.xml": CAMERA_XML, "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
     }.items():  # fmt: skip
         (folder / name).write_bytes(content)
@@ -174,6 +178,11 @@ def _theirs(folder: Path) -> None:
     import scipy.sparse
 
     np.save(folder / "counts.npy", COUNTS)
+    cells = {"density": np.linspace(0.0, 2.0, 60).reshape(3, 4, 5), "cell_size": np.full(3, 0.1)}
+    np.savez(folder / "cells.npz", **cells)
+    with h5py.File(folder / "cells.h5", "w") as file:
+        for name, values in cells.items():
+            file[name] = values
     np.save(folder / "beam.npy", np.outer([1.0, 3.0, 2.0], [1.0, 4.0, 5.0, 1.0]))
     np.save(folder / "response.npy", np.array([1.0, 4.0, 2.0]))
     np.save(folder / "depth.npy", np.linspace(1.0, 2.0, 192, dtype=np.float32).reshape(12, 16))
