@@ -13,6 +13,7 @@ ROOT = Path(sk.__file__).parent
 # A room imports those before it.
 ROOMS = (
     "arguments",
+    "pixels",
     "math",
     "random",
     "medium",
@@ -27,7 +28,6 @@ ROOMS = (
     "derivatives",
     "estimators",
     "transport",
-    "pixels",
     "detection",
     "analytic",
     "ray_cast",

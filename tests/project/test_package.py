@@ -63,6 +63,7 @@ LOADED_LATE = {
     "denoise/synthetic_noise.py",
     "denoise/training.py",
     "denoise/training_steps.py",
+    "denoise/votes.py",
     "transport/device_worker.py",
     "transport/local_workers.py",
     "transport/model.py",
