@@ -52,14 +52,16 @@ def main(photons: int = 4_000_000, path: Path = Path("docs/images/water_unknown.
         together = 1e3 * np.array([one.standard_error for one in found])
         alone = 1e3 * np.array([one.alone for one in found])
         print(label, "mm", together.round(4), "known water", alone.round(4), "ratio", (together / alone).round(3))
+        left.set_yscale("log")
         left.plot(depths, together, "o-", color=colour, markersize=3, label=f"{label}, water unknown")
         left.plot(depths, alone, linestyle=style.DASHED, color=colour, label=f"{label}, water known")
         right.plot(depths, together / alone, "o-", color=colour, markersize=3, label=label)
+    left.set_ylim(top=30 * together.max())  # for the legend
     style.log_axis(left, "y")
     for axis, name in ((left, "bound of the depth [mm]"), (right, "unknown over known water")):
         axis.set(xlabel="optical depth c · 5 m, one way", ylabel=name)
         style.plain_axis(axis)
-        axis.legend()
+        axis.legend(loc="upper left" if axis is left else "upper right")
     style.save(figure, path)
 
 
