@@ -1,4 +1,8 @@
-"""Kernels of transport are compiled, or loaded from Warp's cache, in a thread of their own beside the rest of a run."""
+"""Kernels of transport are compiled, or loaded from Warp's cache, in a thread of their own beside the rest of a run.
+
+On CPUs alone: with CUDA, Warp ends the process now and then where one thread builds a mesh while another loads a module
+(https://github.com/NVIDIA/warp/issues/1491).
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,11 @@ def _thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "spadwarp-kernels")
 
 
+def _beside(devices: Sequence[wp.Device]) -> bool:
+    # Where memory is limited, two threads that compile may be too many.
+    return address_space() is None and not any(device.is_cuda for device in devices)
+
+
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_thread.cache_clear)  # a child has none of its parent's threads
 
@@ -38,7 +47,7 @@ def prepare_kernels(device: str | None = None) -> None:
     import spadwarp_kernels as sk
 
     devices = pick_devices(device)
-    if address_space() is not None:  # where memory is limited, two threads that compile may be too many
+    if not _beside(devices):
         return
 
     def load() -> None:
@@ -56,7 +65,7 @@ def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Future[Non
         for device in devices:
             sk.load_transport_kernel(spec, device)
 
-    if address_space() is None:
+    if _beside(devices):
         return _thread().submit(load)
     load()
     done = Future[None]()
