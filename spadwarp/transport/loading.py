@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from spadwarp.device import pick_devices
@@ -57,17 +57,12 @@ def prepare_kernels(device: str | None = None) -> None:
     _thread().submit(load)  # what fails here fails again in the run
 
 
-def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Future[None]:
-    """Begins to load the kernel of a spec on devices; the future ends when it is there, or raises what went wrong."""
+def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Callable[[], None]:
+    """Begins to load the kernel of a spec on devices; the function returned waits for it, or raises its error."""
     import spadwarp_kernels as sk
 
     def load() -> None:
         for device in devices:
             sk.load_transport_kernel(spec, device)
 
-    if _beside(devices):
-        return _thread().submit(load)
-    load()
-    done = Future[None]()
-    done.set_result(None)
-    return done
+    return _thread().submit(load).result if _beside(devices) else load

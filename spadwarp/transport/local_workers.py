@@ -66,7 +66,7 @@ class LocalWorkers:
         models = []
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
         choices: dict[str, Any] = {"copies": copies, "scale": plan.scale, "kept": kept, "derivatives": plan.derivatives}
-        loading = load_transport_kernel(spec, devices)
+        finish_loading = load_transport_kernel(spec, devices)
         for device in devices:
             with device_errors(device):
                 models.append(build_model(plan.scene, device, plan.mesh, **choices))
@@ -74,7 +74,7 @@ class LocalWorkers:
         with device_errors(devices[0]):
             self._truth = trace_truth(plan.scene, models[0])
             traced = time.perf_counter()
-            loading.result()
+            finish_loading()
         settings: dict[str, Any] = {
             "seed": plan.seed,
             "launch_size": size,
