@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 
-def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, first: int = 0) -> None:
-    """Launch a kernel over `count` pixels from `first` on: its first argument is the launch's first, `inputs` follow.
+def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any) -> None:
+    """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
 
     On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads; but not
     while a graph is captured, which records the launches of one thread.
@@ -19,7 +19,7 @@ def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, devic
     if count == 0:
         return
     if device.is_cuda or device.is_capturing:
-        wp.launch(kernel, count, [first, *inputs], device=device)
+        wp.launch(kernel, count, [0, *inputs], device=device)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads
     workers = os.cpu_count() or 1
@@ -27,7 +27,7 @@ def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, devic
 
     def part(index: int) -> None:
         low, high = int(edges[index]), int(edges[index + 1])
-        wp.launch(kernel, high - low, [first + low, *inputs], device=device)
+        wp.launch(kernel, high - low, [low, *inputs], device=device)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(part, range(len(edges) - 1)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_kind, check_seed
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_seed
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.binomial import PURPOSE_COUNTS, binomial, uniforms
 
@@ -158,7 +158,6 @@ def first_photon_step(
     counter_depth: int = 0,
     seed: int,
     counts: wp.array,
-    rows: range | None = None,
 ) -> None:
     """One frame of `first_photon_counts` whose number is on the device, for a step that is captured in a graph.
 
@@ -169,7 +168,6 @@ def first_photon_step(
         hazard: As there; its values are not checked.
         frame: int64 `[1]`, the number of the frame, which the caller moves on.
         counts: int32 `[pixel, bin]`, overwritten.
-        rows: Pixels that are drawn, without steps; the others keep their counts. All by default.
         pulses, counter_depth, seed: As there.
 
     Raises:
@@ -179,15 +177,9 @@ def first_photon_step(
     check_array("frame", frame, wp.int64, (1,), hazard.device)
     check_array("counts", counts, wp.int32, hazard.shape, hazard.device, contiguous=True)
     pulses, _, _, counter_depth, seed = check_exposure(hazard, pulses, 1, 0, counter_depth, seed)
-    rows = range(hazard.shape[0]) if rows is None else rows
-    check_kind("rows", rows, range)
-    if rows.step != 1 or not 0 <= rows.start <= rows.stop <= hazard.shape[0]:
-        raise ArgumentError(f"rows = {rows} are not rows of the {hazard.shape[0]} of hazard")
-    if not len(rows):
-        return
-    counts[rows.start : rows.stop].zero_()
+    counts.zero_()
     inputs = [hazard, pulses, frame, counter_depth or 2**31 - 1, seed, counts]
-    launch_pixels(_first_photon_step_kernel, len(rows), inputs, device=hazard.device, first=rows.start)
+    launch_pixels(_first_photon_step_kernel, hazard.shape[0], inputs, device=hazard.device)
 
 
 def check_rates(name: str, rates: wp.array) -> None:

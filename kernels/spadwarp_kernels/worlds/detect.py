@@ -91,22 +91,15 @@ class Detection:
             half_width=-lowest_tap - 1,
         )
 
-    def launch(self, cameras: range) -> None:
-        """Counts and depth of some cameras; nothing is allocated or read."""
-        config, pixels = self.config, self.view.size
-        rows = range(cameras.start * pixels, cameras.stop * pixels)
+    def launch(self) -> None:
+        """Counts and depth of all cameras from their rates, and the next step; nothing is allocated or read."""
+        config = self.config
         rates, counts = self.rates.reshape(self.rows), self.histogram.reshape(self.rows)
-        first_photon_step(rates, pulses=config.pulses, frame=self.step, seed=config.seed, counts=counts, rows=rows)
-        histogram, arrival, depth, total = (
-            array[rows.start : rows.stop]
-            for array in (counts, self._arrival, self.depth.flatten(), self.counts.flatten())
-        )
-        self._estimate(histogram, arrival)
-        inputs = [arrival, self.view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
-        wp.launch(_depth_kernel, len(rows), [*inputs, histogram], [depth, total], device=depth.device)
-
-    def advance(self) -> None:
-        """The next step, after `launch` of all cameras."""
+        first_photon_step(rates, pulses=config.pulses, frame=self.step, seed=config.seed, counts=counts)
+        self._estimate(counts, self._arrival)
+        inputs = [self._arrival, self.view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
+        outputs = [self.depth.flatten(), self.counts.flatten()]
+        wp.launch(_depth_kernel, self.rows[0], [*inputs, counts], outputs, device=self.depth.device)
         wp.launch(_advance_kernel, 1, [self.step], device=self.step.device)
 
     def points(self, pose: wp.transform, out: wp.array) -> None:

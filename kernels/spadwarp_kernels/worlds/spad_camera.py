@@ -259,5 +259,4 @@ class SpadCamera(WorldCameras):
         inputs += [config.timing_sigma * config.speed, config.dark_rate * config.bin_path / config.speed]
         rates = self.rates.reshape(detection.rows)
         wp.launch(_rates_kernel, detection.rows, inputs, [rates], device=self.device)
-        detection.launch(range(self.cameras))
-        detection.advance()
+        detection.launch()

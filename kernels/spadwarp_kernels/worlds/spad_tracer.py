@@ -159,10 +159,10 @@ class SpadTracer(WorldCameras):
         for lane in self._lanes[1:]:
             self.device.stream.wait_stream(lane.stream)
         wp.launch(_advance_kernel, 1, [data.offset, self.cameras * self.photons], device=self.device)
-        self._detection.advance()
+        self._detection.launch()
 
     def _trace(self, v: int, model: Model, lane: _Lane) -> None:
-        """Light, counts and depth of one camera, on the device's current stream."""
+        """Expected detections of one camera, on the device's current stream."""
         config, surfaces, photons = self.config, model.surfaces, self.photons
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
@@ -176,7 +176,6 @@ class SpadTracer(WorldCameras):
         dark = config.dark_rate * config.bin_path / config.speed
         inputs = [lane.light, dark, self._taps, self._lowest]
         wp.launch(_response_kernel, rates.shape, inputs, [rates], device=self.device)
-        self._detection.launch(range(v, v + 1))
 
     def rebuild(self) -> None:
         """Builds the trees anew at the next step, for where things are then: faster rays where they have moved far.
