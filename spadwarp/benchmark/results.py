@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from spadwarp.device import core_count, nvidia_driver, pick_device
+from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
 from spadwarp.errors import FileError
 from spadwarp.transport import provenance
 
-__all__ = ["BenchResult", "load_report", "ratios", "report"]
+__all__ = ["BenchResult", "load_report", "report"]
 
 FORMAT, FORMAT_VERSION = "spadwarp bench", 1
 
@@ -57,9 +57,10 @@ class BenchResult:
 
 
 def report(results: Sequence[BenchResult]) -> dict[str, Any]:
-    """Results as plain values, with device, driver, versions, commit and date."""
+    """Results as plain values, with device, processor, driver, versions, commit and date."""
     device = pick_device(results[0].device if results else None)
     made = {**provenance(device), "driver": nvidia_driver() if device.is_cuda else None, "commit": _commit()}
+    made["processor"] = processor_name(pick_device("cpu"))
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -84,20 +85,6 @@ def load_report(path: str | Path) -> dict[str, Any]:
     if any(not isinstance(row, dict) or not needed <= row.keys() for row in stored["results"]):
         raise FileError(f"{path}: a result lacks one of {', '.join(sorted(needed))}")
     return stored
-
-
-def ratios(results: Sequence[BenchResult], before: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Rates now over rates before, by case and unit, for the cases that both have; above 1 is faster now."""
-    earlier = {row["case"]: row["rates"] for row in before["results"]}
-    return {
-        result.case: {
-            unit: rate / earlier[result.case][unit]
-            for unit, rate in result.rates.items()
-            if earlier[result.case].get(unit)
-        }
-        for result in results
-        if result.case in earlier
-    }
 
 
 def _commit() -> str | None:

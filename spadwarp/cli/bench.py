@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,14 +16,19 @@ from spadwarp.cli._tables import new_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spadwarp.benchmark import BenchResult
+    from spadwarp.benchmark import BenchResult, Comparison
 
 
 @app.command()
 def bench(
     cases: Annotated[
         list[str] | None,
-        typer.Argument(metavar="CASE", help='Names of cases, or "scaling"; all cases if left out.', show_default=False),
+        typer.Argument(
+            metavar="CASE",
+            help='Names of cases, or "scaling"; all cases if left out. A FILE.json that --json wrote stands for its '
+            "results, and nothing is measured.",
+            show_default=False,
+        ),
     ] = None,
     device: opt.Device = None,
     photons: opt.Photons = None,
@@ -35,29 +41,68 @@ def bench(
     json_path: opt.Json = None,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also print the ratio of the rates to those in FILE, written by --json."),
+        typer.Option(
+            metavar="FILE",
+            help="Also say which cases are faster, slower or the same as in FILE, written by --json; for a directory, "
+            "as in its newest file from such a device.",
+        ),
     ] = None,
 ) -> None:
     """Measure the speed of named cases.
 
     Compile time is apart from run time. "error" is the relative standard error of the brightest bins after one second
-    of transport. Ends with code 1 where a mean that is known from elsewhere is missed.
+    of transport.
+
+    With --compare, a case is faster or slower where the 99 % confidence interval of the ratio of its speeds (the t-test
+    of Welch on the logarithms of the timed runs) lies more than 3 % from 1; the same where it stays within 10 %; else
+    unclear, for which more --repeats help. Ends with code 1 where a case is slower, or a mean that is known from
+    elsewhere is missed.
 
     \b
     Examples:
       spadwarp bench water staircase_5m --json before.json
       spadwarp bench water staircase_5m --compare before.json
+      spadwarp bench --compare before.json after.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark import CASES, load_report, ratios, report, run
+    from spadwarp.benchmark import CASES, load_report
 
     if list_cases:
         for case in CASES.values():
             say(f"{case.name:<20}  {case.summary}")
         say(f"{'scaling':<20}  how cost and memory grow with photons, faces and bins")
         return
-    before = None if compare is None else load_report(compare)
-    outputs = opt.check_outputs(json=json_path, inputs=(compare,), overwrite=overwrite)
+    kept = _kept_results(cases)
+    before = None if compare is None or compare.is_dir() else load_report(compare)
+    outputs = opt.check_outputs(json=json_path, inputs=(compare, kept), overwrite=overwrite)
+    if kept is not None:
+        summary = _show_kept(load_report(kept), quiet)
+    else:
+        summary = _measure(cases, outputs, quiet, device=device, photons=photons, repeats=repeats)
+    slower = []
+    if compare is not None:
+        slower = _compare(summary, compare, before, quiet)
+    outputs.write_json(summary)
+    checks = {row["case"]: row["check"] for row in summary["results"]}
+    missed = [case for case, check in checks.items() if check is not None and not check["passed"]]
+    problems = [f"{', '.join(missed)}: a mean is not what it should be"] if missed else []
+    problems += [f"{', '.join(slower)}: slower than in {compare}"] if slower else []
+    if problems:
+        fail("\n".join(problems))
+
+
+def _kept_results(cases: Sequence[str] | None) -> Path | None:
+    """The file that stands for results, instead of names of cases."""
+    files = [case for case in cases or () if case.endswith(".json")]
+    if files and len(cases or ()) > 1:
+        raise typer.BadParameter(f"{files[0]} goes without other cases and files", param_hint="CASE")
+    return Path(files[0]) if files else None
+
+
+def _measure(cases: list[str] | None, outputs: opt.Outputs, quiet: bool, **options: Any) -> dict[str, Any]:
+    """Runs the cases, with a row for each as it comes."""
+    from spadwarp.benchmark import report, run
+
     results: list[BenchResult] = []
 
     def found(result: BenchResult) -> None:
@@ -67,15 +112,9 @@ def bench(
         if not quiet:
             say(_row(result))
 
+    announce = None if quiet else lambda case: complain(f"{case.name}: {case.summary}")
     try:
-        run(
-            cases or None,
-            device=device,
-            photons=photons,
-            repeats=repeats,
-            progress=None if quiet else lambda case: complain(f"{case.name}: {case.summary}"),
-            found=found,
-        )
+        run(cases or None, progress=announce, found=found, **options)
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
             outputs.write_json(report(results))
@@ -83,17 +122,40 @@ def bench(
     summary = report(results)
     if not quiet:
         _say_summary(results, summary["provenance"])
-    if before is not None:
-        faster = ratios(results, before)
-        summary["ratios"] = faster
-        if not quiet:
-            made = before["provenance"]
-            say(f"over {compare}: {made['device_name']}, {made['date']}")
-            opt.show_table(_ratio_table(faster))
-    outputs.write_json(summary)
-    missed = [result.case for result in results if result.check is not None and not result.check["passed"]]
-    if missed:
-        fail(f"{', '.join(missed)}: a mean is not what it should be")
+    return summary
+
+
+def _show_kept(stored: dict[str, Any], quiet: bool) -> dict[str, Any]:
+    from spadwarp.benchmark import BenchResult
+
+    if not quiet:
+        names = [field.name for field in fields(BenchResult)]
+        results = [BenchResult(**{name: row[name] for name in names}) for row in stored["results"]]
+        say(_HEAD)
+        for result in results:
+            say(_row(result))
+        _say_summary(results, stored["provenance"])
+    return stored
+
+
+def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None, quiet: bool) -> list[str]:
+    """Adds the comparison to the summary; returns the cases that are slower."""
+    from spadwarp.benchmark import compare, load_report, newest_report
+
+    if before is None:
+        cases = [row["case"] for row in summary["results"]]
+        place = newest_report(place, like=summary["provenance"], cases=cases)
+        before = load_report(place)
+    found = compare(summary, before)
+    summary["comparison"] = [asdict(one) for one in found]
+    if not quiet:
+        made = before["provenance"]
+        say(f"against {place}: {made['device_name']}, spadwarp {made['spadwarp']}, {made['date']}")
+        if found:
+            opt.show_table(_comparison_table(found))
+        else:
+            say("no case is in both")
+    return [one.case for one in found if one.verdict == "slower"]
 
 
 _COLUMNS = (
@@ -155,12 +217,19 @@ def _growth(results: Sequence[BenchResult]) -> list[str]:
     return lines
 
 
-def _ratio_table(faster: Mapping[str, Mapping[str, float]]) -> Table:
-    units = list(dict.fromkeys(unit for rates in faster.values() for unit in rates))
-    table = new_table("case", *(f"{unit}/s" for unit in units))
-    for case, rates in faster.items():
-        table.add_row(case, *(f"× {rates[unit]:.3f}" if unit in rates else "-" for unit in units))
+def _comparison_table(found: Sequence[Comparison]) -> Table:
+    table = new_table("case", "", "before", "now", "ratio", "99 % interval")
+    for one in found:
+        interval = "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}"
+        rates = (_with_spread(one.before, one.spread_before), _with_spread(one.now, one.spread_now))
+        table.add_row(
+            f"{one.case} [{one.unit}/s]".replace("[", r"\["), one.verdict, *rates, f"{one.ratio:.3f}", interval
+        )
     return table
+
+
+def _with_spread(rate: float, spread: float | None) -> str:
+    return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {100 * spread:.2g} %"
 
 
 def _say_summary(results: Sequence[BenchResult], made: Mapping[str, Any]) -> None:

@@ -7,11 +7,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy import stats
 
 import spadwarp
 from helpers.cli import DEVICE, run
-from spadwarp.benchmark import CASES, GROUPS, load_report, ratios, report
+from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
 from spadwarp.benchmark.runs import measure_transport
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.mesh import build_mesh
@@ -100,12 +102,51 @@ def test_report_says_what_it_was_measured_on(staircase):
     assert row["rates"] == pytest.approx(staircase.rates)
 
 
-def test_ratios_are_now_over_before(staircase, kept):
-    twice = replace(staircase, rates={unit: 2.0 * rate for unit, rate in staircase.rates.items()})
+def timed(result, *seconds, case="staircase_5m"):
+    return replace(result, case=case, seconds=seconds, rates={unit: 1.0 for unit in result.rates})
+
+
+@pytest.mark.parametrize(
+    ("seconds", "verdict"),
+    [
+        ((0.500, 0.502, 0.498), "faster"),
+        ((2.00, 2.01, 1.99), "slower"),
+        ((1.02, 1.021, 1.019), "same"),  # two per cent: processes differ by as much
+        ((1.3, 0.8, 1.1), "unclear"),
+        ((2.0,), "unclear"),
+    ],
+)
+def test_a_comparison_is_welchs_test(staircase, seconds, verdict):
+    earlier = (1.00, 1.004, 0.996)
     other = replace(staircase, case="water")
-    assert ratios([twice, other], load_report(kept)) == {
-        "staircase_5m": pytest.approx({"photons": 2.0, "collisions": 2.0, "queries": 2.0})
-    }
+    now, before = report([timed(staircase, *seconds), other]), report([timed(staircase, *earlier)])
+    (one,) = compare(now, before)
+    assert (one.case, one.unit, one.verdict) == ("staircase_5m", "photons", verdict)
+    assert one.before == pytest.approx(4000.0, rel=1e-4)
+    if len(seconds) > 1:
+        new, old = -np.log(seconds), -np.log(earlier)
+        expected = stats.ttest_ind(new, old, equal_var=False).confidence_interval(0.99)
+        assert np.log(one.interval) == pytest.approx([expected.low, expected.high], rel=1e-9, abs=1e-4)
+        assert one.spread_now == pytest.approx(new.std(ddof=1))
+
+
+def test_the_newest_report_of_such_a_device_is_taken(staircase, tmp_path):
+    made = report([staircase])
+    for name, date, changed in (
+        ("a", "2026-01-01", {}),
+        ("b", "2026-02-01", {}),
+        ("c", "2026-03-01", {"device_name": "another"}),
+        ("d", "2026-04-01", {"threads": 999}),
+    ):
+        stored = {**made, "provenance": {**made["provenance"], "date": date, **changed}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(stored))
+    assert [path.stem for path, _ in history(tmp_path)] == ["a", "b", "c", "d"]
+    like = made["provenance"]
+    assert newest_report(tmp_path, like=like, cases=["staircase_5m", "water"]).stem == "b"
+    with pytest.raises(FileError, match=r"no report of water from .* threads"):
+        newest_report(tmp_path, like=like, cases=["water"])
+    with pytest.raises(FileError, match="holds no report"):
+        history(tmp_path / "none")
 
 
 @pytest.mark.slow
@@ -114,10 +155,22 @@ def test_command_writes_and_compares(kept, tmp_path):
     options = ("--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept)
     result = run("bench", "staircase_5m", *DEVICE, *options)
     assert "120" in result.output
-    assert "×" in result.output
+    assert "unclear" in result.output  # a single run
     again = load_report(out)
-    assert again["ratios"]["staircase_5m"]["photons"] > 0
+    assert again["comparison"][0]["verdict"] == "unclear"
     assert again["results"][0]["size"] == {"photons": 4000}
+
+
+def test_kept_files_are_compared_and_a_slower_case_fails_the_command(staircase, tmp_path):
+    for name, seconds in (("fast", (1.0, 1.001, 0.999)), ("slow", (2.0, 2.001, 1.999))):
+        (tmp_path / f"{name}.json").write_text(json.dumps(report([timed(staircase, *seconds)])))
+    fast, slow = tmp_path / "fast.json", tmp_path / "slow.json"
+    result = run("bench", "--compare", fast, slow, "--json", tmp_path / "c.json", code=1)
+    assert "staircase_5m: slower than in" in result.output and "0.500" in result.output
+    assert json.loads((tmp_path / "c.json").read_text())["comparison"][0]["ratio"] == pytest.approx(0.5, rel=1e-3)
+    assert "faster" in run("bench", slow.with_name("fast.json"), "--compare", slow).output
+    assert "same" in run("bench", fast, "--compare", tmp_path / "fast.json").output
+    run("bench", fast, "water", "--compare", slow, code=2)
 
 
 def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
@@ -220,3 +273,11 @@ def test_a_missing_peer_is_reported_and_is_no_failure(script, tmp_path):
 def test_kept_results_can_be_read():
     for path in (PEERS.parent / "results").glob("*.json"):
         assert load_report(path)["results"]
+
+
+def test_the_history_is_drawn(staircase, tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(report([staircase, timed(staircase, 0.1, case="water")])))
+    (tmp_path / "b.json").write_text(json.dumps(report([timed(staircase, 0.1, 0.2)])))
+    command = [sys.executable, PEERS.parent / "history.py", tmp_path, "--out", tmp_path / "history.png"]
+    subprocess.run(command, check=True)
+    assert (tmp_path / "history.png").stat().st_size > 10_000
