@@ -21,6 +21,7 @@ from spadwarp.water.seawater import (
     refractive_index,
     water_optics,
 )
+from spadwarp.water.voss_fry import voss_fry_matrix
 
 __all__ = [
     "ParticleOptics",
@@ -42,5 +43,6 @@ __all__ = [
     "save_phase_table",
     "single_size",
     "surface_reflectance",
+    "voss_fry_matrix",
     "water_optics",
 ]

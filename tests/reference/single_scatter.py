@@ -61,15 +61,24 @@ class Lidar:
         return np.linspace(-half, half, self.pixels + 1)
 
 
+Factor = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""[..., k] over the unit directions [..., 3] before and after the scattering: Stokes vectors, of which I is 1."""
+
+
 def henyey_greenstein(cos_theta: ArrayLike, g: float) -> NDArray[np.float64]:
     """The phase function [1/sr]."""
     return (1 - g * g) / (4 * math.pi * (1 + g * g - 2 * g * np.asarray(cos_theta)) ** 1.5)
 
 
 def single_scatter(
-    lidar: Lidar, *, columns: ArrayLike | None = None, rows: ArrayLike | None = None, order: int = 8
+    lidar: Lidar,
+    *,
+    columns: ArrayLike | None = None,
+    rows: ArrayLike | None = None,
+    order: int = 8,
+    factor: Factor | None = None,
 ) -> NDArray:
-    """Collected fraction of light scattered once, [rows, columns, bins].
+    """Collected fraction of light scattered once, [rows, columns, bins], with a last axis of the factor's.
 
     Integrates over each pixel (order² Gauss points) and, along each of the camera's rays, over the part that lies in
     the laser's cone and in the bin (Gauss points again: the integrand is smooth there). Default: all pixels.
@@ -80,19 +89,19 @@ def single_scatter(
     pitch = edges[1] - edges[0]
     u = edges[columns][:, None] + pitch * (node + 0.5)  # [columns, order]
     v = edges[rows][:, None] + pitch * (node + 0.5)
-    result = np.zeros((rows.size, columns.size, lidar.edges.size - 1))
+    result = []
     for i in range(rows.size):  # a row of pixels at a time keeps the arrays small
         shape = (columns.size, order, order)
         tangent = np.stack(np.broadcast_arrays(u[:, :, None], v[i], 1.0), -1).reshape(*shape, 3)
         length = np.linalg.norm(tangent, axis=-1)
         ray = tangent / length[..., None]
         solid = pitch**2 * gauss[:, None] * gauss / length**3  # du dv cos³ψ
-        result[i] = np.einsum("cxy,cxyt->ct", solid, _along_ray(lidar, ray))
-    return result
+        result.append(np.einsum("cxy,cxyt...->ct...", solid, _along_ray(lidar, ray, factor)))
+    return np.stack(result)
 
 
-def single_scatter_total(lidar: Lidar, *, order: int = 300) -> NDArray:
-    """The same summed over the field, [bins], integrated the other way round: over the laser's rays."""
+def single_scatter_total(lidar: Lidar, *, order: int = 300, factor: Factor | None = None) -> NDArray:
+    """The same summed over the field, [bins, ...], integrated the other way round: over the laser's rays."""
     node, gauss = np.polynomial.legendre.leggauss(order)
     cosine = 1 - (1 - math.cos(lidar.half_angle)) * (node + 1) / 2
     phi = (np.arange(order) + 0.5) * 2 * math.pi / order
@@ -115,8 +124,11 @@ def single_scatter_total(lidar: Lidar, *, order: int = 300) -> NDArray:
     r = np.linalg.norm(point, axis=-1)
     cos_scatter = -(point * ray[:, :, None, None, :]).sum(-1) / r
     value = lidar.scattered(point[..., 2], distance + r, cos_scatter) * lidar.aperture_area * (point[..., 2] / r) / r**2
-    along = np.einsum("aptn,aptn->apt", value, weight)
-    return np.einsum("a,apt->t", gauss / 2, along) / order
+    value = value * weight
+    if factor is None:
+        return np.einsum("a,aptn->t", gauss / 2, value) / order
+    directions = np.broadcast_to(ray[:, :, None, None, :], point.shape)
+    return np.einsum("a,aptn,aptns->ts", gauss / 2, value, factor(directions, -point / r[..., None])) / order
 
 
 def lambertian_plane(lidar: Lidar, *, depth: float, reflectance: float, order: int = 8) -> NDArray:
@@ -140,8 +152,8 @@ def lambertian_plane(lidar: Lidar, *, depth: float, reflectance: float, order: i
     return np.einsum("iajb,a,b->ij", collected, gauss, gauss) * pitch**2
 
 
-def _along_ray(lidar: Lidar, ray: NDArray) -> NDArray:
-    """∫dr of the scattered light per steradian of the camera's unit rays [..., 3], by bin: [..., bins]."""
+def _along_ray(lidar: Lidar, ray: NDArray, factor: Factor | None = None) -> NDArray:
+    """∫dr of the scattered light per steradian of the camera's unit rays [..., 3], by bin: [..., bins, ...]."""
     laser = np.array(lidar.laser_position)
     axis = np.array(lidar.laser_direction) / np.linalg.norm(lidar.laser_direction)
     low, high = _ray_in_cone(ray, laser, axis, math.cos(lidar.half_angle))
@@ -153,7 +165,11 @@ def _along_ray(lidar: Lidar, ray: NDArray) -> NDArray:
     value = lidar.scattered(depth, s + r, cos_scatter) / (
         lidar.solid_angle * s**2
     )  # r² of the volume element and 1/r² of the aperture's solid angle cancel
-    return (value * weight).sum(-1) * lidar.aperture_area * ray[..., 2, None]
+    value = value * weight * (lidar.aperture_area * ray[..., 2, None, None])
+    if factor is None:
+        return value.sum(-1)
+    directions = np.broadcast_to(-ray[..., None, None, :], beam.shape)
+    return np.einsum("...n,...ns->...s", value, factor(beam / s[..., None], directions))
 
 
 def _ray_in_cone(ray: NDArray, apex: NDArray, axis: NDArray, cos_half: float) -> tuple[NDArray, NDArray]:
