@@ -95,7 +95,7 @@ def pixel_maps(
     surfaces = [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)]
     signal, arrival = _signal(lidar, lines, surfaces, optics)
     if scene.medium.grid is not None:
-        signal = signal * passed_by_grid(scene, views * distances[:, None])
+        signal = signal * passed_by_grid(scene, views, distances)
     signal_d: Any = on_device(signal)
     arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
     lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
@@ -263,8 +263,6 @@ def _not_covered(scene: Scene) -> list[str]:
         )
     if scene.medium.layers:
         problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
-    if scene.medium.grid is not None and ported:
-        problems.append("analytic: medium.grid does not go with camera.port or laser.port; simulate takes both")
     if scene.medium.grid is not None and chosen.form == "lu2024":
         problems.append("analytic.form = 'lu2024' takes one water, and not medium.grid; 'radiometric' takes both")
     if chosen.backscatter == "single_scatter" and laser.profile == "collimated":

@@ -194,7 +194,7 @@ def axis_rows(scene: Scene, name: str, distances: Map, reflectance: float, devic
 def _optical_depth(scene: Scene, line: LinesOfSight, distance: float) -> float:
     """Up to a distance on the axis, one way."""
     if scene.medium.grid is not None:
-        return scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, distance))
+        return scene.optical_depth(line.start[0].tolist(), line.points([distance])[0].tolist())
     return float((distance - line.lead[0]) * scene.medium.extinction)
 
 

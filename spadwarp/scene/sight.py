@@ -102,6 +102,15 @@ class LinesOfSight:
         """Unit vectors in which the light of a laser that is a point comes to ranges."""
         return self._light_to(self.points(distance))
 
+    def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Of the light of a laser that is a point, at points in the camera frame: unit vectors, the length of its way
+        in the water, and the length in water that takes as long as all of its way [m]; NaN where none comes."""
+        if self.laser_port is None:
+            length = np.linalg.norm(points - self.laser, axis=-1)
+            return self._light_to(points), length, length
+        inside, light, length, path = self.laser_port.connect(points, self.laser)
+        return light, length - self.laser_port.enter(self.laser, inside)[2], path
+
     @property
     def bent(self) -> bool:
         """Whether there is a port, of camera or laser."""
