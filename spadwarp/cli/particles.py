@@ -37,6 +37,12 @@ def particles(
         Path | None,
         typer.Option(metavar="FILE", help="The phase function as .csv, for medium.phase_table.", show_default=False),
     ] = None,
+    matrix: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Mie: the scattering matrix as .csv, for medium.matrix_table.", show_default=False
+        ),
+    ] = None,
     small: Annotated[float | None, _number("Kopelevich: mineral particles below 1 um [ppm].")] = None,
     large: Annotated[float | None, _number("Kopelevich: organic particles above 1 um [ppm].")] = None,
     index: Annotated[float | None, _number("Mie: index over that of the water, such as 1.05 or 1.15.", "N")] = None,
@@ -65,7 +71,7 @@ def particles(
       spadwarp particles 532 --index 1.1 --absorbing 5e-4 --concentration 1 --slope 4 --smallest 0.1um --largest 50um
       spadwarp particles 532 --index 1.19 --concentration 2 --diameter 3um
     """
-    outputs = opt.check_outputs(files={"--out": out}, json=json_path, overwrite=overwrite)
+    outputs = opt.check_outputs(files={"--out": out, "--matrix": matrix}, json=json_path, overwrite=overwrite)
     mie = {"--index": index, "--concentration": concentration}
     if (small is None and large is None) == (index is None):
         raise typer.BadParameter("give --small and --large, or --index with --concentration and sizes")
@@ -73,8 +79,11 @@ def particles(
     others |= {"--deviation": deviation, "--diameter": diameter, "--concentration": concentration}
     if index is None and (given := [name for name, value in others.items() if value is not None]):
         raise typer.BadParameter(f"goes with --index, not with --small and --large: {', '.join(given)}")
-    if out is not None and out.suffix.lower() != ".csv":
-        raise typer.BadParameter(f"{out} does not end in .csv, as medium.phase_table must", param_hint="--out")
+    for option, field, file in (("--out", "phase_table", out), ("--matrix", "matrix_table", matrix)):
+        if file is not None and file.suffix.lower() != ".csv":
+            raise typer.BadParameter(f"{file} does not end in .csv, as medium.{field} must", param_hint=option)
+    if index is None and matrix is not None:
+        raise typer.BadParameter("goes with --index: Kopelevich's components have no matrix", param_hint="--matrix")
     if index is None:
         parts = spadwarp.water.kopelevich_particles(wavelength_nm, small=small or 0.0, large=large or 0.0)
         text = f"Kopelevich, {small or 0:g} ppm below and {large or 0:g} ppm above 1 um"
@@ -96,12 +105,16 @@ def particles(
     if out is not None:
         spadwarp.water.save_phase_table(whole, out)
         say(f"written: {out}; in the scene:\n{_toml(whole, out)}")
+    if matrix is not None:
+        spadwarp.water.save_matrix_table(whole, matrix)
+        say(f"written: {matrix}; in the scene, for polarised light:\n{_matrix_toml(matrix)}")
     outputs.write_json(
         {
             "wavelength_nm": wavelength_nm,
             **{name: getattr(whole, name) for name in _NAMES},
             "water": water,
             "file": out,
+            "matrix_file": matrix,
         }
     )
 
@@ -153,3 +166,7 @@ def _toml(optics: ParticleOptics, path: Path) -> str:
         'phase_function = "tabulated"\n'
         f'phase_table = "{path.as_posix()}"'
     )
+
+
+def _matrix_toml(path: Path) -> str:
+    return f'[medium]\nscattering_matrix = "tabulated"\nmatrix_table = "{path.as_posix()}"'

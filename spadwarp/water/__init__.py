@@ -1,4 +1,5 @@
-"""Optical properties of natural water over wavelength, temperature, salinity and chlorophyll; particles, daylight."""
+"""Optical properties of natural water over wavelength, temperature, salinity and chlorophyll; particles, polarisation,
+daylight."""
 
 from spadwarp.water.daylight import Skylight, clear_sky_irradiance, daylight_attenuation, surface_reflectance
 from spadwarp.water.particles import (
@@ -9,8 +10,17 @@ from spadwarp.water.particles import (
     mie_particles,
     mixture,
     power_law,
+    save_matrix_table,
     save_phase_table,
     single_size,
+)
+from spadwarp.water.scattering_matrix import (
+    MATRIX_COLUMNS,
+    WATER_DEPOLARISATION,
+    rayleigh_matrix,
+    read_matrix_table,
+    scaled_rayleigh_matrix,
+    voss_fry_matrix,
 )
 from spadwarp.water.seawater import (
     WaterOptics,
@@ -21,9 +31,10 @@ from spadwarp.water.seawater import (
     refractive_index,
     water_optics,
 )
-from spadwarp.water.voss_fry import voss_fry_matrix
 
 __all__ = [
+    "MATRIX_COLUMNS",
+    "WATER_DEPOLARISATION",
     "ParticleOptics",
     "SizeDistribution",
     "Skylight",
@@ -39,8 +50,12 @@ __all__ = [
     "power_law",
     "pure_water_absorption",
     "pure_water_scattering",
+    "rayleigh_matrix",
+    "read_matrix_table",
     "refractive_index",
+    "save_matrix_table",
     "save_phase_table",
+    "scaled_rayleigh_matrix",
     "single_size",
     "surface_reflectance",
     "voss_fry_matrix",

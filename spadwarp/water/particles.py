@@ -5,6 +5,7 @@
 ... )
 >>> water = spadwarp.water.mixture([particles], salinity=35.0)
 >>> spadwarp.water.save_phase_table(water, "harbour.csv")
+>>> spadwarp.water.save_matrix_table(water, "harbour_matrix.csv")
 
 Diameters are in metres, concentrations in parts per million of volume, cm³ of particles in a m³ of water.
 """
@@ -25,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io import write_text
 from spadwarp.limits import check_integer, check_real
+from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
 from spadwarp.water.seawater import (
     check_ranges,
     molecular_density,
@@ -42,6 +44,7 @@ __all__ = [
     "mie_particles",
     "mixture",
     "power_law",
+    "save_matrix_table",
     "save_phase_table",
     "single_size",
 ]
@@ -64,6 +67,8 @@ class ParticleOptics:
         absorption, scattering: a and b [1/m].
         angles_deg: Scattering angles `[n]` [°], 0.01 to 180.
         density: Phase function at them [1/sr], of unit integral over the sphere.
+        matrix: Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function
+            `[n, 5]`; None where only the phase function is known (Kopelevich's components).
     """
 
     wavelength_nm: float
@@ -71,6 +76,7 @@ class ParticleOptics:
     scattering: float
     angles_deg: Floats
     density: Floats
+    matrix: Floats | None = None
 
     @property
     def extinction(self) -> float:
@@ -163,7 +169,8 @@ def mie_particles(
 ) -> ParticleOptics:
     """Homogeneous spheres in water by Mie's theory, computed by the library miepython (extra `mie`).
 
-    b = Σ N(D)·πD²/4·Q_sca(D), a likewise with Q_ext − Q_sca, and the phase function is the sum of |S|² over b.
+    b = Σ N(D)·πD²/4·Q_sca(D), a likewise with Q_ext − Q_sca; the phase function is the sum of (|S1|² + |S2|²)/2 over b,
+    and the scattering matrix follows from S1 and S2 in the same way (Bohren & Huffman 1983, eq 4.77).
 
     Args:
         distribution: `power_law`, `log_normal`, `single_size`, or numbers and diameters of your own.
@@ -197,13 +204,18 @@ def mie_particles(
     per_volume = concentration * _PPM / (numbers * math.pi / 6.0 * diameters**3).sum() * numbers  # [1/m³]
     relative, cosines = complex(real, -absorbing), np.cos(np.radians(_ANGLES))
     lost = scattered = 0.0
-    pattern = np.zeros_like(_ANGLES)
+    pattern = np.zeros((6, _ANGLES.size))
     for parameter, diameter, count in zip(parameters, diameters, per_volume, strict=True):
         q_lost, q_scattered, *_ = miepython.efficiencies_mx(relative, parameter)
         section = count * 0.25 * math.pi * diameter**2
         lost, scattered = lost + section * q_lost, scattered + section * q_scattered
-        pattern += section * q_scattered * miepython.i_unpolarized(relative, parameter, cosines, norm="one")
-    return _optics(wavelength_nm, max(float(lost - scattered), 0.0), float(scattered), pattern)
+        s1, s2 = miepython.S1_S2(relative, parameter, cosines, norm="one")
+        both, across, along = s1 * s2.conj(), np.abs(s1) ** 2, np.abs(s2) ** 2
+        # m22 is m11 and m44 is m33, of each sphere. miepython's time runs as exp(+iωt), which sets the sign of m34.
+        elements = ((across + along) / 2, (along - across) / 2, (across + along) / 2, both.real, both.imag, both.real)
+        pattern += section * q_scattered * np.stack(elements)
+    m11, matrix = pattern[0], (pattern[1:] / pattern[0]).T
+    return _optics(wavelength_nm, max(float(lost - scattered), 0.0), float(scattered), m11, matrix)
 
 
 def kopelevich_particles(wavelength_nm: float, *, small: float, large: float) -> ParticleOptics:
@@ -235,21 +247,30 @@ def mixture(
 ) -> ParticleOptics:
     """Several kinds of particles of one wavelength together, with the water's own absorption and scattering.
 
-    a and b add up; the phase function is the mean over the scattering. Raises `ArgumentError` for no parts, or
-    different wavelengths.
+    a and b add up; the phase function is the mean over the scattering, and the scattering matrix that over the light
+    scattered by the angle. Raises `ArgumentError` for no parts, or different wavelengths.
     """
     if not parts or len({part.wavelength_nm for part in parts}) != 1:
         raise ArgumentError("parts: particles of one wavelength are needed")
     nm = parts[0].wavelength_nm
     absorption = math.fsum(part.absorption for part in parts)
     weights = [part.scattering for part in parts]
-    pattern = sum(part.scattering * _between(part.angles_deg, part.density) for part in parts)
+    patterns = [part.scattering * _between(part.angles_deg, part.density) for part in parts]
+    matrices = [_matrix_between(part) for part in parts]
     if water:
-        own = pure_water_scattering(nm, temperature=temperature, salinity=salinity)
+        own, cosines = (
+            pure_water_scattering(nm, temperature=temperature, salinity=salinity),
+            np.cos(np.radians(_ANGLES)),
+        )
         absorption += pure_water_absorption(nm)
         weights.append(own)
-        pattern = pattern + own * molecular_density(1.0 - np.cos(np.radians(_ANGLES)))
-    return _optics(nm, absorption, math.fsum(weights), np.asarray(pattern))
+        patterns.append(own * molecular_density(1.0 - cosines))
+        matrices.append(rayleigh_matrix(cosines))
+    whole, known = np.sum(patterns, axis=0), [one for one in matrices if one is not None]
+    matrix = None
+    if len(known) == len(matrices):
+        matrix = np.sum([p[:, None] * m for p, m in zip(patterns, known, strict=True)], axis=0) / whole[:, None]
+    return _optics(nm, absorption, math.fsum(weights), whole, matrix)
 
 
 def save_phase_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
@@ -263,7 +284,29 @@ def save_phase_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Pa
     return write_text("\n".join(lines) + "\n", Path(path))
 
 
-def _optics(wavelength_nm: float, absorption: float, scattering: float, pattern: ArrayLike) -> ParticleOptics:
+def save_matrix_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
+    """Writes the scattering matrix as a .csv file for `medium.matrix_table`, 0° to 180°.
+
+    Raises:
+        ArgumentError: The matrix is not known.
+        FileError: The file cannot be written.
+    """
+    if optics.matrix is None:
+        raise ArgumentError("optics.matrix: not known; measured phase functions come without a scattering matrix")
+    # Straight on, symmetry leaves m12 = m34 = 0.
+    straight = optics.matrix[0] * (0.0, 1.0, 1.0, 0.0, 1.0)
+    rows = zip((0.0, *optics.angles_deg), (straight, *optics.matrix), strict=True)
+    lines = [
+        f"# {optics.wavelength_nm:g} nm: elements of the scattering matrix over m11, the phase function",
+        ",".join(MATRIX_COLUMNS),
+        *(f"{angle:.6g},{','.join(f'{element:.8g}' for element in row)}" for angle, row in rows),
+    ]
+    return write_text("\n".join(lines) + "\n", Path(path))
+
+
+def _optics(
+    wavelength_nm: float, absorption: float, scattering: float, pattern: ArrayLike, matrix: Floats | None = None
+) -> ParticleOptics:
     """With the pattern at `_ANGLES`, of any scale, as a density."""
     from spadwarp_kernels import interpolated_density
 
@@ -275,7 +318,15 @@ def _optics(wavelength_nm: float, absorption: float, scattering: float, pattern:
         scattering=float(scattering),
         angles_deg=_ANGLES,
         density=density,
+        matrix=matrix,
     )
+
+
+def _matrix_between(part: ParticleOptics) -> Floats | None:
+    """The scattering matrix of particles at `_ANGLES`, straight between theirs."""
+    if part.matrix is None:
+        return None
+    return np.stack([np.interp(_ANGLES, part.angles_deg, column) for column in part.matrix.T], axis=-1)
 
 
 def _between(angles_deg: Floats, values: Floats) -> Floats:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import shown
+from spadwarp.water.scattering_matrix import WATER_DEPOLARISATION
 
 __all__ = [
     "WaterOptics",
@@ -39,8 +40,6 @@ _RANGES = {
     "chlorophyll": (0.0, 30.0),
 }
 _UNITS = {"wavelength_nm": "nm", "temperature": "°C", "salinity": "g/kg", "chlorophyll": "mg/m³"}
-
-_DEPOLARIZATION = 0.039  # of light scattered by 90° (Farinato & Rowell 1976)
 
 Value = Any  # a float for a float, else an array
 
@@ -179,17 +178,17 @@ def pure_water_scattering(
     stiffness = (n2 - 1.0) * (1.0 + 2.0 / 3.0 * (n2 + 2.0) * (index / 3.0 - 1.0 / (3.0 * index)) ** 2)
 
     boltzmann, avogadro, molar_mass = 1.380649e-23, 6.02214076e23, 0.018
-    cabannes = (6.0 + 6.0 * _DEPOLARIZATION) / (6.0 - 7.0 * _DEPOLARIZATION)
+    cabannes = (6.0 + 6.0 * WATER_DEPOLARISATION) / (6.0 - 7.0 * WATER_DEPOLARISATION)
     of_density = 0.5 * boltzmann * (t + 273.15) * compressibility * stiffness**2
     of_salt = 2.0 * n2 * s * molar_mass * slope**2 / (density * -activity * avogadro)
     at_90_degrees = np.pi**2 / (wavelength * 1e-9) ** 4 * (of_density + of_salt) * cabannes
-    return _value(8.0 * np.pi / 3.0 * at_90_degrees * (2.0 + _DEPOLARIZATION) / (1.0 + _DEPOLARIZATION))
+    return _value(8.0 * np.pi / 3.0 * at_90_degrees * (2.0 + WATER_DEPOLARISATION) / (1.0 + WATER_DEPOLARISATION))
 
 
 def molecular_density(t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Phase function [1/sr] of pure water over t = 1 − cosθ: 1 + cos²θ·(1 − δ)/(1 + δ), δ the depolarization ratio."""
-    spread = 1.0 + _DEPOLARIZATION + (1.0 - _DEPOLARIZATION) * (1.0 - t) ** 2
-    return 3.0 / (4.0 * np.pi) * spread / (4.0 + 2.0 * _DEPOLARIZATION)
+    spread = 1.0 + WATER_DEPOLARISATION + (1.0 - WATER_DEPOLARISATION) * (1.0 - t) ** 2
+    return 3.0 / (4.0 * np.pi) * spread / (4.0 + 2.0 * WATER_DEPOLARISATION)
 
 
 def _quan_fry(temperature: ArrayLike, salinity: ArrayLike) -> tuple[Any, Any, float, float]:
