@@ -14,12 +14,16 @@ from statistics import median
 from types import ModuleType, SimpleNamespace
 
 
-def options(summary: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None) -> argparse.Namespace:
-    """The options of every script, and its own integers: name -> (default, help)."""
+def options(
+    summary: str, *, photons: int, more: dict[str, tuple[int, str]] | None = None, repeats: bool = True
+) -> argparse.Namespace:
+    """The options of every script, and its own integers: name -> (default, help); `repeats`: of scripts that measure
+    time."""
     parser = argparse.ArgumentParser(description=summary)
     parser.add_argument("--device", help='both: "cpu", "cuda:0", ...; by default the first GPU, else the CPU')
     parser.add_argument("--photons", type=lambda text: int(float(text)), default=photons, help="of one run of each")
-    parser.add_argument("--repeats", type=int, default=5, help="alternating runs of each; the median counts")
+    if repeats:
+        parser.add_argument("--repeats", type=int, default=5, help="alternating runs of each; the median counts")
     for name, (default, text) in (more or {}).items():
         parser.add_argument(f"--{name}", type=int, default=default, help=text)
     return parser.parse_args()
