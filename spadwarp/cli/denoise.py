@@ -72,10 +72,17 @@ def denoise(
     mask: Annotated[
         float | None,
         typer.Option(
-            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.5."
+            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.07."
         ),
     ] = None,
     device: opt.TorchDevice = None,
+    precision: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Of the layers of pyramid: float32, or bfloat16, which is the default on a CPU that has AMX.",
+        ),
+    ] = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
@@ -113,7 +120,8 @@ def denoise(
         dataset, axes, image_size, tag_unit_ps, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf, sum_frames
     )
     settings: dict[str, Any] = {
-        "model": model, "gate": depths, "profile": given, "weights": weights, "device": device, "mask": mask,
+        "model": model, "gate": depths, "profile": given, "weights": weights, "device": device,
+        "precision": precision, "mask": mask,
         "as_depth": depth, "channel": channel, "scale": scale, "group_index": group_index, **facts,
     }  # fmt: skip
     lines, summary, failed, written = {}, [], 0, 0
@@ -129,7 +137,7 @@ def denoise(
         there = float(np.isfinite(done.depth).mean())
         frames = "1 frame" if len(done.depth) == 1 else f"{opt.count(len(done.depth))} frames"
         written += len(done.files)
-        target = float((done.target_probability >= 0.5).mean())
+        target = float((done.target_probability >= done.threshold).mean())
         parts = f"{100 * there:.3g} % of the pixels have a depth, {100 * target:.3g} % show a target"
         lines[one.name] = f"{frames}, {parts}"
         summary.append(

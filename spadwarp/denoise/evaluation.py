@@ -32,7 +32,8 @@ _STAIRCASE = "staircase"
 class Sample(NamedTuple):
     """One frame: true depth `[H, W]` [m], gate [m], depth by method `[H, W]` [m], and a caption.
 
-    NaN where no target is, or where the method says that none is: it gives it a probability below one half.
+    NaN where no target is, or where the method says that none is: it gives it a probability below
+    `target_threshold`.
     """
 
     clean: NDArray[np.float32]

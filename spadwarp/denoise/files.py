@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
-from spadwarp.denoise.inference import Estimate, estimate_frames
+from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
-from spadwarp.denoise.network_files import weights_metadata
+from spadwarp.denoise.network_files import Precision, weights_metadata
 from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
@@ -64,11 +64,12 @@ class DepthReading:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """What `denoise_file` wrote: depth `[N, H, W]` [m], probability that a pixel sees a target, probability that its
-    depth is right, gate [m], paths of the files, and notes for the user."""
+    """What `denoise_file` wrote: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
+    counts as such, probability that its depth is right, gate [m], paths of the files, and notes for the user."""
 
     depth: NDArray[np.float32]
     target_probability: NDArray[np.float32]
+    threshold: float
     confidence: NDArray[np.float32]
     gate: tuple[float, float]
     files: tuple[Path, ...]
@@ -95,6 +96,7 @@ def denoise_file(
     profile: NDArray[np.float64] | None = None,
     weights: str | Path | None = None,
     device: str | None = None,
+    precision: Precision | None = None,
     mask: float | None = None,
     **reading: Any,
 ) -> Denoised:
@@ -107,7 +109,7 @@ def denoise_file(
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
         out: The folder.
-        model, weights, device: See `spadwarp.denoise.estimate`.
+        model, weights, device, precision: See `spadwarp.denoise.estimate`.
         mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
         gate: (start, stop) in depth [m]; default: the file's, else from the nearest to the farthest depth in it.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
@@ -147,7 +149,7 @@ def denoise_file(
         else:
             second = None
             frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
-            found = estimate_frames(frames, model=model, weights=weights, device=device)
+            found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
         depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
     empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
@@ -155,13 +157,14 @@ def denoise_file(
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
         notes.append(f"{100 * np.isfinite(second).mean():.2g} % of the pixels have a second return")
-    shown = found.masked(0.5 if mask is None else mask)[0]
+    threshold = target_threshold(model) if mask is None else mask
+    shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
     title = f"{Path(path).name}: {model}"
     files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, title=title, truth=read.truth))
     return Denoised(
-        depth=depth, target_probability=found.target_probability, confidence=found.confidence, gate=gate,
-        files=tuple(files), notes=tuple(notes),
+        depth=depth, target_probability=found.target_probability, threshold=threshold, confidence=found.confidence,
+        gate=gate, files=tuple(files), notes=tuple(notes),
     )  # fmt: skip
 
 

@@ -6,14 +6,18 @@ import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory
 from spadwarp.io.parsing import parse_json
 from spadwarp.io.paths import existing_file
 
-__all__ = ["WEIGHTS", "load_network", "own_weights", "require_torch", "torch_device", "weights_metadata"]
+__all__ = ["WEIGHTS", "Precision", "fast_precision", "load_network", "own_weights", "require_torch", "torch_device"]
+__all__ += ["weights_metadata"]
+
+Precision = Literal["bfloat16", "float32"]
+"""Of numbers in the layers of a network."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the package's weights."""
@@ -32,8 +36,10 @@ def weights_metadata(model: str, weights: str | Path | None = None) -> dict[str,
 
 
 @lru_cache(maxsize=8)
-def load_network(model: str, weights: str | Path | None = None, device: str = "cpu") -> Any:
-    """A network with its weights, ready to run."""
+def load_network(
+    model: str, weights: str | Path | None = None, device: str = "cpu", precision: Precision = "float32"
+) -> Any:
+    """A network with its weights, ready to run; `precision`: of the layers of PyramidNet."""
     torch = require_torch()
     from safetensors.torch import load_file
 
@@ -51,8 +57,14 @@ def load_network(model: str, weights: str | Path | None = None, device: str = "c
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
-    network = network.to(torch.device(device)).to(memory_format=torch.channels_last)
+    network = network.to(torch.device(device), getattr(torch, precision)).to(memory_format=torch.channels_last)
     return network.eval().requires_grad_(False)
+
+
+def fast_precision(device: str) -> Precision:
+    """The precision in which this device is fastest without loss: bfloat16 on a CPU that has AMX, else float32."""
+    capabilities = getattr(require_torch().cpu, "get_capabilities", dict)()
+    return "bfloat16" if device == "cpu" and capabilities.get("amx_bf16", False) else "float32"
 
 
 def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, Path]:

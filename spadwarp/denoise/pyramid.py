@@ -40,7 +40,7 @@ class _Residual(nn.Module):
         nn.init.zeros_(self.second.weight)  # begins as the identity
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(F.relu(x)), inplace=True))
+        return self.second(F.relu(self.first(F.relu(x)), inplace=True)).add_(x)
 
 
 class PyramidNet(nn.Module):
@@ -158,9 +158,8 @@ class PyramidNet(nn.Module):
         if torch.is_grad_enabled() or x.is_cuda:
             found = _answer(*parts)
         else:  # strips of a few rows stay in a CPU's cache
-            found = torch.cat(
-                [_answer(*strips) for strips in zip(*(part.split(16, 2) for part in parts), strict=True)], 2
-            )
+            strips = zip(*(part.split(8, 2) for part in parts), strict=True)
+            found = torch.cat([_answer_in_place(*strip) for strip in strips], 2)
         if delay is not None:
             found = _decided(found, frame[:, 3:].float()) - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
@@ -172,22 +171,26 @@ class PyramidNet(nn.Module):
         scalars = [(depth - 0.5) * reported, reported, 0.25 * density, *ranked]
         if votes is not None:
             scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
-        x = self.enter(torch.cat(scalars, dim=1))
+        x = self.enter(self._as_image(torch.cat(scalars, dim=1)))
         if votes is not None and self.enter_agreement is not None:
-            x = x + self.enter_agreement(votes.agreement)
+            x = x + self.enter_agreement(self._as_image(votes.agreement))
         if self.enter_features is not None:
-            x = x + self.enter_features(frame[:, 3 : 3 + SEEN])
+            x = x + self.enter_features(self._as_image(frame[:, 3 : 3 + SEEN]))
         skipped = []
         for down, before in zip(self.down, self.before, strict=True):
             skipped.append(x)
             x = before(down(F.relu(x)))
         for level in reversed(range(len(skipped))):
             finer = F.interpolate(self.up[level](x), scale_factor=2.0, mode="bilinear", align_corners=False)
-            x = skipped[level] + finer
+            x = finer.add_(skipped[level])
             x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
         for layer in self.polish:
             x = layer(x)
         return F.relu(self.spread(F.relu(x)), inplace=True)
+
+    def _as_image(self, channels: Tensor) -> Tensor:
+        """In the precision of the layers, and with the channels of a pixel side by side."""
+        return channels.to(self.enter.weight.dtype, memory_format=torch.channels_last)
 
     def _heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Weights of all depths, the network's own depth, the three logits and the reach of refining, `[B, n, H, W]`.
@@ -203,8 +206,13 @@ class PyramidNet(nn.Module):
             weight = self.scalars.weight[rows, :, 0, 0].repeat_interleave(GROUP, 1) / GROUP
             layers.append((weight, self.scalars.bias[rows]))
         filters, biases = (torch.cat(parts) for parts in zip(*layers, strict=True))
-        filters = filters[:, :, None, None].contiguous(memory_format=torch.channels_last)
-        found = F.conv2d(x, filters, biases).float()
+        if x.is_cuda:
+            filters = filters[:, :, None, None].contiguous(memory_format=torch.channels_last)
+            found = F.conv2d(x, filters, biases).float()
+        else:  # the product of matrices gives rows of images, which what follows is faster with
+            pixels = x.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)
+            found = torch.baddbmm(biases[:, None], filters.expand(len(x), -1, -1), pixels).float()
+            found = found.unflatten(2, x.shape[2:])
         logits = 3 + self.refines
         weights, own, others = found.split([found.shape[1] - 1 - logits, 1, logits], dim=1)
         return weights, own, others[:, :3], others[:, 3:]
@@ -236,6 +244,20 @@ def _answer(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> T
         near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
         near = weight / torch.addcmul(torch.ones_like(reach), near, near).square()
         found = (near * values).sum(dim=1, keepdim=True) / (near.sum(dim=1, keepdim=True) + 1e-12)
+    return found
+
+
+def _answer_in_place(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
+    """The same as `_answer` in half the time on a CPU, without derivatives."""
+    weight = weights + trusts
+    weight.sub_(weight.amax(dim=1, keepdim=True)).exp_()
+    part = weight * values
+    found = part.sum(dim=1, keepdim=True).div_(weight.sum(dim=1, keepdim=True))
+    if reach.shape[1]:
+        near = torch.sub(values, found, out=part).mul_(reach.sigmoid().mul_(_WIDEST).add_(0.002).reciprocal_())
+        weight.div_(near.square_().add_(1.0).square_())
+        found = torch.mul(weight, values, out=part).sum(dim=1, keepdim=True)
+        found.div_(weight.sum(dim=1, keepdim=True).add_(1e-12))
     return found
 
 

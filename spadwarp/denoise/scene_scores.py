@@ -27,7 +27,7 @@ from spadwarp.denoise.evaluation_scenes import (
     water_profile,
 )
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames
+from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
 from spadwarp.denoise.likelihood import CLASSICAL
 from spadwarp.denoise.metrics import staircase_steps
 from spadwarp.denoise.network_files import own_weights
@@ -174,7 +174,8 @@ def evaluate_scenes(
                         found = estimate_frames(
                             noisy, model=method, window=window, weights=own.get(method), device=device
                         )
-                        scores = score_frame(scene, noisy, found.depth[0], found.target_probability[0] >= 0.5)
+                        seen = found.target_probability[0] >= target_threshold(method)
+                        scores = score_frame(scene, noisy, found.depth[0], seen)
                         rows[method, setting, water, level, scene.shape] = scores
                         _count_reliability(reliability, method, scene, found)
                     done += 1

@@ -7,7 +7,7 @@ permutes them. Cohen & Welling, ICML 2016 (group-equivariant convolutional netwo
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -80,12 +80,18 @@ class SymmetricConv(nn.Module):
         outputs, inputs = self.weight.shape[:2]
         shape = (outputs, inputs, GROUP, -1, self.size, self.size)
         filters = self.weight.index_select(2, self.places).view(shape).transpose(1, 2).flatten(2, 3).flatten(0, 1)
-        self._kept = None if torch.is_grad_enabled() or self.training else filters.detach()
-        return filters
+        if torch.is_grad_enabled() or self.training:
+            return filters
+        self._kept = filters.detach().contiguous(memory_format=torch.channels_last)
+        return self._kept
 
     def train(self, mode: bool = True) -> SymmetricConv:
         self._kept = None
         return super().train(mode)
+
+    def _apply(self, *arguments: Any, **options: Any) -> SymmetricConv:
+        self._kept = None
+        return super()._apply(*arguments, **options)
 
     def _load_from_state_dict(self, *arguments: object) -> None:
         self._kept = None

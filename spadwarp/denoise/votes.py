@@ -18,6 +18,7 @@ VOTES = 4
 """Scalar channels among the votes: `near`, `wide`, `depth` and `support`."""
 
 _SAME, _ALIKE = 0.012, 0.04  # depths this far apart do not agree, among 3 × 3 and 5 × 5 pixels [gate widths]
+_FAR = 10.0  # behind any depth that is reported [gate widths]
 _REACH = 3  # pixels of padding, more than those of a pair are apart
 _RING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
 _SHARPNESS = 6.0  # a depth with one vote more counts exp(_SHARPNESS) times as much
@@ -45,8 +46,9 @@ class Votes(NamedTuple):
 def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
     """Votes of frames of depth over the gate and of which pixels reported, `[B, 1, H, W]`."""
     height, width = depth.shape[-2:]
-    # Missing pixels agree with none, and those beyond the border are missing.
+    # Pixels that are missing, or beyond the border, agree with none: each has a depth of its own far behind the gate.
     image = F.pad(torch.where(reported > 0.5, depth, torch.nan), (_REACH,) * 4, value=torch.nan)
+    image = torch.where(torch.isnan(image), _apart(*image.shape[-2:], image.device), image)
 
     def beside(values: Tensor, place: tuple[int, int]) -> Tensor:
         y, x = (_REACH + step for step in place)
@@ -54,8 +56,8 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
 
     agreeing: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # of all pixels with those so many rows, columns away
     for step in ((y, x) for y in range(3) for x in range(-2, 3) if (y, x) > (0, 0)):
-        apart = (image - image.roll((-step[0], -step[1]), (2, 3))).abs()
-        fine, coarse = (torch.nan_to_num(1.0 - apart / most, nan=0.0).clamp_min_(0.0) for most in (_SAME, _ALIKE))
+        apart = (image - image.roll((-step[0], -step[1]), (2, 3))).abs_()
+        fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
         agreeing[step] = fine, coarse
 
     def pair(one: tuple[int, int], other: tuple[int, int], kind: int = 0) -> Tensor:
@@ -68,20 +70,28 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
     near = sum(single.values(), torch.zeros_like(depth)) / 8.0
     wide = sum((pair((0, 0), place, 1) for place in around), torch.zeros_like(depth)) / 24.0
     depths = [beside(image, place) for place in _RING]
-    counts = [(~torch.isnan(value)).float() for value in depths]
+    counts = [(value < _FAR).float() for value in depths]
     for first, one in enumerate(_RING):
         for second in range(first + 1, 8):
             agree = pair(one, _RING[second])
-            counts[first] = counts[first] + agree
-            counts[second] = counts[second] + agree
+            counts[first].add_(agree)
+            counts[second].add_(agree)
     count = torch.cat(counts, dim=1)
     most = count.amax(dim=1, keepdim=True)
     weight = torch.exp(_SHARPNESS * (count - most)) * (count > 0.0)
-    ring = torch.nan_to_num(torch.cat(depths, dim=1), nan=0.0)
+    ring = torch.cat(depths, dim=1)
     total = weight.sum(dim=1, keepdim=True)
     voted = torch.where(total > 0.0, (weight * ring).sum(dim=1, keepdim=True) / total.clamp_min(1e-9), 1.0)
     agreement = torch.cat([single[place] for place in _directions()], dim=1)
     return Votes(near, wide, voted, most / 8.0, agreement)
+
+
+@lru_cache(maxsize=4)
+def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Depths behind the gate of which no two within five rows and columns are equal, `[rows, columns]`."""
+    with torch.inference_mode(False):
+        row, column = torch.arange(rows, device=device) % 5, torch.arange(columns, device=device) % 5
+        return _FAR + 5.0 * row[:, None] + column
 
 
 @lru_cache(maxsize=1)

@@ -103,6 +103,17 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
         assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
 
 
+def test_the_answer_in_place_is_the_answer():
+    generator = torch.Generator().manual_seed(4)
+    weights, trusts, values = (torch.randn(1, 7, 5, 6, generator=generator) for _ in range(3))
+    for channels in (0, 1):
+        reach = torch.randn(1, channels, 5, 6, generator=generator)
+        parts = weights, trusts, values, reach
+        kept = [part.clone() for part in parts]
+        assert torch.allclose(pyramid._answer_in_place(*parts), pyramid._answer(*parts), atol=1e-5)
+        assert all(torch.equal(part, before) for part, before in zip(parts, kept, strict=True))
+
+
 def test_an_answer_that_the_pixel_s_own_photons_refute_is_replaced():
     """Twenty units of log-likelihood speak for the own return at 0.2, none for the answer 0.7."""
     features = torch.zeros(1, FEATURES, 4, 4)
