@@ -63,7 +63,7 @@ def load_network(
 
 def fast_precision(device: str) -> Precision:
     """The precision in which this device is fastest without loss: bfloat16 on a CPU that has AMX, else float32."""
-    capabilities = getattr(require_torch().cpu, "get_capabilities", dict)()
+    capabilities: dict[str, Any] = getattr(require_torch().cpu, "get_capabilities", dict)()
     return "bfloat16" if device == "cpu" and capabilities.get("amx_bf16", False) else "float32"
 
 
