@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -78,8 +79,12 @@ def check_derivatives(found: DerivativeTallies, shape: tuple[int, ...], batches:
         raise ArgumentError(f"derivative_tallies.second_moment is not uint64 {moments}")
 
 
+_BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
+
+
 class _Values(Mapping[str, NDArray[np.float64]]):
-    """Parameter → array, made from integers when it is asked for."""
+    """Parameter → array, made from integers when it is asked for; the name without a block stands for all of them,
+    `[x, y, z, ...]`."""
 
     def __init__(self, result: Result, errors: bool) -> None:
         self._result, self._errors = result, errors
@@ -94,6 +99,10 @@ class _Values(Mapping[str, NDArray[np.float64]]):
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         result, found = self._result, self._result.derivative_tallies
+        if found is not None and (places := _places(found.names, name)):
+            shape = tuple(max(place[axis] for place in places) + 1 for axis in range(3))
+            blocks = np.stack([self[f"{name}[{i},{j},{k}]"] for i, j, k in places])
+            return blocks.reshape(*shape, *blocks.shape[1:])
         if found is None or name not in found.names:
             raise KeyError(f"{name!r} is not one of the derivatives: {', '.join(self) or 'none were asked for'}")
         p = found.names.index(name)
@@ -107,6 +116,12 @@ class _Values(Mapping[str, NDArray[np.float64]]):
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
+
+
+def _places(names: tuple[str, ...], name: str) -> list[tuple[int, int, int]]:
+    """Of all blocks by whose coefficient `name` a histogram is differentiated."""
+    behind = [_BLOCK.fullmatch(one.removeprefix(name)) for one in names if one.startswith(f"{name}[")]
+    return [(int(match[1]), int(match[2]), int(match[3])) for match in behind if match is not None]
 
 
 def derivative_values(result: Result) -> Mapping[str, NDArray[np.float64]]:

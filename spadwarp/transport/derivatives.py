@@ -12,6 +12,13 @@ import numpy as np
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import shown, suggestion
 from spadwarp.scene import Scene
+from spadwarp.transport.block_derivatives import (
+    COEFFICIENTS,
+    block_parameters,
+    block_scales,
+    check_blocks,
+    is_of_grid,
+)
 from spadwarp.transport.placement import config_error
 
 if TYPE_CHECKING:
@@ -19,7 +26,14 @@ if TYPE_CHECKING:
 
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["Parameter", "derivative_names", "derivative_units", "make_derivatives", "resolve_derivatives"]
+__all__ = [
+    "Parameter",
+    "derivative_choices",
+    "derivative_names",
+    "derivative_units",
+    "make_derivatives",
+    "resolve_derivatives",
+]
 
 
 @dataclass(frozen=True)
@@ -43,12 +57,15 @@ class Parameter:
     problem: str = ""
 
 
+_OF_CELLS = "the grid's water differs from cell to cell; medium.grid.absorption and others go by block of its cells"
+
+
 def _parameters(scene: Scene) -> dict[str, Parameter]:
     """Of the scene, by name; those without a derivative too."""
     medium = scene.medium
     everywhere = 'albedo = "lu2024" draws the scattering anew at every collision' if medium.albedo == "lu2024" else ""
     found: list[Parameter] = []
-    in_water = everywhere or ("the grid's water differs from cell to cell" if medium.grid is not None else "")
+    in_water = everywhere or (_OF_CELLS if medium.grid is not None else "")
     for k, water in enumerate(medium.waters):
         place = "medium" if k == 0 else f"medium.layers[{k - 1}]"
         for kind in ("absorption", "scattering"):
@@ -74,26 +91,37 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
 
 
 def derivative_names(scene: Scene) -> tuple[str, ...]:
-    """Full names of all parameters of a scene by which its histogram can be differentiated."""
-    return tuple(name for name, one in _parameters(scene).items() if not one.problem)
+    """Names of all parameters of a scene by which its histogram can be differentiated; those of a grid's cells without
+    the block."""
+    found = [name for name, one in _parameters(scene).items() if not one.problem]
+    for kind in COEFFICIENTS if scene.medium.grid is not None else ():
+        try:
+            check_blocks(scene, [f"medium.grid.{kind}"], None)
+        except ConfigError:
+            continue
+        found.append(f"medium.grid.{kind}")
+    return tuple(found)
 
 
-def resolve_derivatives(scene: Scene, names: Iterable[str]) -> tuple[str, ...]:
+def resolve_derivatives(scene: Scene, names: Iterable[str], blocks: Sequence[int] | None = None) -> tuple[str, ...]:
     """The full names of parameters.
 
     A short name, "absorption", stands for "medium.absorption" where no other parameter of the scene ends with it.
+    "medium.grid.absorption", ".scattering" and ".extinction" stand for those of all blocks, of which `blocks` gives the
+    number along the edges of the box: "medium.grid.absorption[0,0,0]", ..., behind all others.
 
     Raises:
         ArgumentError: No list of names, or more than the kernel takes.
         ConfigError: A name that the scene does not have, that stands for several, is given twice, or whose parameter
-            has no derivative.
+            has no derivative, or blocks that the grid cannot be divided into.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ArgumentError(f"derivatives = {shown(names)} is not a list of names")
     import spadwarp_kernels as sk
 
-    known, found = _parameters(scene), list[str]()
-    for name in names:
+    known, found, asked = _parameters(scene), list[str](), list(names)
+    of_grid = check_blocks(scene, [name for name in asked if is_of_grid(name)], blocks)
+    for name in (name for name in asked if not is_of_grid(name)):
         one = _resolve(scene, name, known)
         if one.problem:
             raise config_error(scene, f"derivatives: {one.name} = {one.value:g} has none: {one.problem}")
@@ -105,7 +133,7 @@ def resolve_derivatives(scene: Scene, names: Iterable[str]) -> tuple[str, ...]:
             f"derivatives: {len(found)} names; one run takes {sk.MOST_DERIVATIVES}, and another run of the same seed "
             "has the same photons"
         )
-    return tuple(found)
+    return (*found, *of_grid.names)
 
 
 def _resolve(scene: Scene, name: Any, known: dict[str, Parameter]) -> Parameter:
@@ -131,8 +159,8 @@ def derivative_units(scene: Scene, names: Sequence[str], scale: float) -> tuple[
     Coarser than the histogram's by about the score that the light of a bin may have: its path, 1/b, that of the most
     telling scattering, or two bounces. The brightest bin has 16 times the room that it needs by this estimate.
     """
-    known, units = _parameters(scene), list[float]()
-    for name in names:
+    known, of_grid, units = _parameters(scene), block_parameters(names), list[float]()
+    for name in _others(names):
         one = known[name]
         largest = {
             "absorption": scene.path_limit,
@@ -141,17 +169,23 @@ def derivative_units(scene: Scene, names: Sequence[str], scale: float) -> tuple[
             "reflectance": 2.0 / max(one.value, 1e-9),
         }[one.kind]
         units.append(2.0 ** math.ceil(math.log2(largest)) / scale)
+    for of_kind in block_scales(scene, of_grid, scale):
+        units += [1.0 / of_kind] * math.prod(of_grid.shape)
     return tuple(units)
 
 
+def _others(names: Sequence[str]) -> list[str]:
+    return [name for name in names if not is_of_grid(name)]
+
+
 def make_derivatives(
-    scene: Scene, names: Sequence[str], mesh: TriangleMesh | None, scale: float, device: wp.Device
+    scene: Scene, names: Sequence[str], mesh: TriangleMesh | None, scale: float, device: wp.Device, grid: Any
 ) -> Any:
-    """The parameters as the kernels take them."""
+    """The parameters as the kernels take them; `grid` is that of the model's layers."""
     import spadwarp_kernels as sk
 
-    known = _parameters(scene)
-    chosen = [known[name] for name in names]
+    known, of_grid = _parameters(scene), block_parameters(names)
+    chosen = [known[name] for name in _others(names)]
     waters = [sum(1 << p for p, one in enumerate(chosen) if k in one.waters) for k in range(len(scene.medium.waters))]
     faces: Any = ()
     if mesh is not None:
@@ -160,14 +194,16 @@ def make_derivatives(
     return sk.make_derivatives(
         [one.kind for one in chosen],
         [one.value for one in chosen],
-        [1.0 / unit for unit in derivative_units(scene, names, scale)],
+        [1.0 / unit for unit in derivative_units(scene, _others(names), scale)],
         waters=waters,
         faces=faces,
+        blocks=sk.make_blocks(grid, of_grid.shape, block_scales(scene, of_grid, scale)) if of_grid.kinds else None,
         device=device,
     )
 
 
-def derivative_kinds(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
-    """What the kernel is compiled for."""
+def derivative_choices(scene: Scene, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """What the kernel is compiled for: choices of a spec."""
     known = _parameters(scene)
-    return tuple(known[name].kind for name in names)
+    kinds = tuple(known[name].kind for name in _others(names))
+    return {"derivatives": kinds, "blocks": block_parameters(names).kinds}

@@ -185,8 +185,17 @@ class DeviceWorker:
         moments = None
         if batches is not None:
             moments = np.stack([np.moveaxis(half.numpy().reshape(shape[1:]), -1, 0) for half in batches.second_moment])
-        units = tuple(1.0 / float(self.model.derivatives.scale[p]) for p in range(len(self._names)))
-        return DerivativeTallies(self._names, np.moveaxis(total.numpy().reshape(shape), -1, 0), units, moments)
+        tallies = np.moveaxis(total.numpy().reshape(shape), -1, 0)
+        return DerivativeTallies(self._names, tallies, self.derivative_units, moments)
+
+    @property
+    def derivative_units(self) -> tuple[float, ...]:
+        """Of each derivative's tallies [fraction of an emitted photon per unit of the parameter]."""
+        found, spec = self.model.derivatives, self._spec
+        scales = [found.scale[p] for p in range(len(spec.derivatives))]
+        for kind in range(len(spec.blocks)):
+            scales += [found.blocks.scale[kind]] * found.blocks.count
+        return tuple(1.0 / float(scale) for scale in scales)
 
     def clear(self) -> None:
         """Empties the tallies."""

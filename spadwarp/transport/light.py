@@ -77,8 +77,7 @@ class LightTracer:
         per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
         value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
         slopes = {}
-        for p, name in enumerate(self._names):
-            unit = 1.0 / float(worker.model.derivatives.scale[p])
+        for p, (name, unit) in enumerate(zip(self._names, worker.derivative_units, strict=True)):
             slopes[name] = self._light(data.gradients, value * unit, len(self._names), p)
         return self._light(data.tally, value * self._unit, 1, 0), slopes
 

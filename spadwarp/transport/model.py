@@ -22,7 +22,7 @@ from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
+from spadwarp.transport.derivatives import derivative_choices, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
 from spadwarp.transport.tally_unit import tally_scale
@@ -101,7 +101,8 @@ def build_model(
     if scene.scan.mode != "none":
         model = dataclasses.replace(model, scan=_scan(scene, device))
     if derivatives:
-        model = dataclasses.replace(model, derivatives=make_derivatives(scene, derivatives, mesh, scale, device))
+        found = make_derivatives(scene, derivatives, mesh, scale, device, model.layers.grid)
+        model = dataclasses.replace(model, derivatives=found)
     if camera:
         _check_size(scene, model, copies, len(derivatives))
     return model
@@ -253,7 +254,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         laser_port=port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
         grid=grid_tracking(scene),
-        derivatives=derivative_kinds(scene, derivatives),
+        **derivative_choices(scene, derivatives),
     )
     return spec._replace(**choices)
 
@@ -355,7 +356,9 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, derivatives: int) 
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
     if derivatives and size * derivatives >= 2**31:
         raise config_error(
-            scene, f"{shape} x {derivatives} derivatives = {size * derivatives} is outside [1, {2**31 - 1}]"
+            scene,
+            f"{shape} x {derivatives} derivatives = {size * derivatives} is outside [1, {2**31 - 1}]; fewer pixels, "
+            "bins or blocks, or fewer derivatives a run, with the same seed",
         )
     if size >= 2**31:
         raise config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")

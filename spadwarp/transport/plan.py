@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -69,6 +69,7 @@ def make_plan(
     resume: Result | None,
     launch_size: int | None,
     derivatives: Iterable[str] | None = None,
+    blocks: Sequence[int] | None = None,
 ) -> Plan:
     """The plan for the arguments of `simulate`.
 
@@ -92,7 +93,7 @@ def make_plan(
     if derivatives is None:
         names = () if resume is None else tuple(resume.derivatives)
     else:
-        names = resolve_derivatives(scene, derivatives)
+        names = resolve_derivatives(scene, derivatives, blocks)
     if resume is not None and names != tuple(resume.derivatives):
         raise ConfigError(
             f"derivatives: the run to resume has {', '.join(resume.derivatives) or 'none'}, not {', '.join(names)}"

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
+from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import Coordinate, name_dimensions
 from spadwarp.limits import SEED, check_integer
@@ -19,6 +20,7 @@ from spadwarp.mesh import build_mesh
 from spadwarp.result.file import read_ledger
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.transport.block_derivatives import is_of_grid
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.transport.plan import LAUNCH_SIZE
 
@@ -119,6 +121,10 @@ def trace(
     seed = check_integer("seed", scene.transport.seed if seed is None else seed, SEED)
     mesh = build_mesh(scene)
     names = resolve_derivatives(scene, derivatives)
+    if any(map(is_of_grid, names)):
+        raise ArgumentError(
+            f"derivatives: photon records have no scores by block: {names[-1]}; a histogram has, `simulate`"
+        )
     model = build_model(scene, pick_device(device), mesh, camera=False, derivatives=names)
     if progress is not None:
         progress("compile", 0, 0)

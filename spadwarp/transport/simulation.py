@@ -7,7 +7,7 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +58,7 @@ def simulate(
     tallies: Any = None,
     kept: dict[str, Any] | None = None,
     derivatives: Iterable[str] | None = None,
+    blocks: Sequence[int] | None = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
@@ -97,6 +98,10 @@ def simulate(
             "medium.absorption", "medium.scattering", "medium.anisotropy", "medium.layers[1].scattering",
             "targets[0].reflectance"; short, "absorption", where one parameter alone can be meant. By default none, or
             those of the run to resume. The photons and their histogram stay the same to the bit.
+            "medium.grid.absorption", "medium.grid.scattering" and "medium.grid.extinction" (at fixed albedo) are those
+            of all blocks of a grid's cells, 4096 at most; `Result.derivatives` has all of them by that name.
+        blocks: Number of blocks along the three edges of `medium.grid`, each a divisor of the number of cells there;
+            by default one block.
 
     Returns:
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
@@ -122,6 +127,7 @@ def simulate(
         resume=resume,
         launch_size=launch_size,
         derivatives=derivatives,
+        blocks=blocks,
     )
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())

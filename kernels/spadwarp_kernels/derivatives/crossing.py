@@ -20,17 +20,24 @@ def _to_lens(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
 
 
 @functools.cache
+def make_to_lens(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(camera, x, u) -> float``: the way in water of a photon at x whose flight along u leads to
+    the lens [m]."""
+    if spec.port is None:
+        return _to_lens
+    leave = spec.port.leave
+
+    @wp.func
+    def to_port(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
+        return leave(camera.port, x, u).water
+
+    return to_port
+
+
+@functools.cache
 def make_crossing_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, camera, layers, derivatives) -> Scores`` of a photon whose flight leads to the lens."""
-    flight_scores, to_lens = make_flight_scores(spec), _to_lens
-    if spec.port is not None:
-        leave = spec.port.leave
-
-        @wp.func
-        def to_port(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
-            return leave(camera.port, x, u).water
-
-        to_lens = to_port
+    flight_scores, to_lens = make_flight_scores(spec), make_to_lens(spec)
 
     @wp.func
     def crossing_scores(s: PhotonState, camera: Camera, layers: Layers, derivatives: Derivatives) -> Scores:

@@ -4,7 +4,8 @@ import functools
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.crossing import make_crossing_scores
+from spadwarp_kernels.derivatives.blocks import make_block_scores
+from spadwarp_kernels.derivatives.crossing import make_crossing_scores, make_to_lens
 from spadwarp_kernels.derivatives.request import make_request_scores
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -28,6 +29,10 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
     if cross is None:
         return None
     derives, crossing_scores = bool(spec.derivatives), make_crossing_scores(spec)
+    by_block, to_lens = make_block_scores(spec), make_to_lens(spec)
+    in_blocks = by_block is not None
+    if by_block is not None:
+        fly, copy = by_block.fly, by_block.copy
 
     @wp.func
     def derived_cross(
@@ -37,6 +42,10 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
         if wp.static(derives):
             if c.value > 0.0:
                 c.scores = crossing_scores(s, camera, layers, derivatives)
+        if wp.static(in_blocks):
+            if c.value > 0.0:
+                copy(derivatives.blocks)
+                fly(derivatives.blocks, 1, s.x, s.u, to_lens(camera, s.x, s.u))
         return c
 
     return derived_cross
@@ -49,6 +58,10 @@ def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Fun
     if score is None:
         return None
     derives, request_scores = bool(spec.derivatives), make_request_scores(spec)
+    by_block = make_block_scores(spec)
+    in_blocks = by_block is not None
+    if by_block is not None:
+        fly, turn, copy = by_block.fly, by_block.turn, by_block.copy
 
     @wp.func
     def derived_score(
@@ -76,6 +89,15 @@ def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Fun
                     layers,
                     surfaces,
                 )
+        if wp.static(in_blocks):
+            if found.contribution.value > 0.0:
+                point, way = found.origin, found.lens - found.origin
+                length = wp.length(way)
+                copy(derivatives.blocks)
+                fly(derivatives.blocks, 1, request.x, request.u, wp.length(point - request.x))
+                if request.slot < 0:
+                    turn(derivatives.blocks, 1, medium, layers, point)
+                fly(derivatives.blocks, 1, point, way / length, length)
         return found
 
     return derived_score

@@ -44,6 +44,8 @@ class TransportSpec(NamedTuple):
             None: there is no grid.
         derivatives: Kinds of the parameters by which the histogram is differentiated, each one of DERIVATIVES and
             described in `Model.derivatives`; at most MOST_DERIVATIVES.
+        blocks: Kinds of the coefficients of a grid's cells by which it is differentiated block by block, each one of
+            BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`.
     """
 
     estimator: str = "next_event"
@@ -69,6 +71,7 @@ class TransportSpec(NamedTuple):
     laser_port: PortKind | None = None
     grid: Water | None = None
     derivatives: tuple[str, ...] = ()
+    blocks: tuple[str, ...] = ()
 
     @property
     def water(self) -> Water:

@@ -12,6 +12,7 @@ import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_choice, check_device, check_integer, check_number
 
+from .blocks import Blocks, block_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
 from .tally import DEPOSIT_LIMIT, Contribution, Scores, deposit
 
@@ -31,12 +32,14 @@ class Derivatives:
         scale: Tally units of its derivative per emitted photon.
         waters: By layer, bit p set: parameter p is of this layer; not read without layers.
         faces: By face, bit p set: parameter p is this face's reflectance, or a factor on it.
+        blocks: Of a spec with blocks, from `make_blocks`.
     """
 
     value: Scores
     scale: Scores
     waters: wp.array(dtype=int)
     faces: wp.array(dtype=int)
+    blocks: Blocks
 
 
 def make_derivatives(
@@ -46,13 +49,16 @@ def make_derivatives(
     *,
     waters: Sequence[int] = (),
     faces: Any = (),
+    blocks: Any = None,
     device: wp.DeviceLike = None,
 ) -> Derivatives:
     """The parameters of a spec whose `derivatives` are `kinds`; see `Derivatives` for the others.
 
-    Raises `ArgumentError` for a kind that is not one of DERIVATIVES, or a number out of range.
+    `blocks`: from `make_blocks`, of a spec with blocks; without them, one kind at least. Raises `ArgumentError` for a
+    kind that is not one of DERIVATIVES, or a number out of range.
     """
-    device, count = check_device("device", device), check_integer("derivatives", len(kinds), 1, MOST_DERIVATIVES)
+    least = 1 if blocks is None else 0
+    device, count = check_device("device", device), check_integer("derivatives", len(kinds), least, MOST_DERIVATIVES)
     if not len(value) == len(scale) == count:
         raise ArgumentError(f"{count} derivatives, {len(value)} values, {len(scale)} scales; one each are needed")
     for p, kind in enumerate(kinds):
@@ -64,14 +70,34 @@ def make_derivatives(
     derivatives.value, derivatives.scale = Scores(*value, *rest), Scores(*scale, *rest)
     derivatives.waters = wp.array(waters, dtype=int, device=device, shape=len(waters))
     derivatives.faces = wp.array(faces, dtype=int, device=device, shape=len(faces))
+    if blocks is not None:
+        derivatives.blocks = blocks
     return derivatives
 
 
 @functools.cache
-def make_deposit(count: int) -> wp.Function:
+def make_deposit(count: int, kinds: int = 0) -> wp.Function:
     """The Warp function ``(tally, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
     `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many
-    derivatives; rounded down after the rounding sample is added, so that the mean is kept."""
+    derivatives, and after them of so many kinds of derivatives by block; rounded down after the rounding sample is
+    added, so that the mean is kept."""
+
+    @wp.func
+    def deposit_scored(
+        gradients: wp.array(dtype=wp.int64),
+        ledger: wp.array(dtype=wp.int64),
+        thread: int,
+        index: int,
+        units: float,
+        rounding_sample: float,
+    ):
+        if wp.abs(units) <= DEPOSIT_LIMIT:
+            whole = wp.int64(wp.floor(units + rounding_sample))
+            if whole != wp.int64(0):
+                atomic_add_int64(gradients, index, whole)
+        else:
+            entry = wp.where(wp.abs(units) > DEPOSIT_LIMIT, CLIPPED, INVALID)
+            add_to_ledger(ledger, thread, entry, wp.int64(1))
 
     @wp.func
     def deposit_derived(
@@ -84,17 +110,19 @@ def make_deposit(count: int) -> wp.Function:
         derivatives: Derivatives,
         c: Contribution,
     ) -> wp.vec2l:
-        if wp.static(count > 0):
+        if wp.static(count + kinds > 0):
             if c.index >= 0:
+                blocks = derivatives.blocks
+                first = c.index * (wp.static(count) + wp.static(kinds) * blocks.count)
                 for p in range(wp.static(count)):
                     units = c.value * c.scores[p] * derivatives.scale[p]
-                    if wp.abs(units) <= DEPOSIT_LIMIT:
-                        whole = wp.int64(wp.floor(units + c.rounding_sample))
-                        if whole != wp.int64(0):
-                            atomic_add_int64(gradients, c.index * wp.static(count) + p, whole)
-                    else:
-                        entry = wp.where(wp.abs(units) > DEPOSIT_LIMIT, CLIPPED, INVALID)
-                        add_to_ledger(ledger, thread, entry, wp.int64(1))
+                    deposit_scored(gradients, ledger, thread, first + p, units, c.rounding_sample)
+                for q in range(wp.static(kinds)):
+                    for k in range(blocks.count):
+                        row = (wp.static(kinds) + q) * blocks.count + k
+                        units = c.value * blocks.memory[block_entry(blocks, row)] * blocks.scale[q]
+                        p = wp.static(count) + q * blocks.count + k
+                        deposit_scored(gradients, ledger, thread, first + p, units, c.rounding_sample)
         return deposit(tally, ledger, pending, thread, scale, c)
 
     return deposit_derived

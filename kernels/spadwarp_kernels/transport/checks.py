@@ -37,6 +37,7 @@ from spadwarp_kernels.sensor.projection import PLAIN, Lens
 from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
+from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS
@@ -104,6 +105,12 @@ def _check_kinds(spec: TransportSpec) -> None:
         )
     for p, kind in enumerate(spec.derivatives):
         check_choice(f"spec.derivatives[{p}]", kind, DERIVATIVES)
+    if not isinstance(spec.blocks, tuple) or len(set(spec.blocks)) < len(spec.blocks):
+        raise ArgumentError(f"spec.blocks = {spec.blocks!r} is not a tuple of different names")
+    for q, kind in enumerate(spec.blocks):
+        check_choice(f"spec.blocks[{q}]", kind, BLOCK_DERIVATIVES)
+    if spec.blocks and (spec.grid is None or spec.reflecting or spec.merged):
+        raise ArgumentError("spec.blocks need spec.grid, and go without spec.reflecting and spec.merged")
     if spec.derivatives and spec.random_albedo:
         raise ArgumentError("spec.derivatives go without spec.random_albedo, which has no scattering coefficient")
     if spec.grid is not None and {*spec.derivatives} - {"reflectance"}:
@@ -148,7 +155,7 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
         check_fields("model.guiding", model.guiding, _GUIDING)
     if spec.confocal:
         _check_scan(model, estimator)
-    if spec.derivatives:
+    if spec.derivatives or spec.blocks:
         _check_derivatives(spec, model)
     _check_data(spec, model, data, estimator, photon_count)
 
@@ -265,6 +272,15 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
     for p, kind in enumerate(spec.derivatives):
         check_number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
         check_number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
+    if spec.blocks:
+        blocks = derivatives.blocks
+        for edge, (count, cells) in enumerate(zip(blocks.grid.size, model.layers.grid.size, strict=True)):
+            check_integer(f"model.derivatives.blocks.grid.size[{edge}]", count, 1, cells)
+        count = check_integer("model.derivatives.blocks.count", blocks.count, 1, MOST_BLOCK_DERIVATIVES)
+        if count != math.prod(blocks.grid.size):
+            raise ArgumentError(f"model.derivatives.blocks.count = {count}; see make_blocks")
+        for q in range(len(spec.blocks)):
+            check_number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
     if spec.layered:
         count = model.layers.start.size
         check_array("model.derivatives.waters", derivatives.waters, wp.int32, (count,), device)
@@ -287,8 +303,9 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
     bins = model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
     size = check_integer("bins of the tally", bins, 1) if estimator.scores else None
     check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
-    if spec.derivatives and size is not None:
-        size = check_integer("bins of data.gradients", size * len(spec.derivatives), 1)
+    derivatives = len(spec.derivatives) + len(spec.blocks) * model.derivatives.blocks.count
+    if derivatives and size is not None:
+        size = check_integer("bins of data.gradients", size * derivatives, 1)
         check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)

@@ -14,6 +14,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.history import make_flight_scores
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
@@ -103,7 +104,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
     has_bvh = has_mesh and not brute_force
-    queues = scores and cuda and not has_bvh
+    by_block = make_block_scores(spec)
+    in_blocks = by_block is not None
+    if by_block is not None:  # their scores stay with the thread
+        begin_blocks, fly_blocks = by_block.begin, by_block.fly
+    queues = scores and cuda and not has_bvh and not in_blocks
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, enter = make_emit(spec), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
@@ -111,7 +116,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues, len(spec.derivatives))
-    deposit, flight_scores = make_deposit(len(spec.derivatives)), make_flight_scores(spec)
+    deposit, flight_scores = make_deposit(len(spec.derivatives), len(spec.blocks)), make_flight_scores(spec)
     score_images = make_score_images(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
@@ -152,6 +157,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         thread = ledger_slot(wp.tid(), first_id)
         base = first_photon(first_id, offset)
         s = first_state(medium, camera)
+        if wp.static(in_blocks):
+            derivatives.blocks.thread = wp.tid()
         if wp.static(has_bvh and cuda):
             stack = Stack()
             stack[0] = NO_NODE
@@ -203,6 +210,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 )
                         end = collide(s, medium, layers, limits)
                         s.scores = flight_scores(s.scores, derivatives, layers, s.x, s.u, end.distance)
+                        if wp.static(in_blocks):
+                            fly_blocks(derivatives.blocks, 0, s.x, s.u, end.distance)
                         s.x = end.x
                         s.path += end.distance
                         s.reason = end.reason
@@ -311,6 +320,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.collisions = 0
                             s.surface_count = 0
                             s.scores = Scores()
+                            if wp.static(in_blocks):
+                                begin_blocks(derivatives.blocks)
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)

@@ -18,6 +18,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.tally.blocks import MOST_BLOCK_DERIVATIVES, Blocks, threads_of_blocks
 from spadwarp_kernels.tally.ledger import (
     BOUNDARY_COUNTERS,
     COUNTERS,
@@ -110,8 +111,8 @@ def make_data(
     """Zeroed tallies for a model, or the caller's own int64 array of `model.tally_size` to add to.
 
     `histogram=False` makes none, for an estimator that scores nothing; `record_count` is the number of photons of the
-    largest launch, where `spec.records` asks for their records; `derivatives` is how many the spec has. Raises
-    `ArgumentError`.
+    largest launch, where `spec.records` asks for their records; `derivatives` is how many the spec has, those by block
+    included. Raises `ArgumentError`.
     """
     check_kind("model", model, Model)
     size = check_integer("bins of the tally", model.tally_size, 0) if histogram else 1
@@ -119,7 +120,7 @@ def make_data(
         tally = wp.zeros(size, dtype=wp.int64, device=model.device)
     else:
         check_array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
-    derivatives = check_integer("derivatives", derivatives, 0, MOST_DERIVATIVES)
+    derivatives = check_integer("derivatives", derivatives, 0, MOST_DERIVATIVES + MOST_BLOCK_DERIVATIVES)
     signed = check_integer("bins of data.gradients", size * derivatives, 0)
     return Data(
         tally=tally,
@@ -169,6 +170,10 @@ def launch_transport(
     seed = check_seed(seed)
     check_launch(spec, model, data, photon_count)
     threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
+    derivatives = model.derivatives
+    if spec.blocks:
+        threads = threads_of_blocks(threads, 2 * len(spec.blocks) * derivatives.blocks.count)
+        derivatives = _with_memory(spec, derivatives, threads, model.device)
     data.cursor.zero_()
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
@@ -183,7 +188,7 @@ def launch_transport(
             model.guiding,
             model.surfaces,
             model.scan,
-            model.derivatives,
+            derivatives,
             seed,
             round_keys(seed),
             first_id,
@@ -194,6 +199,19 @@ def launch_transport(
         device=model.device,
         block_dim=BLOCK_SIZE,
     )
+
+
+def _with_memory(spec: TransportSpec, derivatives: Derivatives, threads: int, device: wp.Device) -> Derivatives:
+    """With memory for the scores of blocks: of each launch its own, since several may run at a time."""
+    found, blocks = Derivatives(), Blocks()
+    for name in Derivatives.vars:
+        setattr(found, name, getattr(derivatives, name))
+    for name in Blocks.vars:
+        setattr(blocks, name, getattr(derivatives.blocks, name))
+    blocks.memory = wp.empty(2 * len(spec.blocks) * blocks.count * threads, dtype=float, device=device)
+    blocks.threads = threads
+    found.blocks = blocks
+    return found
 
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:

@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.history import make_event_scores
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
@@ -218,6 +219,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
     derives, event_scores = bool(spec.derivatives), make_event_scores(spec)
+    by_block = make_block_scores(spec)
+    in_blocks = by_block is not None
+    if by_block is not None:
+        turn_in_block = by_block.turn
 
     @wp.func
     def scatter(
@@ -269,6 +274,9 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             new.scores = event_scores(
                 s.scores, derivatives, medium, layers, surfaces, s.hit.face, s.hit.normal, s.x, s.u, new.u
             )
+        if wp.static(in_blocks):
+            if not on_surface:
+                turn_in_block(derivatives.blocks, 0, medium, layers, s.x)
         if wp.static(directed):
             new.weight = reweigh(new.weight, heading.factor)
             new.directed = new.weight.taken

@@ -1,0 +1,103 @@
+"""Scores of a photon's history by block of a grid's cells: by the same addition to a coefficient of all its cells.
+
+Per block -L for absorption, n/b - L for scattering at fixed absorption and n/c - L for extinction at fixed albedo: L
+the path in the block, and over n, the scatterings there, the coefficient of the cell of each. They ask for nothing but
+the way, so that they hold however the flights were drawn and what passes was estimated: by regular tracking, delta
+tracking or ratio tracking.
+
+A thread keeps them in `Blocks.memory`: in the first half of its rows those of the history, in the second half those of
+the contribution that is scored, until it is added or, behind a surface, forgotten.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from spadwarp_kernels.medium.grid import first_place, grid_cell, grid_line, next_place
+from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.tally.blocks import Blocks, block_entry
+
+
+class BlockScores(NamedTuple):
+    """What becomes of the scores of blocks, as Warp functions; `half`: 0 for the history, 1 for what is scored.
+
+    Attributes:
+        begin: ``(blocks)``, a new photon.
+        fly: ``(blocks, half, x, u, length)``, a way in the water.
+        turn: ``(blocks, half, medium, layers, x)``, a scattering in the water at x.
+        copy: ``(blocks)``, the history's to what is scored.
+    """
+
+    begin: wp.Function
+    fly: wp.Function
+    turn: wp.Function
+    copy: wp.Function
+
+
+@functools.cache
+def make_block_scores(spec: TransportSpec) -> BlockScores | None:
+    """Of a spec with blocks."""
+    if not spec.blocks:
+        return None
+    kinds = len(spec.blocks)
+
+    @wp.func
+    def begin(blocks: Blocks):
+        for row in range(wp.static(kinds) * blocks.count):
+            blocks.memory[block_entry(blocks, row)] = 0.0
+
+    @wp.func
+    def copy(blocks: Blocks):
+        rows = wp.static(kinds) * blocks.count
+        for row in range(rows):
+            blocks.memory[block_entry(blocks, rows + row)] = blocks.memory[block_entry(blocks, row)]
+
+    return BlockScores(begin, _make_fly(kinds), _make_turn(spec), copy)
+
+
+def _make_fly(kinds: int) -> wp.Function:
+    @wp.func
+    def add(blocks: Blocks, half: int, block: int, value: float):
+        for q in range(wp.static(kinds)):
+            entry = block_entry(blocks, (wp.static(kinds) * half + q) * blocks.count + block)
+            blocks.memory[entry] = blocks.memory[entry] + value
+
+    @wp.func
+    def fly(blocks: Blocks, half: int, x: wp.vec3, u: wp.vec3, length: float):
+        line = grid_line(blocks.grid, x, u, length)
+        if line.begin < line.end:
+            place = first_place(line, blocks.grid.size)
+            while place.leave < line.end:
+                add(blocks, half, place.cell, place.t - place.leave)
+                place = next_place(line, place)
+            add(blocks, half, place.cell, place.t - line.end)
+
+    return fly
+
+
+def _make_turn(spec: TransportSpec) -> wp.Function:
+    kinds, water_at = len(spec.blocks), spec.water.at
+    # Bits, since a `wp.static` that reads the index of a loop does not enter the hash of Warp's kernel cache.
+    by_scattering, by_extinction = (
+        sum(1 << q for q, kind in enumerate(spec.blocks) if kind == name) for name in ("scattering", "extinction")
+    )
+
+    @wp.func
+    def turn(blocks: Blocks, half: int, medium: Medium, layers: Layers, x: wp.vec3):
+        block = grid_cell(blocks.grid, x)
+        if block >= 0:
+            water = water_at(medium, layers, x)
+            for q in range(wp.static(kinds)):
+                coefficient = float(0.0)
+                if (wp.static(by_scattering) >> q) & 1 == 1:
+                    coefficient = water.extinction * water.albedo
+                if (wp.static(by_extinction) >> q) & 1 == 1:
+                    coefficient = water.extinction
+                if coefficient > 0.0:
+                    entry = block_entry(blocks, (wp.static(kinds) * half + q) * blocks.count + block)
+                    blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
+
+    return turn
