@@ -64,7 +64,16 @@ def simulate(
             metavar="NAME,...",
             help="Also the derivatives of the histogram by these parameters, 8 at most: medium.absorption, "
             "medium.scattering, medium.anisotropy, medium.layers[0].scattering, targets[0].reflectance, ...; short, "
-            "absorption, where one alone can be meant.",
+            "absorption, where one alone can be meant. medium.grid.absorption, .scattering, .extinction: by block.",
+            show_default=False,
+        ),
+    ] = None,
+    blocks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NX,NY,NZ",
+            help="Blocks of cells along the edges of medium.grid, for the derivatives by its coefficients; divisors of "
+            "the numbers of cells. Memory grows with their product. By default one block.",
             show_default=False,
         ),
     ] = None,
@@ -123,7 +132,7 @@ def simulate(
     if resume is not None:
         given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
         more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records}
-        more |= {"--derivatives": derivatives}
+        more |= {"--derivatives": derivatives, "--blocks": blocks}
         if clash := [name for name, value in (given | more).items() if value]:
             raise typer.BadParameter(f"goes without {', '.join(clash)}: the run has them", param_hint="--resume")
         out = resume if resume.is_dir() else resume.parent
@@ -141,7 +150,7 @@ def simulate(
     run = _prepared(scene, device, engine)
     _warn(scene, device)
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
-    names = _parameters(scene, derivatives, earlier)
+    names = _parameters(scene, derivatives, blocks, earlier)
     sizes: dict[str, Any] = {"batches": batches, "records": records, "checkpoint": checkpoint > 0}
     needed = run.bytes_needed(scene, derivatives=len(names), **sizes)
     inputs = (scene_path, *scene.files)
@@ -184,11 +193,21 @@ def _missing(scene_path: Path | None) -> typer.BadParameter:
     return typer.BadParameter(f"is missing; give {text}", param_hint=hint)
 
 
-def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:
+def _parameters(scene: Scene, names: str | None, blocks: str | None, earlier: Result | None) -> tuple[str, ...]:
     """By which the histogram is differentiated."""
+    counts = None if blocks is None else [_count(text) for text in blocks.split(",")]
     if names is None:
+        if counts is not None:
+            raise typer.BadParameter("goes with --derivatives medium.grid.absorption", param_hint="--blocks")
         return () if earlier is None else tuple(earlier.derivatives)
-    return spadwarp.transport.resolve_derivatives(scene, [name.strip() for name in names.split(",")])
+    return spadwarp.transport.resolve_derivatives(scene, [name.strip() for name in names.split(",")], counts)
+
+
+def _count(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a whole number; for example 4,4,2", param_hint="--blocks") from None
 
 
 def _warn(scene: Scene, device: str | None) -> None:
@@ -298,7 +317,7 @@ def described(result: Result, files: RunFiles) -> str:
             f"median error of the depth {1000 * error:.3g} mm"
         )
     if result.derivatives:
-        lines["derivatives"] = "by " + ", ".join(result.derivatives)
+        lines["derivatives"] = "by " + ", ".join(summary["derivatives"])
     if _has_errors(result) and math.isfinite(result.relative_error):
         lines["error"] = (
             f"{100 * result.relative_error:.3g} % in the bins that decide the depth, or less, in 95 % of "

@@ -15,7 +15,7 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
-__all__ = ["DerivativeTallies", "check_derivatives", "derivative_errors", "derivative_values"]
+__all__ = ["DerivativeTallies", "check_derivatives", "derivative_errors", "derivative_values", "short_names"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +100,8 @@ class _Values(Mapping[str, NDArray[np.float64]]):
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         result, found = self._result, self._result.derivative_tallies
         if found is not None and (places := _places(found.names, name)):
-            shape = tuple(max(place[axis] for place in places) + 1 for axis in range(3))
             blocks = np.stack([self[f"{name}[{i},{j},{k}]"] for i, j, k in places])
-            return blocks.reshape(*shape, *blocks.shape[1:])
+            return blocks.reshape(*_shape(places), *blocks.shape[1:])
         if found is None or name not in found.names:
             raise KeyError(f"{name!r} is not one of the derivatives: {', '.join(self) or 'none were asked for'}")
         p = found.names.index(name)
@@ -116,6 +115,22 @@ class _Values(Mapping[str, NDArray[np.float64]]):
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
+
+
+def _shape(places: list[tuple[int, int, int]]) -> list[int]:
+    return [max(indices) + 1 for indices in zip(*places, strict=True)]
+
+
+def short_names(names: tuple[str, ...]) -> list[str]:
+    """For a reader: one text for all blocks, such as "medium.grid.absorption of 4 x 4 x 2 blocks"."""
+    found = dict[str, str]()
+    for name in names:
+        whole = name.partition("[")[0]
+        places = _places(names, whole)
+        found[whole if places else name] = (
+            f"{whole} of {' x '.join(map(str, _shape(places)))} blocks" if places else name
+        )
+    return list(found.values())
 
 
 def _places(names: tuple[str, ...], name: str) -> list[tuple[int, int, int]]:

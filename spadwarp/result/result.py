@@ -19,6 +19,7 @@ from spadwarp.result.derivatives import (
     check_derivatives,
     derivative_errors,
     derivative_values,
+    short_names,
     standard_error,
 )
 from spadwarp.scene.sight import lines_of_sight
@@ -192,7 +193,9 @@ class Result:
     @property
     def derivatives(self) -> Mapping[str, NDArray[np.float64]]:
         """Parameter → ∂histogram/∂parameter by component, float64 `[3, H, W, T]`; of those that `simulate` was asked
-        for, "medium.absorption" [per 1/m] and others, with all other parameters fixed."""
+        for, "medium.absorption" [per 1/m] and others, with all other parameters fixed. Those by block of a grid's
+        cells, "medium.grid.absorption[0,0,0]" and others, are also there together: "medium.grid.absorption" is
+        `[x, y, z, 3, H, W, T]`."""
         return derivative_values(self)
 
     # Errors
@@ -345,7 +348,7 @@ class Result:
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
-            **({"derivatives": list(self.derivatives)} if self.derivatives else {}),
+            **({"derivatives": short_names(tuple(self.derivatives))} if self.derivatives else {}),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
