@@ -19,19 +19,21 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.tally.blocks import Blocks, block_entry
+from spadwarp_kernels.tally.scores import Derivatives
+from spadwarp_kernels.tally.tally import Scores
+
+from .history import make_flight_scores
 
 
 class BlockScores(NamedTuple):
     """What becomes of the scores of blocks, as Warp functions; `half`: 0 for the history, 1 for what is scored.
 
     Attributes:
-        begin: ``(blocks)``, a new photon.
         fly: ``(blocks, half, x, u, length)``, a way in the water.
         turn: ``(blocks, half, medium, layers, x)``, a scattering in the water at x.
         copy: ``(blocks)``, the history's to what is scored.
     """
 
-    begin: wp.Function
     fly: wp.Function
     turn: wp.Function
     copy: wp.Function
@@ -45,17 +47,12 @@ def make_block_scores(spec: TransportSpec) -> BlockScores | None:
     kinds = len(spec.blocks)
 
     @wp.func
-    def begin(blocks: Blocks):
-        for row in range(wp.static(kinds) * blocks.count):
-            blocks.memory[block_entry(blocks, row)] = 0.0
-
-    @wp.func
     def copy(blocks: Blocks):
         rows = wp.static(kinds) * blocks.count
         for row in range(rows):
             blocks.memory[block_entry(blocks, rows + row)] = blocks.memory[block_entry(blocks, row)]
 
-    return BlockScores(begin, _make_fly(kinds), _make_turn(spec), copy)
+    return BlockScores(_make_fly(kinds), _make_turn(spec), copy)
 
 
 def _make_fly(kinds: int) -> wp.Function:
@@ -101,3 +98,37 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
                     blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
 
     return turn
+
+
+@functools.cache
+def make_begin_history(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(derivatives) -> Scores`` of a photon that has met nothing; of blocks too."""
+    kinds = len(spec.blocks)
+
+    @wp.func
+    def begin_history(derivatives: Derivatives) -> Scores:
+        if wp.static(kinds > 0):
+            blocks = derivatives.blocks
+            for row in range(wp.static(kinds) * blocks.count):
+                blocks.memory[block_entry(blocks, row)] = 0.0
+        return Scores()
+
+    return begin_history
+
+
+@functools.cache
+def make_fly_history(spec: TransportSpec) -> wp.Function:
+    """The Warp function of `make_flight_scores`, for a flight of the photon itself: of blocks too."""
+    flight_scores, by_block = make_flight_scores(spec), make_block_scores(spec)
+    if by_block is None:
+        return flight_scores
+    fly = by_block.fly
+
+    @wp.func
+    def fly_history(
+        scores: Scores, derivatives: Derivatives, layers: Layers, x: wp.vec3, u: wp.vec3, length: float
+    ) -> Scores:
+        fly(derivatives.blocks, 0, x, u, length)
+        return flight_scores(scores, derivatives, layers, x, u, length)
+
+    return fly_history

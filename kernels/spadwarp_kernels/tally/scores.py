@@ -113,16 +113,16 @@ def make_deposit(count: int, kinds: int = 0) -> wp.Function:
         if wp.static(count + kinds > 0):
             if c.index >= 0:
                 blocks = derivatives.blocks
-                first = c.index * (wp.static(count) + wp.static(kinds) * blocks.count)
+                width = wp.static(count) + wp.static(kinds) * blocks.count
                 for p in range(wp.static(count)):
                     units = c.value * c.scores[p] * derivatives.scale[p]
-                    deposit_scored(gradients, ledger, thread, first + p, units, c.rounding_sample)
+                    deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
                 for q in range(wp.static(kinds)):
                     for k in range(blocks.count):
                         row = (wp.static(kinds) + q) * blocks.count + k
                         units = c.value * blocks.memory[block_entry(blocks, row)] * blocks.scale[q]
                         p = wp.static(count) + q * blocks.count + k
-                        deposit_scored(gradients, ledger, thread, first + p, units, c.rounding_sample)
+                        deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
         return deposit(tally, ledger, pending, thread, scale, c)
 
     return deposit_derived

@@ -14,8 +14,7 @@ import functools
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.blocks import make_block_scores
-from spadwarp_kernels.derivatives.history import make_flight_scores
+from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_history
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
@@ -63,7 +62,7 @@ from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
-from spadwarp_kernels.tally.tally import TOO_LONG, Scores
+from spadwarp_kernels.tally.tally import TOO_LONG
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
@@ -104,11 +103,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
     has_bvh = has_mesh and not brute_force
-    by_block = make_block_scores(spec)
-    in_blocks = by_block is not None
-    if by_block is not None:  # their scores stay with the thread
-        begin_blocks, fly_blocks = by_block.begin, by_block.fly
-    queues = scores and cuda and not has_bvh and not in_blocks
+    in_blocks = bool(spec.blocks)
+    queues = scores and cuda and not has_bvh and not in_blocks  # scores of blocks stay with the thread
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, enter = make_emit(spec), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
@@ -116,7 +112,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues, len(spec.derivatives))
-    deposit, flight_scores = make_deposit(len(spec.derivatives), len(spec.blocks)), make_flight_scores(spec)
+    deposit = make_deposit(len(spec.derivatives), len(spec.blocks))
+    begin_history, fly_history = make_begin_history(spec), make_fly_history(spec)
     score_images = make_score_images(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
@@ -209,9 +206,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     tally, gradients, ledger, s.pending_add, thread, scale, derivatives, crossing
                                 )
                         end = collide(s, medium, layers, limits)
-                        s.scores = flight_scores(s.scores, derivatives, layers, s.x, s.u, end.distance)
-                        if wp.static(in_blocks):
-                            fly_blocks(derivatives.blocks, 0, s.x, s.u, end.distance)
+                        s.scores = fly_history(s.scores, derivatives, layers, s.x, s.u, end.distance)
                         s.x = end.x
                         s.path += end.distance
                         s.reason = end.reason
@@ -319,9 +314,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.path = start.path
                             s.collisions = 0
                             s.surface_count = 0
-                            s.scores = Scores()
-                            if wp.static(in_blocks):
-                                begin_blocks(derivatives.blocks)
+                            s.scores = begin_history(derivatives)
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)
