@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Parameter",
-    "derivative_choices",
+    "derivative_kinds",
     "derivative_names",
     "derivative_units",
     "make_derivatives",
@@ -202,8 +202,7 @@ def make_derivatives(
     )
 
 
-def derivative_choices(scene: Scene, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """What the kernel is compiled for: choices of a spec."""
+def derivative_kinds(scene: Scene, names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What the kernel is compiled for: kinds of parameters, and of those by block."""
     known = _parameters(scene)
-    kinds = tuple(known[name].kind for name in _others(names))
-    return {"derivatives": kinds, "blocks": block_parameters(names).kinds}
+    return tuple(known[name].kind for name in _others(names)), block_parameters(names).kinds

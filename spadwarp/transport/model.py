@@ -22,7 +22,7 @@ from spadwarp.scene.geometry import scan_axes
 from spadwarp.scene.intrinsics import pixel_views, view_box
 from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport.derivatives import derivative_choices, make_derivatives
+from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
 from spadwarp.transport.tally_unit import tally_scale
@@ -235,6 +235,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
 
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
     """The compile-time choices of a scene and of the derivatives asked for; `choices` override them."""
+    kinds, by_block = derivative_kinds(scene, derivatives)
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
@@ -254,7 +255,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         laser_port=port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
         grid=grid_tracking(scene),
-        **derivative_choices(scene, derivatives),
+        derivatives=kinds,
+        blocks=by_block,
     )
     return spec._replace(**choices)
 
