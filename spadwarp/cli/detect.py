@@ -108,7 +108,7 @@ def detect(
         )
     for note in recording.notes:
         complain(f"note: {note}")
-    if recording.bound_noise > _NOISE:
+    if recording.bound_noise > _NOISE and not _refused(recording):
         complain(f"note: {_bound_noise(recording, result.photons)}")
     written = [recording.path, draw_recording(recording, result, out / "frame.png")]
     summary = _summary(recording, frames)
@@ -168,7 +168,9 @@ def _lines(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
         "frames": f"{opt.count(summary['frames'])} of {opt.count(summary['pulses'])} pulses, seed {summary['seed']}",
         "detections": f"{summary['detections_per_frame_and_pixel']:.4g} a frame and pixel, "
         f"{summary['detections_per_pulse_and_pixel']:.3g} a pulse and pixel",
-        "bound": ("unknown" if summary["bound"]["pixels"] else "no depth information in any pixel")
+        "bound": (
+            "unknown" if summary["bound"]["pixels"] or _refused(recording) else "no depth information in any pixel"
+        )
         if median is None
         else f"standard deviation {1000 * median:.3g} mm of depth in the median pixel (Cramér–Rao, one frame); normal "
         f"errors then have a median of {1000 * _MEDIAN_PER_SIGMA * median:.3g} mm",
@@ -183,14 +185,19 @@ def _lines(recording: Recording, summary: dict[str, Any]) -> dict[str, str]:
     return lines
 
 
+def _refused(recording: Recording) -> bool:
+    """There is information, but no bound: too few photons were traced, as a note says."""
+    return math.isfinite(recording.bound_noise) and not (recording.bound_time == recording.bound_time).any()
+
+
 def _bound_noise(recording: Recording, photons: int) -> str:
     """How much of the bound's information was noise, and the photons that would leave a tenth."""
-    noise = min(recording.bound_noise, 0.999)
-    needed = photons * noise / (1.0 - noise) * (1.0 - _NOISE) / _NOISE
+    from spadwarp.frames.cramer_rao import photons_for_noise
+
+    needed = photons_for_noise(photons, recording.bound_noise, _NOISE)
     return (
-        f"{100 * noise:.2g} % of the information in the median pixel was noise of the simulation; the Cramér–Rao bound "
-        f"is without it"
-        + (", and only roughly known" if noise > 0.3 else "")
-        + f"; about {needed:.1e} photons instead "
-        f"of {photons:.1e} would make that {100 * _NOISE:g} %"
+        f"{100 * recording.bound_noise:.2g} % of the information in the median pixel was noise of the simulation; the "
+        "Cramér–Rao bound is without it"
+        + (", and only roughly known" if recording.bound_noise > 0.3 else "")
+        + f"; about {needed:.1e} photons instead of {photons:.1e} would make that {100 * _NOISE:g} %"
     )

@@ -44,7 +44,7 @@ def is_frames_file(path: str | Path) -> bool:
     return hdf5_format(path) == FORMAT
 
 
-_OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf")
+_OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "monte_carlo_noise")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -61,6 +61,7 @@ class FramesFile:
         scene: Of the result that the counts were drawn from.
         truth_depth: float32 `[H, W]` [m].
         methods: Estimators whose depth frames the file holds.
+        monte_carlo_noise: As of `Frames`.
     """
 
     path: Path
@@ -77,6 +78,7 @@ class FramesFile:
     scene: Scene
     truth_depth: NDArray[np.float32]
     methods: tuple[Method, ...]
+    monte_carlo_noise: float | None = None
 
     def __repr__(self) -> str:
         height, width = self.truth_depth.shape
@@ -94,6 +96,7 @@ class FramesFile:
                 file.refuse("edges", "are not two or more ascending times")
             shape = (scene.camera.height, scene.camera.width, edges.size - 1)
             period = file.real("period", "(0, inf]")
+            noise = file.attribute("monte_carlo_noise", None)
             found = file.names("depth")
             methods = tuple(name for name in METHODS if name in found)
             if unknown := [name for name in found if name not in METHODS]:
@@ -116,6 +119,7 @@ class FramesFile:
                 methods=methods,
                 expected=_expectation(file, "expected", shape),
                 background=_expectation(file, "background", shape),
+                monte_carlo_noise=None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
             )
 
     def plot(self, frame: int = 0, **options: Any) -> Any:
@@ -302,6 +306,7 @@ def _metadata(result: Result, part: Frames, frames: int) -> dict[str, Any]:
         **camera_attributes(scene.camera, result.focus_distance),
         "irf_sigma": part.irf.sigma,
         "irf_tail": part.irf.tail,
+        **({} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}),
         "notes": list(part.notes),
         "source": str(scene.source or ""),
         "photons": result.photons,

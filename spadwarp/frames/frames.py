@@ -45,6 +45,9 @@ class Frames:
             counts, ambient light and, where the source has it apart, backscatter.
         seed: Of the random numbers.
         tags: Every detection, where it was asked for.
+        monte_carlo_noise: Standard error of the simulation over the shot noise of a frame, at the 95th percentile of
+            the pixels; None where nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced,
+            and no more are the counts that are drawn from it.
         notes: What the source could not give, in words.
     """
 
@@ -61,6 +64,7 @@ class Frames:
     background: NDArray[np.float32]
     seed: int
     tags: TimeTags | None = None
+    monte_carlo_noise: float | None = None
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -13,7 +13,7 @@ from spadwarp.scene import detection_efficiency, noise_rate
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
 
-__all__ = ["MonteCarloNoise", "monte_carlo_noise"]
+__all__ = ["MonteCarloNoise", "monte_carlo_noise", "noise_caption"]
 
 LIMIT = 0.5
 """Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""
@@ -58,6 +58,13 @@ UNKNOWN = (
     "histograms is drawn as if it were light, the same in every frame, and counts as information in the Cramér–Rao "
     "bound, which is too small where few photons were traced"
 )
+
+
+def noise_caption(ratio: float | None) -> str:
+    """For the caption of a picture of frames that show the noise of the simulation; else empty."""
+    if ratio is None or ratio <= LIMIT:
+        return ""
+    return f"; too few photons traced: Monte Carlo noise of expected and counts {ratio:.2g} times the shot noise"
 
 
 def monte_carlo_noise(

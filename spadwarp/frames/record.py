@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.frames.cramer_rao import crlb
+from spadwarp.frames.cramer_rao import bound_of_result
 from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
@@ -51,7 +51,8 @@ class Recording:
         first: The first frame, its counts `[1, H, W, T]`.
         depth: First frame by each estimator, float64 `[H, W]` [m].
         errors: By estimator; of at most the first 256 MiB of counts.
-        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m]; see `crlb`.
+        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m]; see `crlb`. NaN where that
+            refuses, which the notes then say.
         bound_noise: Part of the histograms' information that was noise of the simulation and is subtracted, median of
             the pixels; NaN if the result keeps no standard errors.
         detections: Counts of all frames.
@@ -111,13 +112,14 @@ def record_frames(
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
-    bound_time, bound_depth, bound_noise = _bounds(result, pulses, device)
+    bound_time, bound_depth, bound_noise, notes = _bounds(result, pulses, device)
     recording: Recording | None = None
     detections = 0
     with FramesFile.create(path) as file:
         for start in range(0, frames, size) if frames > 0 else (0,):
             count = min(size, frames - start)
             part = detect(result, frames=count, first_frame=start, **options)
+            part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
             for method in methods:
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
@@ -144,18 +146,18 @@ def record_frames(
     return replace(recording, detections=detections)
 
 
-def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map, float]:
-    """Cramér–Rao bounds of one frame [s], [m], NaN for a response without a derivative; the part that was noise."""
+def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map, float, tuple[str, ...]]:
+    """Cramér–Rao bounds of one frame [s], [m], NaN for a response without a derivative or too few photons; the part
+    that was noise; and notes."""
     scene, distance = result.scene, result.truth.range.astype(np.float64)
-    bound, noise = np.full(distance.shape, np.nan), np.nan
-    if detector_response(scene.detector, scene.laser).is_smooth:
-        law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
-        bound = crlb(result, pulses=pulses, law=law, device=device)
-        known = ~np.isnan(bound)
-        if result.second_moment is not None and known.any():
-            with_noise = crlb(replace(result, second_moment=None, batch_size=0), pulses=pulses, law=law, device=device)
-            noise = float(1.0 - np.median(with_noise[known] / bound[known]) ** 2)
-    return bound, bound * depth_per_time(scene, distance), noise
+    missing = np.full(distance.shape, np.nan)
+    if not detector_response(scene.detector, scene.laser).is_smooth:
+        return missing, missing, np.nan, ()
+    law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
+    found = bound_of_result(result, pulses=pulses, law=law, device=device)
+    if found.problem is not None:
+        return missing, missing, found.noise, (f"no Cramér–Rao bound: {found.problem}",)
+    return found.sigma, found.sigma * depth_per_time(scene, distance), found.noise, ()
 
 
 def _errors(depth: Map, truth: NDArray[np.float32]) -> FrameErrors:

@@ -122,6 +122,7 @@ def detect(
         light = _expected(source, background, camera, (gate_start, bin_width), device)
         drawn = _draw(light, detector, is_torch(source), numbers, summed=summed, tags=tags, out=out)
     time_axis, recorded = light.window, light.window.recorded
+    noise, unknown = (None, ()) if scene is None else _noise_of_simulation(result, pulses, detector, laser)
     return Frames(
         counts=drawn.counts,
         expected=drawn.expected[:, :recorded].reshape(*light.image, -1),
@@ -134,20 +135,23 @@ def detect(
         tags=None if drawn.events is None else _time_tags(drawn.events, light.image, first_frame),
         notes=(
             *(missing_light(time_axis, gate_start) if detector.wrap else ()),
-            *(_noise_of_simulation(result, pulses, detector, laser) if scene is not None else ()),
+            *unknown,
         ),
+        monte_carlo_noise=noise,
         **numbers,
     )
 
 
-def _noise_of_simulation(result: Any, pulses: int, detector: Detector, laser: Laser | None) -> tuple[str, ...]:
-    """Warns where frames show the noise of the simulation; a note where nobody knows whether they do."""
+def _noise_of_simulation(
+    result: Any, pulses: int, detector: Detector, laser: Laser | None
+) -> tuple[float | None, tuple[str, ...]]:
+    """Noise over shot noise, with a warning where frames show it, and a note where nobody knows whether they do."""
     noise = monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
     if noise is None:
-        return (UNKNOWN,)
+        return None, (UNKNOWN,)
     if noise.exceeds:
         warnings.warn(str(noise), SpadwarpWarning, stacklevel=4)
-    return ()
+    return noise.ratio, ()
 
 
 # Expected detections

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, first_photon_probabilities
+from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
 from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, PROBABILITY_MAP, paper, save, spaced
@@ -87,7 +88,8 @@ def frame_figure(frames: Frames, number: int = 0, *, maps: DepthMaps | None = No
     else:
         panels.show_depth(maps.depth, f"Depth ({maps.method})", target_limits(maps.truth, maps.depth))
         panels.show_error(maps.depth - maps.truth, "Depth − truth")
-        panels.show_positive(1e3 * maps.bound, "Cramér–Rao bound", "standard deviation [mm]")
+        known = "" if np.isfinite(maps.bound).any() else ": unknown"
+        panels.show_positive(1e3 * maps.bound, f"Cramér–Rao bound{known}", "standard deviation [mm]")
     panels.show_intensity(intensity, "Intensity", "counts in a frame")
     axis = panels.below()
     _plot_counts(frames, counts, maps, axis)
@@ -95,7 +97,8 @@ def frame_figure(frames: Frames, number: int = 0, *, maps: DepthMaps | None = No
     panels.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     which = "all frames added up" if frames.summed else f"frame {frames.first_frame + number + 1}"
     mode = "" if maps is None else f", {maps.scene.detector.mode.replace('_', '-')}"
-    panels.caption(f"{which}: {spaced(frames.pulses)} pulses{mode}; seed {frames.seed}")
+    noise = noise_caption(frames.monte_carlo_noise)
+    panels.caption(f"{which}: {spaced(frames.pulses)} pulses{mode}; seed {frames.seed}{noise}")
     return panels.figure
 
 

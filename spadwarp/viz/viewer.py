@@ -15,6 +15,7 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
+from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.paths import check_apart
 from spadwarp.result import Result
@@ -152,7 +153,7 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     return _Page(
         title=_name(file.scene),
         caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
-        "expectations before pile-up",
+        f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
         scene=file.scene,
         depth=file.depth(chosen, frame).astype(np.float64),
         method=chosen,

@@ -1,6 +1,7 @@
 """Cramér–Rao bounds from the shape of histograms."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -147,3 +148,53 @@ def test_a_result_with_standard_errors_has_a_bound_without_their_noise():
     plain = dataclasses.replace(few, second_moment=None, batch_size=0)
     with_noise, mended = (spadwarp.crlb(one, pulses=1000, device="cpu") for one in (plain, few))
     assert (mended > with_noise).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*one of")
+def test_a_bound_that_is_noise_is_refused_with_the_photons_that_it_needs():
+    """Against a run of many photons: what is given is near its bound, what would not be is refused."""
+    murky = scene(
+        laser={"pulse_energy": 1e-12},
+        detector={"jitter_fwhm_ps": 200.0},
+        camera={"width": 4, "height": 4, "horizontal_fov_deg": 4.0},
+        transport={"estimator": "next_event"},
+    )
+
+    def run(photons, seed):
+        return spadwarp.simulate(murky, photons=photons, seed=seed, uncertainty=True, device="cpu")
+
+    truth = np.median(spadwarp.crlb(run(1_000_000, 0), device="cpu"))
+    given, refused = [], 0
+    for seed in range(1, 6):
+        for photons in (2_000, 10_000, 50_000):
+            try:
+                given.append(np.nanmedian(spadwarp.crlb(run(photons, seed), device="cpu")) / truth)
+            except spadwarp.errors.ArgumentError as error:
+                found = re.search(
+                    r"result: \d+ % of the information .* about (\S+) photons instead of (\S+) would", str(error)
+                )
+                assert photons == float(found[2]) and photons < float(found[1]) < 1_000_000
+                refused += 1
+    assert refused >= 3 and len(given) >= 8
+    assert 0.9 < np.median(given) < 1.25 and max(given) < 1.6 and min(given) > 0.6
+
+
+def test_light_of_a_known_truth_has_its_bound_up_to_half_noise():
+    """Photons of uneven weights at random times of an exponential return: the median bound, and where it goes wrong."""
+    rng = np.random.default_rng(0)
+    shape = np.exp(-np.arange(64) / 10.0) / 10.0 * (np.arange(64) < 60)
+    expected = np.concatenate([np.zeros(40), 0.3 * shape])
+    options = {"background": 1e-3, "irf": 3.0 * BIN, "law": "first_photon"}
+    truth = bound(expected, **options)
+    ratio = {}
+    for photons in (10, 100, 1000):
+        number = rng.poisson(photons * expected / expected.sum(), (300, expected.size))
+        light, variance = np.zeros(number.shape), np.zeros(number.shape)
+        for k in range(number.max()):
+            weight = (number > k) * np.exp(rng.normal(size=number.shape) - 0.5) * expected.sum() / photons
+            light, variance = light + weight, variance + weight**2
+        with_noise, without = bound(light, **options), bound(light, signal_variance=variance, **options)
+        ratio[photons] = np.median(without) / truth
+        assert np.median(with_noise) < np.median(without)
+    assert ratio[1000] == pytest.approx(1.0, abs=0.05) and ratio[100] == pytest.approx(1.0, abs=0.2)
+    assert ratio[10] > 1.2  # most of it is noise: `crlb` refuses such a result
