@@ -66,8 +66,8 @@ def component_errors(result: Result) -> dict[str, ComponentError]:
     names = [name.removesuffix("_squares") for name in moments if name.endswith("_squares")]
     count, found = result.photons // result.batch_size, {}
     for name, tally in zip(names, result.tallies, strict=True):
-        # In halves, since a sum over all voxels may exceed 64 bits.
-        total = (int((tally >> 32).sum()) << 32) + int((tally & 0xFFFFFFFF).sum())
+        # In rows and halves, since a sum over all voxels may exceed 64 bits.
+        total = sum((int((row >> 32).sum()) << 32) + int((row & 0xFFFFFFFF).sum()) for row in tally)
         # count times the sum of squared deviations, in integers: no cancellation.
         spread = count * moments[f"{name}_squares"] - total * total
         furthest = max(count * moments[f"{name}_largest"] - total, total - count * moments[f"{name}_smallest"])

@@ -207,10 +207,16 @@ class Result:
         Raises:
             ConfigError: The run kept no batches, or only one.
         """
+        return standard_error(self.tallies, self._moments(), self._batches) * self.tally_value[..., None]
+
+    @property
+    def _batches(self) -> int:
+        return self.photons // self.batch_size
+
+    def _moments(self) -> NDArray[np.uint64]:
         if self.second_moment is None or self.photons < 2 * self.batch_size:
             raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
-        count = self.photons // self.batch_size
-        return standard_error(self.tallies, self.second_moment, count) * self.tally_value[..., None]
+        return self.second_moment
 
     @property
     def derivative_errors(self) -> Mapping[str, NDArray[np.float64]]:
@@ -222,12 +228,19 @@ class Result:
     def relative_error(self) -> float:
         """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
         the pixels that hold a target, or of all without any, in which anything returned. Infinite if nothing did."""
-        peak = self.histogram.argmax(axis=2)[..., None]
-        value = np.take_along_axis(self.histogram, peak, axis=2)[..., 0]
-        error = np.take_along_axis(self.standard_error, peak, axis=2)[..., 0]
+        moments = self._moments()
+        # Row by row: of a large histogram nothing is copied.
+        peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[..., None]
+        value = self._at(peak, self.tallies).sum(axis=0)
         target = np.isfinite(self.truth.depth)
         returned = (value > 0) & (target | ~target.any())
-        return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
+        if not returned.any():
+            return math.inf
+        error = standard_error(self._at(peak, self.tallies), self._at(peak, moments), self._batches)
+        return float(np.quantile(error[returned] / value[returned], 0.95))
+
+    def _at(self, peak: NDArray[np.int64], array: NDArray[Any]) -> NDArray[Any]:
+        return np.take_along_axis(array, peak[None], axis=3)[..., 0]
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ class DeviceWorker:
             gradients = self._gradients = self.data.gradients
             self._gradient_batches = None
             if batch_size and gradients is not None:
-                self._gradient_batches = sk.Batches(gradients, len(COMPONENTS))
+                self._gradient_batches = sk.Batches(gradients, len(COMPONENTS), signed=True)
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)
         self._names = derivatives
@@ -89,7 +89,7 @@ class DeviceWorker:
         """
         if self._batches is None:
             traced = self._trace(block, stopped, report)
-            self._check_overflow(self.data.tally, self._gradients)
+            self._check_overflow()
             return traced
         done: list[Range] = []
         for first in range(*block, self._batch_size):
@@ -99,15 +99,19 @@ class DeviceWorker:
                 break
             self._close_batch()
             done.append(batch)
-        self._check_overflow(self._batches.total, self._gradient_batches.total if self._gradient_batches else None)
+        self._check_overflow()
         return joined(done)
 
-    def _check_overflow(self, tally: wp.array, gradients: wp.array | None) -> None:
+    def _check_overflow(self) -> None:
         """After every block of photons, long before an integer could go round and look right again."""
         with device_errors(self.model.device):
-            overflowed = sk.has_overflowed(tally)
-            if gradients is not None:
-                overflowed = overflowed or sk.has_overflowed(gradients, signed=True)
+            if self._batches is not None:
+                batches = [self._batches, self._gradient_batches]
+                overflowed = any(one.has_overflowed() for one in batches if one is not None)
+            else:
+                overflowed = sk.has_overflowed(self.data.tally)
+                if self._gradients is not None:
+                    overflowed = overflowed or sk.has_overflowed(self._gradients, signed=True)
         if overflowed:
             raise SpadwarpError(OVERFLOW)
 
@@ -148,9 +152,9 @@ class DeviceWorker:
         """Adds a batch whose photons are all done to the totals."""
         assert self._batches is not None
         with device_errors(self.model.device):
-            self._batches.close(self.data.tally)
+            self._batches.close(self.data.tally, threads=self.threads)
             if self._gradients is not None and self._gradient_batches is not None:
-                self._gradient_batches.close(self._gradients)
+                self._gradient_batches.close(self._gradients, threads=self.threads)
             moments = moments_of(COMPONENTS, self._batches.take_sums())
             batch = sk.read_ledger(self.data)
             self.data.ledger.zero_()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from spadwarp.errors import ConfigError
 from spadwarp.limits import SEED, check_integer, check_part, check_real
 from spadwarp.mesh import build_mesh
-from spadwarp.result import Result
+from spadwarp.result import COMPONENTS, Result
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.result.result import physics_of
 from spadwarp.scene import Scene
@@ -28,6 +28,9 @@ LARGEST_LAUNCH = {"cpu": 1 << 20, "cuda": 1 << 26}
 
 PHOTONS = "[1, 1000000000000]"
 """Range of the photons of a run."""
+
+# Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.
+_VOXELS_PER_PHOTON = 16
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work and little is lost.
 _LARGEST_BATCH = 1 << 30
@@ -131,8 +134,12 @@ def _check_capacity(photons: int, capacity: int) -> None:
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it."""
-    # With a stopping rule more batches, so that it can act early.
-    least = 32 if relative_error is None else 1024
+    least = 32
+    if relative_error is not None:
+        # With a stopping rule more batches, so that it can act early; in a large histogram, all of which is read at the
+        # end of a batch, fewer.
+        voxels = len(COMPONENTS) * scene.camera.width * scene.camera.height * scene.gate.bins
+        least = min(max(photons * _VOXELS_PER_PHOTON // voxels, 128), 1024)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 import platform
 import threading
 import time
@@ -36,6 +37,10 @@ Progress = Callable[[str, int, int], None]
 # so small, in numbers of them to one unit, that their own scatter is less.
 _LARGEST_ROUNDING_ERROR = 0.05
 _MANY = 10
+
+# With a stopping rule: batches at the first look at the error; those that know it well; photons beyond the number that
+# should reach the goal, since most looks would else come a little too early.
+_FIRST_LOOK, _FEW, _RESERVE = 8, 32, 1.05
 
 
 def simulate(
@@ -78,8 +83,10 @@ def simulate(
             with ("trace", photons done, photons asked for); any other first word is a remark for the user.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
             at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
-        relative_error: Stop once `Result.relative_error` is below this, checked after 8, 16, 32, ... batches; implies
-            `uncertainty`, and `photons` is the most that are traced.
+        relative_error: Stop once `Result.relative_error` is below this; implies `uncertainty`, and `photons` is the
+            most that are traced. The error is looked at after 8 batches of 1/128 to 1/1024 of the photons, and then
+            where it says that the goal will be reached, whatever the device. See "Which estimator, how many photons"
+            for what the choice of the moment does to the error.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
         shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
         resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
@@ -171,6 +178,17 @@ def _warn_of_rounding(result: Result) -> None:
             )
 
 
+def _batches_wanted(batches: int, excess: float) -> int:
+    """After how many batches the error is looked at again, when after so many it is `excess` times what is asked for.
+
+    Errors fall with the root of the photons. Few batches know them badly, and rather too large, since a high quantile
+    of the pixels is taken: until 32 there are at most twice as many at the next look, then eight times as many.
+    """
+    most = batches * (2 if batches < _FEW else 8)
+    wanted = math.ceil(_RESERVE * batches * excess**2) if excess < math.inf else most
+    return min(max(wanted, batches + max(1, batches // 16)), most)
+
+
 class _Run:
     """The photons of a plan, those of an earlier result included."""
 
@@ -194,35 +212,35 @@ class _Run:
 
     def result(self, stopped: threading.Event, relative_error: float | None) -> Result:
         """Of all photons, of those that reach a relative error, or of those done when the run was stopped."""
-        done = self._earlier
-        start, stop = self._plan.ids
-        for goal in [*self._milestones(relative_error), stop]:
-            done = self._trace((start, goal), done, stopped)
-            if stopped.is_set() and without((start, goal), done):
-                break
-            if relative_error is not None:
-                result = self._collect(done)
-                if self._is_known(result, relative_error) or goal == stop:
-                    return replace(result, requested=(start, goal), partial=False)
+        if relative_error is not None:
+            return self._known_result(stopped, relative_error)
+        done = self._trace(self._plan.ids, self._earlier, stopped)
         if count(done) == count(self._earlier):
             raise KeyboardInterrupt
         return self._collect(done)
 
-    def _milestones(self, relative_error: float | None) -> list[int]:
-        """Where the error is checked: after 8, 16, 32, ... batches; nowhere without a stopping rule."""
-        if relative_error is None:
-            return []
-        (start, stop), done = self._plan.ids, count(self._earlier)
-        sizes = [self._plan.batch_size << power for power in range(3, 45)]
-        return [start + size for size in sizes if done < size < stop - start]
-
-    def _is_known(self, result: Result, relative_error: float) -> bool:
-        if result.photons < 2 * result.batch_size:
-            return False
-        error, batches = result.relative_error, result.photons // result.batch_size
-        remark = f"error {100 * error:.3g} % after {batches} batches"
-        self._report(remark, result.photons, count([self._plan.ids]))
-        return error <= relative_error
+    def _known_result(self, stopped: threading.Event, relative_error: float) -> Result:
+        """Traces until the error is known to be small enough, looking at it where it may be."""
+        done, size = self._earlier, self._plan.batch_size
+        (start, stop), photons = self._plan.ids, count([self._plan.ids])
+        goal = min(start + max(_FIRST_LOOK * size, count(done)), stop)
+        while True:
+            done = self._trace((start, goal), done, stopped)
+            if count(done) == count(self._earlier) and stopped.is_set():
+                raise KeyboardInterrupt
+            result = self._collect(done)
+            if stopped.is_set() and without((start, goal), done):
+                return result
+            batches = result.photons // size
+            error = result.relative_error if batches > 1 else math.inf
+            remark = f"error {100 * error:.3g} % after {batches} batches"
+            if error <= relative_error or goal == stop:
+                self._report(remark, result.photons, photons)
+                return replace(result, requested=(start, goal), partial=False)
+            if error < math.inf:
+                remark += f"; about {result.photons * (error / relative_error) ** 2:.2g} photons are needed"
+            self._report(remark, result.photons, photons)
+            goal = min(goal + (_batches_wanted(batches, error / relative_error) - batches) * size, stop)
 
     def _trace(self, span: Range, done: Ranges, stopped: threading.Event) -> Ranges:
         """The ids done once a span is, or once the run was stopped."""
