@@ -40,7 +40,7 @@ _MANY = 10
 
 # With a stopping rule: batches at the first look at the error; those that know it well; photons beyond the number that
 # should reach the goal, since most looks would else come a little too early.
-_FIRST_LOOK, _FEW, _RESERVE = 8, 32, 1.05
+_FIRST_LOOK, _FEW, _RESERVE = 16, 32, 1.05
 
 
 def simulate(
@@ -84,7 +84,7 @@ def simulate(
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
             at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
         relative_error: Stop once `Result.relative_error` is below this; implies `uncertainty`, and `photons` is the
-            most that are traced. The error is looked at after 8 batches of 1/128 to 1/1024 of the photons, and then
+            most that are traced. The error is looked at after 16 batches of 1/128 to 1/1024 of the photons, and then
             where it says that the goal will be reached, whatever the device. See "Which estimator, how many photons"
             for what the choice of the moment does to the error.
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.

@@ -65,7 +65,7 @@ def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
     same(spadwarp.simulate(scene(), **options, device="cpu,cpu"), one)
     errors = [remark for remark in seen if remark.startswith("error")]
     batches = one.photons // one.batch_size
-    assert "after 8 batches; about " in errors[0] and errors[0].endswith(" photons are needed")
+    assert "after 16 batches; about " in errors[0] and errors[0].endswith(" photons are needed")
     assert errors[-1] == f"error {100 * one.relative_error:.3g} % after {batches} batches"
 
 
