@@ -192,12 +192,9 @@ def _refused(recording: Recording) -> bool:
 
 def _bound_noise(recording: Recording, photons: int) -> str:
     """How much of the bound's information was noise, and the photons that would leave a tenth."""
-    from spadwarp.frames.cramer_rao import photons_for_noise
-
-    needed = photons_for_noise(photons, recording.bound_noise, _NOISE)
     return (
         f"{100 * recording.bound_noise:.2g} % of the information in the median pixel was noise of the simulation; the "
         "Cramér–Rao bound is without it"
         + (", and only roughly known" if recording.bound_noise > 0.3 else "")
-        + f"; about {needed:.1e} photons instead of {photons:.1e} would make that {100 * _NOISE:g} %"
+        + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"
     )

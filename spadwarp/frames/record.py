@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.frames.cramer_rao import bound_of_result
+from spadwarp.frames.cramer_rao import bound_of_result, photons_for_noise
 from spadwarp.frames.estimators import METHODS, Method
 from spadwarp.frames.file import FramesFile
 from spadwarp.frames.frames import Frames
@@ -55,6 +55,7 @@ class Recording:
             refuses, which the notes then say.
         bound_noise: Part of the histograms' information that was noise of the simulation and is subtracted, median of
             the pixels; NaN if the result keeps no standard errors.
+        bound_photons: Photons that would make that part a tenth.
         detections: Counts of all frames.
         notes: What the simulation could not give, in words.
         monte_carlo: Its noise against the shot noise of one frame; None if the result keeps no standard errors.
@@ -67,6 +68,7 @@ class Recording:
     bound_time: Map
     bound_depth: Map
     bound_noise: float
+    bound_photons: float
     detections: int
     notes: tuple[str, ...]
     monte_carlo: MonteCarloNoise | None
@@ -134,6 +136,7 @@ def record_frames(
                     bound_time=bound_time,
                     bound_depth=bound_depth,
                     bound_noise=bound_noise,
+                    bound_photons=photons_for_noise(result.photons, bound_noise, 0.1),
                     detections=0,
                     notes=part.notes,
                     monte_carlo=monte_carlo_noise(result, pulses=pulses),
