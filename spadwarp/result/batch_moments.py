@@ -8,10 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from spadwarp.errors import ConfigError
+from spadwarp.result.derivatives import standard_error
+
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from spadwarp.result.result import Result
 
 __all__ = ["ComponentError", "component_errors", "dominance_warnings", "joined_moments", "moments_of"]
+__all__ += ["batches_of", "relative_error"]
 
 # Share of the variance between batches from which one batch is said to decide a standard error. Chance alone exceeds
 # it with a probability of _FALSE_ALARM at most, see `_threshold`.
@@ -75,6 +83,25 @@ def component_errors(result: Result) -> dict[str, ComponentError]:
             error = math.sqrt(spread / (count - 1)) / total
             found[name] = ComponentError(error, furthest * furthest / ((count - 1) * spread), count)
     return found
+
+
+def batches_of(result: Result) -> tuple[NDArray[np.uint64], int]:
+    """The second moments of a result's batches and their number. Raises `ConfigError` where there are too few."""
+    if result.second_moment is None or result.photons < 2 * result.batch_size:
+        raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
+    return result.second_moment, result.photons // result.batch_size
+
+
+def relative_error(result: Result) -> float:
+    """What `Result.relative_error` describes, row by row: of a large histogram nothing is copied."""
+    moments, count = batches_of(result)
+    peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in result.tallies.swapaxes(0, 1)])[None, ..., None]
+    tallies = np.take_along_axis(result.tallies, peak, axis=3)[..., 0]
+    value = tallies.sum(axis=0)
+    error = standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], count)
+    target = np.isfinite(result.truth.depth)
+    returned = (value > 0) & (target | ~target.any())
+    return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
 
 def dominance_warnings(result: Result) -> list[str]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.result.batch_moments import dominance_warnings
+from spadwarp.errors import ArgumentError
+from spadwarp.result.batch_moments import batches_of, dominance_warnings, relative_error
 from spadwarp.result.derivatives import (
     DerivativeTallies,
     check_derivatives,
@@ -207,16 +207,8 @@ class Result:
         Raises:
             ConfigError: The run kept no batches, or only one.
         """
-        return standard_error(self.tallies, self._moments(), self._batches) * self.tally_value[..., None]
-
-    @property
-    def _batches(self) -> int:
-        return self.photons // self.batch_size
-
-    def _moments(self) -> NDArray[np.uint64]:
-        if self.second_moment is None or self.photons < 2 * self.batch_size:
-            raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
-        return self.second_moment
+        moments, count = batches_of(self)
+        return standard_error(self.tallies, moments, count) * self.tally_value[..., None]
 
     @property
     def derivative_errors(self) -> Mapping[str, NDArray[np.float64]]:
@@ -228,19 +220,7 @@ class Result:
     def relative_error(self) -> float:
         """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
         the pixels that hold a target, or of all without any, in which anything returned. Infinite if nothing did."""
-        moments = self._moments()
-        # Row by row: of a large histogram nothing is copied.
-        peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[..., None]
-        value = self._at(peak, self.tallies).sum(axis=0)
-        target = np.isfinite(self.truth.depth)
-        returned = (value > 0) & (target | ~target.any())
-        if not returned.any():
-            return math.inf
-        error = standard_error(self._at(peak, self.tallies), self._at(peak, moments), self._batches)
-        return float(np.quantile(error[returned] / value[returned], 0.95))
-
-    def _at(self, peak: NDArray[np.int64], array: NDArray[Any]) -> NDArray[Any]:
-        return np.take_along_axis(array, peak[None], axis=3)[..., 0]
+        return relative_error(self)
 
     @property
     def warnings(self) -> tuple[str, ...]:
