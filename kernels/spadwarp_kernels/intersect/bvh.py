@@ -1,4 +1,5 @@
-"""Rays against a triangle mesh, step by step: the tree of a `wp.Mesh`, laid out for the warps of a GPU.
+"""Rays against a triangle mesh, step by step: the tree of a `wp.Mesh`, laid out for the warps of a GPU; `wide` is for
+a CPU.
 
 `wp.mesh_query_ray` walks a tree from its root to the end of the ray, so that a warp waits for its longest walk, some of
 its lanes in the tree's nodes and others at its leaves. Here a walk is a state (node, stack, nearest face so far) that
@@ -17,7 +18,7 @@ import warp as wp
 from spadwarp_kernels.math.bits import bits_of, from_bits
 
 from .box import box_span
-from .triangle import WIDENING, face_distance, face_in, pack_faces_kernel
+from .triangle import box_padding, face_distance, face_in, pack_faces, set_faces
 
 # What a walk holds in place of a node when it has come to its end: nodes are above, leaves below.
 NO_NODE = wp.constant(-1)
@@ -116,11 +117,25 @@ def _pack_kernel(
             nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
 
 
+def read_tree(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array]:
+    """Nodes and order of a mesh's tree, see `pack_bvh`."""
+    count, device = mesh.indices.size // 3, mesh.device
+    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
+    before = wp.zeros_like(has_children)
+    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
+    order = wp.zeros(count, dtype=int, device=device)
+    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
+    wp.utils.array_scan(has_children, before, inclusive=False)
+    inputs = [mesh.id, box_padding(extent), before]
+    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
+    return nodes, order
+
+
 def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
     """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; see `refit_bvh` for moved points.
 
     Args:
-        mesh: Any `wp.Mesh`.
+        mesh: Any `wp.Mesh` on a GPU.
         extent: Its largest coordinate [m], for the padding of the boxes.
 
     Returns:
@@ -128,22 +143,8 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         faces: vec4 [3 * slots], see `face_distance`.
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
     """
-    count, device = mesh.indices.size // 3, mesh.device
-    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
-    before = wp.zeros_like(has_children)
-    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
-    faces = wp.zeros(3 * count, dtype=wp.vec4, device=device)
-    order = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
-    wp.utils.array_scan(has_children, before, inclusive=False)
-    inputs = [mesh.id, _padding(extent), before]
-    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
-    wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=device)
-    return nodes, faces, order
-
-
-def _padding(extent: float) -> float:
-    return 2.5 * WIDENING * extent + 1e-9
+    nodes, order = read_tree(mesh, extent)
+    return nodes, pack_faces(mesh, extent, order), order
 
 
 @wp.kernel(enable_backward=False)
@@ -213,18 +214,9 @@ def refit_bvh(
     """Boxes and faces of a packed tree for points that have moved: a launch a level, without an allocation or a look
     at Warp's own tree. `depth` and `levels` are those of `pair_depths`."""
     for level in reversed(range(levels)):
-        inputs = [mesh.id, _padding(extent), level, depth, order]
+        inputs = [mesh.id, box_padding(extent), level, depth, order]
         wp.launch(_refit_kernel, depth.size, inputs, outputs=[nodes], device=mesh.device)
-    wp.launch(pack_faces_kernel, order.size, [mesh.id, order], outputs=[faces], device=mesh.device)
-
-
-def pack_faces(mesh: wp.Mesh) -> tuple[wp.array, wp.array]:
-    """Faces and order without Warp's tree: each face in the slot of its own number, for `wp.mesh_query_ray`."""
-    count = mesh.indices.size // 3
-    order = wp.array(np.arange(count), dtype=int, device=mesh.device)
-    faces = wp.zeros(3 * count, dtype=wp.vec4, device=mesh.device)
-    wp.launch(pack_faces_kernel, count, [mesh.id, order], outputs=[faces], device=mesh.device)
-    return faces, order
+    set_faces(mesh, extent, order, faces)
 
 
 def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:

@@ -1,21 +1,29 @@
-"""Rays against triangles, laid out as planes."""
+"""Rays against triangles, laid out as planes: see `face_distance`.
+
+On CUDA the three planes of a face are three vec4 in a row. On the CPU eight faces make a block of 36 vec4, as 18 rows
+of eight numbers: the components of the planes, then the lower and the upper corner of each face's own box.
+"""
 
 import warp as wp
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
 WIDENING = wp.constant(4.0e-7)
 
+# Faces of a block on the CPU.
+LANES = wp.constant(8)
+
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(array.data) + index);
+    const float4 v = __ldg(reinterpret_cast<const float4*>(faces.data) + 3 * slot + plane);
     return wp::vec4(v.x, v.y, v.z, v.w);
 #else
-    return reinterpret_cast<const wp::vec4*>(array.data)[index];
+    const float* const row = reinterpret_cast<const float*>(faces.data) + 144 * (slot / 8) + 32 * plane + slot % 8;
+    return wp::vec4(row[0], row[8], row[16], row[24]);
 #endif
 """)
-def load_vec4(array: wp.array(dtype=wp.vec4), index: int) -> wp.vec4:
-    """An entry of a contiguous array, in one load."""
+def load_plane(faces: wp.array(dtype=wp.vec4), slot: int, plane: int) -> wp.vec4:
+    """One of the three planes of a face, in one load on CUDA."""
     ...
 
 
@@ -26,11 +34,9 @@ def face_in(order: wp.array(dtype=int), slot: int) -> int:
     return wp.where(face < 0, ~face, face)
 
 
-@wp.kernel(enable_backward=False)
-def pack_faces_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
-    """Launch: faces."""
-    slot = wp.tid()
-    face = face_in(order, slot)
+@wp.func
+def _planes(mesh: wp.uint64, face: int):
+    """Normals and offsets of the three planes of a face, see `face_distance`."""
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face]]
     e1 = m.points[m.indices[3 * face + 1]] - p
@@ -41,9 +47,87 @@ def pack_faces_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.arr
     b = inverse * wp.cross(n, e1)
     steepest = wp.max(wp.max(wp.length(a), wp.length(b)), wp.length(a + b))
     n = wp.normalize(n) / steepest
-    faces[3 * slot] = wp.vec4(a[0], a[1], a[2], -wp.dot(a, p))
-    faces[3 * slot + 1] = wp.vec4(b[0], b[1], b[2], -wp.dot(b, p))
-    faces[3 * slot + 2] = wp.vec4(n[0], n[1], n[2], wp.dot(n, p))
+    return (
+        wp.vec4(a[0], a[1], a[2], -wp.dot(a, p)),
+        wp.vec4(b[0], b[1], b[2], -wp.dot(b, p)),
+        wp.vec4(n[0], n[1], n[2], wp.dot(n, p)),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _rows_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+    """Launch: slots; CUDA."""
+    slot = wp.tid()
+    a, b, n = _planes(mesh, face_in(order, slot))
+    faces[3 * slot] = a
+    faces[3 * slot + 1] = b
+    faces[3 * slot + 2] = n
+
+
+@wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
+def number_at(rows: wp.array(dtype=wp.vec4), index: int) -> float:
+    """A number of contiguous rows."""
+    ...
+
+
+@wp.func_native("reinterpret_cast<float*>(rows.data)[index] = value;")
+def set_number(rows: wp.array(dtype=wp.vec4), index: int, value: float):
+    """Writes a number of contiguous rows."""
+    ...
+
+
+@wp.func
+def face_number(slot: int, row: int) -> int:
+    """Index of a number of the face in a slot, in the blocks of the CPU."""
+    return 144 * (slot / LANES) + LANES * row + slot % LANES
+
+
+@wp.kernel(enable_backward=False)
+def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+    """Launch: slots; CPU. A slot without a face keeps planes of zeros and a box that no ray meets."""
+    slot = wp.tid()
+    face = order[slot]
+    low = wp.vec3(1.0e30)
+    high = wp.vec3(-1.0e30)
+    if face >= 0:
+        a, b, n = _planes(mesh, face)
+        for i in range(4):
+            set_number(faces, face_number(slot, i), a[i])
+            set_number(faces, face_number(slot, 4 + i), b[i])
+            set_number(faces, face_number(slot, 8 + i), n[i])
+        m = wp.mesh_get(mesh)
+        for corner in range(3):
+            p = m.points[m.indices[3 * face + corner]]
+            low = wp.min(low, p - wp.vec3(padding))
+            high = wp.max(high, p + wp.vec3(padding))
+    for axis in range(3):
+        set_number(faces, face_number(slot, 12 + axis), low[axis])
+        set_number(faces, face_number(slot, 15 + axis), high[axis])
+
+
+def box_padding(extent: float) -> float:
+    """By how much boxes are larger than what is in them [m], for coordinates up to the extent."""
+    return 2.5 * WIDENING * extent + 1e-9
+
+
+def face_vectors(slots: int, device: wp.Device) -> int:
+    """How many vec4 the faces in so many slots take."""
+    return 3 * slots if device.is_cuda else 36 * (slots // 8)
+
+
+def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) -> None:
+    """Writes the faces in their slots, for the mesh's points as they are."""
+    if mesh.device.is_cuda:
+        wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
+    else:
+        wp.launch(_blocks_kernel, order.size, [mesh.id, box_padding(extent), order], [faces], device=mesh.device)
+
+
+def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
+    """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks]."""
+    faces = wp.zeros(face_vectors(order.size, mesh.device), dtype=wp.vec4, device=mesh.device)
+    set_faces(mesh, extent, order, faces)
+    return faces
 
 
 @wp.func
@@ -54,9 +138,9 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
     own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the
     ray, so that none slips between two faces; more than that beyond the short edges of a sliver, where its box ends it.
     """
-    a = load_vec4(faces, 3 * slot)
-    b = load_vec4(faces, 3 * slot + 1)
-    n = load_vec4(faces, 3 * slot + 2)
+    a = load_plane(faces, slot, 0)
+    b = load_plane(faces, slot, 1)
+    n = load_plane(faces, slot, 2)
     rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
     height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
     distance = height / rate  # infinite or not a number for a ray in the plane, which fails below
@@ -73,6 +157,6 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
 @wp.func
 def face_normal(faces: wp.array(dtype=wp.vec4), slot: int, u: wp.vec3) -> wp.vec3:
     """The unit normal of a face, against u."""
-    n = load_vec4(faces, 3 * slot + 2)
+    n = load_plane(faces, slot, 2)
     normal = wp.normalize(wp.vec3(n[0], n[1], n[2]))
     return wp.where(wp.dot(normal, u) > 0.0, -normal, normal)

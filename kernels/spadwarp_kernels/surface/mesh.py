@@ -16,8 +16,9 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_values,
 )
-from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pack_faces, pair_depths, refit_bvh
-from spadwarp_kernels.intersect.triangle import pack_faces_kernel
+from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pair_depths, refit_bvh
+from spadwarp_kernels.intersect.triangle import LANES, face_vectors, pack_faces, set_faces
+from spadwarp_kernels.intersect.wide import empty_wide, pack_wide, refit_wide
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import near_depth_map
 
@@ -46,14 +47,15 @@ class Surfaces:
     Attributes:
         mesh: Id of a `wp.Mesh`.
         lower, upper: Its bounding box [m], padded against rounding.
-        nodes, faces, order: The mesh's tree, see `bvh`.
+        nodes, faces, order: The mesh's tree, see `bvh`, on the CPU `wide`.
         reflectance: Of each face, in [0, 1].
         near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
         corner_reflectance: At the three corners of each face, instead of `reflectance`; empty unless it varies.
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
-        depth, levels: Of the tree of a moving mesh, see `pair_depths`; empty for others.
+        depth, levels: Of the tree of a moving mesh, see `pair_depths`; empty for others, and on the CPU but for one
+            level.
         extent: Largest coordinate that the tree is made for [m].
     """
 
@@ -138,7 +140,7 @@ def make_surfaces(
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
     _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device)
+    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device) if device.is_cuda else empty_wide()
     surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     if mesh is None:
@@ -159,12 +161,18 @@ def make_surfaces(
     padding = 1e-6 * surfaces.extent + 1e-6
     surfaces.mesh = mesh.id
     if public_tree:
+        slots = face_count if device.is_cuda else -(-face_count // LANES) * LANES
+        numbers = np.where(np.arange(slots) < face_count, np.arange(slots), -1)
         surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
-        surfaces.faces, surfaces.order = pack_faces(mesh)
-    else:
+        surfaces.order = wp.array(numbers, dtype=int, device=device)  # each face in the slot of its own number
+        surfaces.faces = pack_faces(mesh, surfaces.extent, surfaces.order)
+    elif device.is_cuda:
         surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent)
         if extent is not None:
             surfaces.depth, surfaces.levels = pair_depths(surfaces.nodes)
+    else:
+        surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
+        surfaces.levels = 0 if extent is None else 1
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
@@ -195,20 +203,25 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
             raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
     if surfaces.near_depth.size:
         raise ArgumentError("surfaces know what the camera cannot miss; for moving points, make them without camera")
-    if surfaces.nodes.size:
-        if not surfaces.depth.size:
-            raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
-        count, device = mesh.indices.size // 3, mesh.device
-        check_array("surfaces.order", surfaces.order, wp.int32, (count,), device)
-        check_array("surfaces.faces", surfaces.faces, wp.vec4, (3 * count,), device)
-        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), device)
-        tree = (surfaces.nodes, surfaces.faces, surfaces.order, surfaces.depth, surfaces.levels)
-        refit_bvh(mesh, surfaces.extent, *tree)
-    else:
+    check_faces("surfaces", surfaces, mesh.indices.size // 3, mesh.device)
+    tree = (mesh, surfaces.extent, surfaces.nodes, surfaces.faces, surfaces.order)
+    if not surfaces.nodes.size:
         mesh.refit()
-        wp.launch(
-            pack_faces_kernel, surfaces.order.size, [mesh.id, surfaces.order], [surfaces.faces], device=mesh.device
-        )
+        set_faces(mesh, surfaces.extent, surfaces.order, surfaces.faces)
+    elif not surfaces.levels:
+        raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
+    elif mesh.device.is_cuda:
+        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), mesh.device)
+        refit_bvh(*tree, surfaces.depth, surfaces.levels)
+    else:
+        refit_wide(*tree)
+
+
+def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
+    """Raises `ArgumentError` for arrays of `Surfaces` that do not hold so many faces."""
+    slots = faces if device.is_cuda else None
+    slots = check_array(f"{name}.order", surfaces.order, wp.int32, (slots,), device).size
+    check_array(f"{name}.faces", surfaces.faces, wp.vec4, (face_vectors(slots, device),), device)
 
 
 def _check_mesh(mesh: Any) -> wp.Device:

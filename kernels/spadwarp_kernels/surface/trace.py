@@ -5,6 +5,8 @@ import warp as wp
 from spadwarp_kernels.intersect.box import inverse_direction
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, TreeWalk, step_leaf, step_node
 from spadwarp_kernels.intersect.triangle import face_distance, face_in, face_normal
+from spadwarp_kernels.intersect.wide import walk_wide
+from spadwarp_kernels.math.bits import bits_of
 
 from .mesh import Surfaces
 
@@ -74,6 +76,18 @@ def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: fl
     return hit
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+    return true;
+#endif
+""")
+def _on_cpu() -> bool:
+    """Known when the kernel is compiled, so that each device has one of the two walks."""
+    ...
+
+
 @wp.func
 def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any_hit: bool) -> SurfaceHit:
     """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
@@ -93,6 +107,11 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
     walk.found = -1
     inverse = inverse_direction(u)
     shift = wp.cw_mul(x, inverse)
+    if _on_cpu():
+        wide = walk_wide(surfaces.nodes, surfaces.faces, surfaces.order, x, u, inverse, shift, max_distance, any_hit)
+        walk.nearest = wide[0]
+        walk.found = bits_of(wide[1])
+        walk.node = NO_NODE
     while walk.node != NO_NODE:
         if walk.node > NO_NODE:
             near, far = step_node(surfaces.nodes, walk, inverse, shift)

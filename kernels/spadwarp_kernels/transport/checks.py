@@ -36,7 +36,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.sensor.projection import PLAIN, Lens
 from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.surface.mesh import Surfaces, surface_choices
+from spadwarp_kernels.surface.mesh import Surfaces, check_faces, surface_choices
 from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
@@ -237,8 +237,7 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
 
 def _check_surfaces(spec: TransportSpec, model: Model) -> None:
     surfaces, device = model.surfaces, model.device
-    order = check_array("model.surfaces.order", surfaces.order, wp.int32, (None,), device)
-    faces = order.size
+    faces = check_array("model.surfaces.reflectance", surfaces.reflectance, wp.float32, (None,), device).size
     if faces == 0:
         raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
     if spec.brute_force and faces > BRUTE_FORCE_FACES:
@@ -250,8 +249,7 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
             raise ArgumentError(
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
-    check_array("model.surfaces.reflectance", surfaces.reflectance, wp.float32, (faces,), device)
-    check_array("model.surfaces.faces", surfaces.faces, wp.vec4, (3 * faces,), device)
+    check_faces("model.surfaces", surfaces, faces, device)
     check_array("model.surfaces.nodes", surfaces.nodes, wp.vec4, (None,), device)
     check_array("model.surfaces.near_depth", surfaces.near_depth, wp.float32, (None, None), device)
     if spec.pattern:
@@ -285,7 +283,7 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
         count = model.layers.start.size
         check_array("model.derivatives.waters", derivatives.waters, wp.int32, (count,), device)
     if "reflectance" in spec.derivatives:
-        count = model.surfaces.order.size
+        count = model.surfaces.reflectance.size
         check_array("model.derivatives.faces", derivatives.faces, wp.int32, (count,), device)
 
 

@@ -166,7 +166,7 @@ class SpadTracer(WorldCameras):
         config, surfaces, photons = self.config, model.surfaces, self.photons
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
-        wp.launch(_albedo_kernel, surfaces.order.size, inputs, outputs, device=self.device)
+        wp.launch(_albedo_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh)
         lane.data.tally.zero_()
         launch_transport(self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons)

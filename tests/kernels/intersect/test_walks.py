@@ -114,6 +114,26 @@ def test_our_walk_hits_what_warp_hits(builder, leaf_size, device):
         assert (distance[:, 2] >= distance[:, 1]).all()
 
 
+def test_hits_on_a_cpu_do_not_depend_on_the_tree():
+    """Bit for bit, whatever the builder and its leaves, also where ten faces lie on each other or share an edge."""
+    box = trimesh.creation.box(extents=(1, 2, 3)).subdivide().subdivide()
+    faces = np.concatenate([box.faces, *[box.faces[:20]] * 9])
+    rng = np.random.default_rng(6)
+    x = rng.uniform(-0.4, 0.4, size=(50_000, 3))
+    u = box.vertices[rng.integers(len(box.vertices), size=len(x))] - x  # at corners
+    u[::2] = rng.normal(size=u[::2].shape)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    hits = []
+    for builder, leaf_size in ((None, 1), ("sah", 4), ("median", 30)):
+        shape = trimesh.Trimesh(box.vertices, faces, process=False)
+        _kept, surfaces = mesh_and_surfaces(shape, "cpu", builder=builder, leaf_size=leaf_size)
+        face, distance = launched(_both_walks, [surfaces, x, u, 4.0], (wp.vec3i, wp.vec3))
+        hits.append(np.concatenate([face[:, 1], distance[:, 1].astype(np.float32).view(np.int32)]))
+    assert (hits[0][: len(x)] >= 0).all() and (hits[0][: len(x)] < len(box.faces)).all()
+    np.testing.assert_array_equal(hits[1], hits[0])
+    np.testing.assert_array_equal(hits[2], hits[0])
+
+
 def test_faces_that_lie_on_each_other_and_faces_without_area_are_no_trouble():
     """A leaf of any size: two hundred copies of one triangle, one of a point, one of a line."""
     corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1]], float)

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.intersect import pack_bvh
+from spadwarp_kernels.intersect.bvh import read_tree
 
 PRIVATE_LAYOUT = (
     f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/intersect/bvh.py reads "
@@ -55,12 +55,12 @@ def distances(surfaces, device, count=20_000):
 
 
 def test_the_tree_is_read_as_warp_writes_it(device):
-    """Warp's private structs: `pack_bvh` finds each face once, in boxes that hold it, whatever the builder."""
+    """Warp's private structs: `read_tree` finds each face once, in boxes that hold it, whatever the builder."""
     for constructor in ("sah", "median", "cubql", *(["lbvh"] if wp.get_device(device).is_cuda else [])):
         mesh, points = ball(device)
         mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
         try:
-            nodes, _, order = (one.numpy() for one in pack_bvh(mesh, 1.2))
+            nodes, order = (one.numpy() for one in read_tree(mesh, 1.2))
         except Exception as error:
             pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
         faces = np.where(order < 0, ~order, order)
