@@ -122,7 +122,7 @@ if __name__ == "__main__":
             continue
     else:
         skip("Mitsuba finds neither CUDA nor LLVM")
-    peer("mitransient", "pip install mitransient")
+    their_version = peer("mitransient", "pip install mitransient").__version__
     import drjit
 
     import spadwarp
@@ -155,7 +155,8 @@ if __name__ == "__main__":
         render(next(seed_of))
 
     seed_of = itertools.count(1)
-    print(f"mitransient  {variant}, {samples} paths a pixel, roulette from {roulette_from}")
+    print(f"mitransient  {their_version} on Mitsuba {mi.__version__} and Dr.Jit {drjit.__version__}, {variant}")
+    print(f"             {samples} paths a pixel, roulette from {roulette_from}")
     compare("staircase_5m", run, name="mitransient", unit="camera paths", work=samples * SIZE**2, args=args)
     if seeds == 0:
         sys.exit(0)

@@ -3,6 +3,7 @@
 from .box import segment_meets_box
 from .bvh import NO_NODE, LeafStep, TreeWalk, pack_bvh, step_leaf, step_node
 from .triangle import face_distance, face_in, face_normal
+from .wide import pack_wide, walk_wide
 
 __all__ = [
     "NO_NODE",
@@ -12,7 +13,9 @@ __all__ = [
     "face_in",
     "face_normal",
     "pack_bvh",
+    "pack_wide",
     "segment_meets_box",
     "step_leaf",
     "step_node",
+    "walk_wide",
 ]
