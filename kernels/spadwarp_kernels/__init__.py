@@ -51,11 +51,13 @@ from .phase import (
     henyey_greenstein_score,
     interpolated_density,
     make_phase_tables,
+    rayleigh_density,
     sample_henyey_greenstein,
     sphere_integral,
     two_term_henyey_greenstein_density,
 )
 from .photon import BRUTE_FORCE_FACES, Records, TransportSpec, make_records
+from .polarisation import MATRIX_POINTS, MOST_CHANNELS, Polarisation, make_polarisation, matrix_cosines
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind, make_dome_port, make_flat_port
 from .random import philox4x32, random_block, u01, u01_fine, u01_tail
 from .ray_cast import truth_along_kernel, truth_kernel
@@ -156,7 +158,9 @@ __all__ = [
     "LASER_PROFILES",
     "LEDGER_ENTRIES",
     "LEDGER_UNIT",
+    "MATRIX_POINTS",
     "MOST_BLOCK_DERIVATIVES",
+    "MOST_CHANNELS",
     "MOST_DERIVATIVES",
     "PLAIN",
     "REGULAR_TRACKING",
@@ -182,6 +186,7 @@ __all__ = [
     "Model",
     "PhaseFunction",
     "PhaseGuide",
+    "Polarisation",
     "Port",
     "PortKind",
     "Records",
@@ -232,11 +237,13 @@ __all__ = [
     "make_grid",
     "make_layers",
     "make_phase_tables",
+    "make_polarisation",
     "make_records",
     "make_shapes",
     "make_surfaces",
     "make_textures",
     "make_transport_kernel",
+    "matrix_cosines",
     "move_shapes",
     "mujoco_shapes",
     "near_depth_map",
@@ -251,6 +258,7 @@ __all__ = [
     "project",
     "project_calibrated",
     "random_block",
+    "rayleigh_density",
     "read_ledger",
     "reflectance_at",
     "reflection_images",

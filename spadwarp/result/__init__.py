@@ -1,7 +1,6 @@
 """The result of a simulation as plain data, its files, the sum of results, and truth maps from other programs."""
 
 from spadwarp.result.batch_moments import ComponentError, component_errors, dominance_warnings
-from spadwarp.result.derivatives import DerivativeTallies
 from spadwarp.result.file import (
     ResultLike,
     as_result,
@@ -15,6 +14,7 @@ from spadwarp.result.labelled import to_xarray
 from spadwarp.result.merging import Tallies, merge
 from spadwarp.result.rendered_truth import EXR_PRESETS, ExrPreset, load_truth_exr
 from spadwarp.result.result import COMPONENTS, Component, Result, Truth
+from spadwarp.result.signed_tallies import SignedTallies
 from spadwarp.result.tensors import TorchResult, TorchTruth, to_torch
 
 __all__ = [
@@ -22,10 +22,10 @@ __all__ = [
     "EXR_PRESETS",
     "Component",
     "ComponentError",
-    "DerivativeTallies",
     "ExrPreset",
     "Result",
     "ResultLike",
+    "SignedTallies",
     "Tallies",
     "TorchResult",
     "TorchTruth",

@@ -19,9 +19,10 @@ from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
 from spadwarp.result.batch_moments import moments_of
-from spadwarp.result.derivatives import DerivativeTallies
 from spadwarp.result.photon_ids import Ranges, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
+from spadwarp.result.signed_file import SIGNED_DIMENSIONS, read_signed, write_signed
+from spadwarp.result.signed_tallies import SignedTallies
 from spadwarp.scene import Scene
 from spadwarp.scene.intrinsics import camera_attributes
 
@@ -58,6 +59,7 @@ _READ_ME = (
     "squared tally. "
     "derivatives/tallies, where they were asked for: [parameter, component, height, width, bin], signed; times "
     "derivatives/unit over photons it is the derivative of the fraction with respect to the parameter. "
+    "channels/tallies, of a camera that tells polarisation: the same for each channel, the fraction that it gets. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
     "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
     "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
@@ -90,13 +92,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         if result.second_moment is not None:
             shape = (1, rows, columns, bins)
             file.create_dataset("second_moment", data=result.second_moment, chunks=shape, **packed)
-        if (found := result.derivative_tallies) is not None:
-            file.attrs["derivatives"] = list(found.names)
-            kept = {"tallies": found.tallies, "second_moment": found.second_moment}
-            for name, array in kept.items():
-                if array is not None:
-                    file.create_dataset(f"derivatives/{name}", data=array, chunks=(1, 1, rows, columns, bins), **packed)
-            file.create_dataset("derivatives/unit", data=np.array(found.units))
+        write_signed(file, "derivatives", result.derivative_tallies, chunks=(1, 1, rows, columns, bins), **packed)
+        write_signed(file, "channels", result.channel_tallies, chunks=(1, 1, rows, columns, bins), **packed)
         file.create_dataset("bin_edges", data=result.bin_edges)
         if result.scene.scan_positions > 1:
             file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)
@@ -119,6 +116,7 @@ def _coordinates(result: Result) -> dict[str, Coordinate | int | None]:
         "bin_edges": ("bin_edges", "s", "time of flight at the edges of the bins"),
         "word": (["low", "high"], "1", "64 bits of a number of 128"),
         "parameter": (list(result.derivatives), "1", "by which the histogram is differentiated"),
+        "channel": (list(result.scene.camera.tallied_channels), "1", "of the receiver of polarised light"),
         "run": len(result.photon_ranges),
         "limit": (["start", "stop"], "1", "of photon ids"),
     }
@@ -127,17 +125,7 @@ def _coordinates(result: Result) -> dict[str, Coordinate | int | None]:
 _DIMENSIONS = {
     "tallies": (("component", *PIXELS, "time"), "1", "times unit over photons: fraction of the emitted photons"),
     "second_moment": (("word", *PIXELS, "time"), "1", "sum over batches of the squared tally"),
-    "derivatives/tallies": (
-        ("parameter", "component", *PIXELS, "time"),
-        "1",
-        "times derivatives/unit over photons: derivative of the fraction of the emitted photons",
-    ),
-    "derivatives/second_moment": (
-        ("word", "parameter", *PIXELS, "time"),
-        "1",
-        "sum over batches of the squared tally of the derivative",
-    ),
-    "derivatives/unit": (("parameter",), "1", "of the tallies of each parameter"),
+    **SIGNED_DIMENSIONS,
     "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
     "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
     "requested": (("limit",), "1", "ids of the requested photons"),
@@ -173,7 +161,8 @@ def load_result(path: str | Path) -> Result:
             ledger=read_ledger(file),
             counters=file.integers("counters"),
             batch_moments=_batch_moments(file) if moments else {},
-            derivative_tallies=_derivatives(file, tallies.shape, bool(moments)),
+            derivative_tallies=read_signed(file, "derivatives", tallies.shape, bool(moments)),
+            channel_tallies=_channels(file, scene, tallies.shape, bool(moments)),
             timing=file.numbers("timing"),
             provenance=_provenance(file),
         )
@@ -249,24 +238,12 @@ def _head(file: Hdf5File) -> ResultHead:
     )
 
 
-def _derivatives(file: Hdf5File, shape: tuple[int, ...], batches: bool) -> DerivativeTallies | None:
-    """Files without derivatives, and of older versions, have none."""
-    if "derivatives" not in file:
-        return None
-    names = tuple(np.ravel(file.attribute("derivatives")).tolist())
-    count = len(names)
-    if not all(isinstance(name, str) for name in names) or len(set(names)) < count:
-        file.refuse("derivatives", "are not names of parameters")
-    units = file.array("derivatives/unit", np.float64, (count,))
-    if not all(unit > 0 and np.frexp(unit)[0] == 0.5 for unit in units):
-        file.refuse("derivatives/unit", "are not powers of two")
-    moments = (2, count, *shape[1:])
-    return DerivativeTallies(
-        names,
-        file.array("derivatives/tallies", np.int64, (count, *shape)),
-        tuple(map(float, units)),
-        file.array("derivatives/second_moment", np.uint64, moments) if batches else None,
-    )
+def _channels(file: Hdf5File, scene: Scene, shape: tuple[int, ...], batches: bool) -> SignedTallies | None:
+    found = read_signed(file, "channels", shape, batches)
+    expected = scene.camera.tallied_channels
+    if (() if found is None else found.names) != expected:
+        file.refuse("channels", f"are not {', '.join(expected) or 'none'}, those of the scene's camera")
+    return found
 
 
 def _batch_moments(file: Hdf5File) -> dict[str, int]:

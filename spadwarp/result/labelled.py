@@ -20,8 +20,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
 
     `histogram` has the dimensions (component, y, x, time); `.sum("component")` is all light, `.sel(component=
     "backscatter")` a part of it. Coordinates: time of flight [s] at the bins' centres, `path` [m] along it, pixels.
-    `derivative`, of results that have some, has the dimension parameter before these. Attributes: photons, seed,
-    partial and the scene as TOML.
+    `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
+    channel. Attributes: photons, seed, partial and the scene as TOML.
 
     Raises:
         FileError: xarray is not installed.
@@ -45,6 +45,10 @@ def to_xarray(result: Result) -> xarray.Dataset:
         slopes = np.stack([*result.derivatives.values()])
         variables["derivative"] = (("parameter", *cube), slopes, "1", "of the histogram, per unit of the parameter")
         coordinates["parameter"] = (("parameter",), list(result.derivatives), "1", "by which it is differentiated")
+    if result.channels:
+        channels = np.stack([*result.channels.values()])
+        variables["polarisation"] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
+        coordinates["channel"] = (("channel",), list(result.channels), "1", "of the receiver of polarised light")
     coordinates |= {
         "component": (("component",), list(COMPONENTS), "1", "history of the light"),
         "time": (("time",), result.bin_centres, "s", "time of flight at the centre of the bin"),

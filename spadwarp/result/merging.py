@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 from spadwarp.limits import shown
 from spadwarp.result.batch_moments import joined_moments
-from spadwarp.result.derivatives import DerivativeTallies, add_moments
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.photon_ids import Range, joined
 from spadwarp.result.result import Result, Truth, physics_of
+from spadwarp.result.signed_tallies import SignedTallies, add_moments
 
 __all__ = ["Tallies", "merge"]
 
@@ -30,20 +30,21 @@ class Tallies:
     counters: dict[str, int]
     second_moment: NDArray[np.uint64] | None = None
     batch_moments: Mapping[str, int] = field(default_factory=dict)
-    derivative_tallies: DerivativeTallies | None = None
+    derivative_tallies: SignedTallies | None = None
+    channel_tallies: SignedTallies | None = None
 
     @classmethod
     def of(cls, result: Tallies | Result) -> Tallies:
         """A copy, with arrays of its own."""
         second_moment = None if result.second_moment is None else result.second_moment.copy()
-        derivatives = None if result.derivative_tallies is None else result.derivative_tallies.copy()
+        signed = [result.derivative_tallies, result.channel_tallies]
         return cls(
             result.tallies.copy(),
             dict(result.ledger),
             dict(result.counters),
             second_moment,
             result.batch_moments,
-            derivatives,
+            *(None if found is None else found.copy() for found in signed),
         )
 
     def add(self, other: Tallies | Result) -> None:
@@ -58,9 +59,9 @@ class Tallies:
         if self.second_moment is not None:
             assert other.second_moment is not None
             add_moments(self.second_moment, other.second_moment)
-        if self.derivative_tallies is not None:
-            assert other.derivative_tallies is not None
-            self.derivative_tallies.add(other.derivative_tallies)
+        for name in ("derivative_tallies", "channel_tallies"):
+            if (signed := getattr(self, name)) is not None:
+                signed.add(getattr(other, name))
         # Older results have none, and their sum with others has none.
         known = self.batch_moments and other.batch_moments
         self.batch_moments = joined_moments(self.batch_moments, other.batch_moments) if known else {}

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.errors import ConfigError
 
-__all__ = ["IdQueue", "Range", "Ranges", "count", "joined", "shard_of", "without"]
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
+__all__ = ["IdQueue", "Range", "Ranges", "count", "joined", "photons_per_position", "shard_of", "without"]
 
 Range = tuple[int, int]
 Ranges = tuple[Range, ...]
@@ -82,3 +89,17 @@ class IdQueue:
         """Ids that are to be done again."""
         self._ranges = sorted([*self._ranges, *ranges], reverse=True)
         self.left = count(self._ranges)
+
+
+def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
+    at least."""
+    shape = (scene.camera.height, scene.camera.width)
+    if scene.scan_positions == 1:
+        return np.full(shape, float(sum(stop - start for start, stop in photon_ranges)))
+    pixels = shape[0] * shape[1]
+    position = np.arange(pixels)
+    count = np.zeros(pixels)
+    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
+        count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
+    return np.maximum(count, 1.0).reshape(shape)

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.result.batch_moments import batches_of, dominance_warnings, relative_error
-from spadwarp.result.derivatives import (
-    DerivativeTallies,
-    check_derivatives,
-    derivative_errors,
+from spadwarp.result.photon_ids import photons_per_position
+from spadwarp.result.signed_tallies import (
+    SignedTallies,
+    channel_values,
+    check_signed,
     derivative_values,
     short_names,
     standard_error,
@@ -93,6 +94,7 @@ class Result:
         batch_moments: By component, over batches of its tally summed over voxels: `…_squares` (their sum),
             `…_smallest` and `…_largest`; empty without batches, and in results of older versions.
         derivative_tallies: Of the derivatives that were asked for; None if there are none.
+        channel_tallies: Of the camera's channels but "I", which is the histogram; None if there are none.
     """
 
     scene: Scene
@@ -113,7 +115,8 @@ class Result:
     batch_moments: Mapping[str, int] = field(default_factory=dict)
     requested: tuple[int, int] = (0, 0)
     focus_distance: float | None = None
-    derivative_tallies: DerivativeTallies | None = None
+    derivative_tallies: SignedTallies | None = None
+    channel_tallies: SignedTallies | None = None
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
@@ -132,13 +135,12 @@ class Result:
                 f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed"
             )
         if self.second_moment is not None:
-            found, expected = self.second_moment, (2, *shape[1:])
-            if found.dtype != np.uint64 or found.shape != expected:
-                raise ArgumentError(f"second_moment is {found.dtype} {found.shape}; uint64 {expected} is needed")
+            moment, expected = self.second_moment, (2, *shape[1:])
+            if moment.dtype != np.uint64 or moment.shape != expected:
+                raise ArgumentError(f"second_moment is {moment.dtype} {moment.shape}; uint64 {expected} is needed")
             if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
                 raise ArgumentError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
-        if self.derivative_tallies is not None:
-            check_derivatives(self.derivative_tallies, shape, self.second_moment is not None)
+        check_signed(self, shape)
         for name in ("unit", "ledger_unit"):
             value = getattr(self, name)
             if not (value > 0 and math.frexp(value)[0] == 0.5):
@@ -214,7 +216,18 @@ class Result:
     def derivative_errors(self) -> Mapping[str, NDArray[np.float64]]:
         """Parameter → standard error of its derivative, of all components together, float64 `[H, W, T]`; raises as
         `standard_error` does."""
-        return derivative_errors(self)
+        return derivative_values(self, errors=True)
+
+    @property
+    def channels(self) -> Mapping[str, NDArray[np.float64]]:
+        """ "co" and "cross" of an analyser, or "I", "Q", "U" and "V" → what that channel of the camera gets, as
+        `derivatives`; the histogram is of light without an analyser."""
+        return channel_values(self)
+
+    @property
+    def channel_errors(self) -> Mapping[str, NDArray[np.float64]]:
+        """Channel → standard error, as `derivative_errors`."""
+        return channel_values(self, errors=True)
 
     @property
     def relative_error(self) -> float:
@@ -342,6 +355,7 @@ class Result:
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
             **({"derivatives": short_names(tuple(self.derivatives))} if self.derivatives else {}),
+            **({"channels": list(self.channels)} if self.channels else {}),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
@@ -368,20 +382,6 @@ class Result:
         import spadwarp
 
         return spadwarp.result.save_result(self, path)
-
-
-def photons_per_position(scene: Scene, photon_ranges: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
-    at least."""
-    shape = (scene.camera.height, scene.camera.width)
-    if scene.scan_positions == 1:
-        return np.full(shape, float(sum(stop - start for start, stop in photon_ranges)))
-    pixels = shape[0] * shape[1]
-    position = np.arange(pixels)
-    count = np.zeros(pixels)
-    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
-        count += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
-    return np.maximum(count, 1.0).reshape(shape)
 
 
 def physics_of(scene: Scene) -> Scene:

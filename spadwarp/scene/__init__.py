@@ -15,6 +15,7 @@ from spadwarp.scene.gate import Gate
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.layers import Layer
 from spadwarp.scene.load import parse_override
+from spadwarp.scene.matrix import Matrix, scattering_matrix
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.output import Output
 from spadwarp.scene.phase import PhaseFunction, phase_function
@@ -43,6 +44,7 @@ __all__ = [
     "Gate",
     "Laser",
     "Layer",
+    "Matrix",
     "Medium",
     "Output",
     "PhaseFunction",
@@ -71,6 +73,7 @@ __all__ = [
     "phase_function",
     "presets",
     "save_calibration",
+    "scattering_matrix",
     "spectral_lines",
     "template",
     "water_lines",

@@ -67,6 +67,14 @@ class Camera(Section):
     """lens centre in the world [m]"""
     rotation_deg: Vector = (0.0, 0.0, 0.0)
     """rotations from the world's axes about x, then the new y, then the new z [°]"""
+    polarisation: Literal["none", "analyser", "stokes"] = "none"
+    """what it tells of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
+    analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
+    """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
+    extinction_ratio: Annotated[
+        Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)], BeforeValidator(_infinite)
+    ] = math.inf
+    """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
     port: Port | None = None
     """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""
 
@@ -108,6 +116,17 @@ class Camera(Section):
                 "pixels show no direction, or two"
             )
         return self
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What a result holds of polarisation: ("co", "cross") of an analyser and of one across it, the Stokes vector
+        ("I", "Q", "U", "V"), or nothing."""
+        return {"none": (), "analyser": ("co", "cross"), "stokes": ("I", "Q", "U", "V")}[self.polarisation]
+
+    @property
+    def tallied_channels(self) -> tuple[str, ...]:
+        """Channels with tallies of their own: all but the intensity, which is the histogram."""
+        return tuple(name for name in self.channels if name != "I")
 
     @property
     def focal_pixels(self) -> tuple[float, float]:

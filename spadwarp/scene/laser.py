@@ -43,6 +43,10 @@ class Laser(Section):
     """full width at half maximum of a Gaussian spectrum about wavelength_nm [nm]; 0: one line"""
     spectrum: str | None = None
     """a measured spectrum in place of linewidth_nm: .csv file of wavelength [nm] and power per nm of any scale"""
+    polarisation: Literal["none", "linear", "right_circular", "left_circular"] = "none"
+    """of the light; right is clockwise for who looks towards the laser"""
+    polarisation_angle_deg: float = Field(0.0, ge=-180, le=180)
+    """linear: direction of the field, from the beam's right towards its down, in the image from +x towards +y [°]"""
     pulse_energy: float = Field(37.5e-9, ge=1e-30, le=1e6)
     """energy of one pulse [J]"""
     average_power: float = Field(0.0, ge=1e-30, le=1e15)

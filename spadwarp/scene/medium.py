@@ -47,9 +47,9 @@ class Medium(Water):
     `layers` it is the water before the first of them.
     """
 
-    phase_function: Literal["henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "tabulated"] = (
-        "henyey_greenstein"
-    )
+    phase_function: Literal[
+        "henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "rayleigh", "tabulated"
+    ] = "henyey_greenstein"
     """law of the scattering angle"""
     anisotropy: float = Field(0.924, gt=-1, lt=1)
     """henyey_greenstein: mean cosine g of the scattering angle"""
@@ -65,6 +65,15 @@ class Medium(Water):
     """fournier_forand: slope µ of the size distribution"""
     phase_table: str | None = None
     """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
+    scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
+    """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised"""
+    matrix_table: str | None = None
+    """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp particles` writes one
+    """
+    depolarisation_ratio: float = Field(0.039, ge=0, le=0.5)
+    """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
+    largest_polarisation: float = Field(0.66, ge=0, le=1)
+    """scaled_rayleigh: polarisation of unpolarised light that is scattered by 90°"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
@@ -106,6 +115,17 @@ class Medium(Water):
             if law != self.phase_function and (given := [name for name in needed if name not in missing]):
                 value = getattr(self, given[0])
                 raise ValueError(f"{given[0]} = {value!r} goes with phase_function = {law!r} only")
+        return self
+
+    @model_validator(mode="after")
+    def _table_of_the_matrix(self) -> Self:
+        table = self.matrix_table
+        if (self.scattering_matrix == "tabulated") != (table is not None):
+            if table is None:
+                raise ValueError("needs matrix_table with scattering_matrix = 'tabulated'")
+            raise ValueError(f"matrix_table = {table!r} goes with scattering_matrix = 'tabulated' only")
+        if table is not None and not table.lower().endswith(".csv"):
+            raise ValueError(f"matrix_table = {table!r} is not the path of a .csv file")
         return self
 
     @model_validator(mode="after")

@@ -21,5 +21,6 @@ PHASE_FIELDS = {
     "henyey_greenstein": PhaseFields(optional=("anisotropy",)),
     "two_term_henyey_greenstein": PhaseFields(needed=("g1", "g2", "alpha")),
     "fournier_forand": PhaseFields(optional=("particle_index", "junge_slope")),
+    "rayleigh": PhaseFields(optional=("depolarisation_ratio",)),
     "tabulated": PhaseFields(needed=("phase_table",)),
 }

@@ -24,6 +24,7 @@ from spadwarp.scene.detector import Detector
 from spadwarp.scene.domain import Domain
 from spadwarp.scene.gate import Gate
 from spadwarp.scene.laser import Laser
+from spadwarp.scene.matrix import check_polarisation
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
 from spadwarp.scene.output import Output
@@ -125,6 +126,12 @@ class Scene(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _light_that_can_be_polarised(self) -> Self:
+        if self.polarised:
+            check_polarisation(self.medium, self.transport, self.targets)
+        return self
+
+    @model_validator(mode="after")
     def _inside_their_ports(self) -> Self:
         through = camera_port(self)
         if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
@@ -180,6 +187,12 @@ class Scene(BaseModel):
         position, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
         moved = {"position": tuple(map(float, position)), "direction": tuple(map(float, axis)), "frame": "camera"}
         return laser.model_copy(update=moved)
+
+    @property
+    def polarised(self) -> bool:
+        """Whether light is polarised: the laser's, what water scatters, or as far as the camera can tell."""
+        chosen = (self.laser.polarisation, self.medium.scattering_matrix, self.camera.polarisation)
+        return any(one != "none" for one in chosen)
 
     @property
     def detections_per_photon(self) -> float:
@@ -339,6 +352,7 @@ def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
 # Fields with the path of a file beside `mesh` of a target: section, name, the ending that makes text a path.
 _FILE_FIELDS = (
     ("medium", "phase_table", ".csv"),
+    ("medium", "matrix_table", ".csv"),
     ("detector", "irf", ".csv"),
     ("camera", "calibration", ""),
     ("laser", "profile_image", ""),

@@ -37,6 +37,8 @@ class Target(Section):
     """reflectance of the facets of a rough specular lobe; 0 is none"""
     roughness: float = Field(0.2, ge=0.01, le=1)
     """width of that lobe: GGX parameter α"""
+    specular_index: float = Field(1.5, ge=1, le=10)
+    """phase index of its facets, by which they polarise light; polarised light alone"""
 
     @model_validator(mode="after")
     def _one_mesh(self) -> Self:

@@ -85,6 +85,8 @@ def check_blocks(scene: Scene, names: Sequence[str], blocks: Sequence[int] | Non
         return BlockParameters()
     if scene.medium.grid is None:
         raise config_error(scene, f"derivatives: {names[0]}, but the scene has no medium.grid")
+    if scene.polarised:
+        raise config_error(scene, f"derivatives: {names[0]} goes without polarised light; simulate the scene without")
     if scene.domain.reflecting:
         raise config_error(
             scene, f"derivatives: {names[0]} goes without faces that reflect; leave out domain.outside_index"

@@ -64,6 +64,8 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
     """Of the scene, by name; those without a derivative too."""
     medium = scene.medium
     everywhere = 'albedo = "lu2024" draws the scattering anew at every collision' if medium.albedo == "lu2024" else ""
+    if scene.polarised:
+        everywhere = "light is polarised, whose matrices have no derivatives; simulate the scene without polarisation"
     found: list[Parameter] = []
     in_water = everywhere or (_OF_CELLS if medium.grid is not None else "")
     for k, water in enumerate(medium.waters):

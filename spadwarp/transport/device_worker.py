@@ -13,7 +13,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.errors import DeviceError, SpadwarpError, kernel_errors
-from spadwarp.result import COMPONENTS, DerivativeTallies, Tallies
+from spadwarp.result import COMPONENTS, SignedTallies, Tallies
 from spadwarp.result.batch_moments import joined_moments, moments_of
 from spadwarp.result.merging import OVERFLOW
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, joined
@@ -33,7 +33,7 @@ class DeviceWorker:
         batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         tallies: The caller's own, to be filled.
         histogram: False: none is made, for records of photons without a camera.
-        derivatives: Names of those of the spec.
+        derivatives, channels: Names of those of the spec, which has one kind of them.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class DeviceWorker:
         tallies: Any = None,
         histogram: bool = True,
         derivatives: tuple[str, ...] = (),
+        channels: tuple[str, ...] = (),
     ) -> None:
         camera, gate = model.camera, model.gate
         self._shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
@@ -55,9 +56,8 @@ class DeviceWorker:
         self.model, self.threads, self.launch_size = model, threads, launch_size
         self._spec, self._seed, self._batch_size = spec, seed, batch_size
         with device_errors(model.device):
-            self.data = sk.make_data(
-                model, tally=None if batch_size else own, histogram=histogram, derivatives=len(derivatives)
-            )
+            signed = len(derivatives) + len(channels)
+            self.data = sk.make_data(model, tally=None if batch_size else own, histogram=histogram, derivatives=signed)
             self._batches = sk.Batches(self.data.tally, len(COMPONENTS), total=own) if batch_size else None
             gradients = self._gradients = self.data.gradients
             self._gradient_batches = None
@@ -65,7 +65,7 @@ class DeviceWorker:
                 self._gradient_batches = sk.Batches(gradients, len(COMPONENTS), signed=True)
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)
-        self._names = derivatives
+        self._names, self._channels = derivatives, channels
         self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
         self._moments: dict[str, int] = {}
 
@@ -177,20 +177,23 @@ class DeviceWorker:
                 counters,
                 second_moment,
                 dict(self._moments),
-                self._derivative_tallies(),
+                self._signed_tallies(self._names),
+                self._signed_tallies(self._channels),
             )
 
-    def _derivative_tallies(self) -> DerivativeTallies | None:
-        """The device has the parameters of a voxel side by side, the result an array for each."""
-        if self._gradients is None:
+    def _signed_tallies(self, names: tuple[str, ...]) -> SignedTallies | None:
+        """The device has the derivatives or channels of a voxel side by side, the result an array for each."""
+        if self._gradients is None or not names:
             return None
-        batches, shape = self._gradient_batches, (*self._shape, len(self._names))
+        batches, shape = self._gradient_batches, (*self._shape, len(names))
         total = self._gradients if batches is None else batches.total
         moments = None
         if batches is not None:
             moments = np.stack([np.moveaxis(half.numpy().reshape(shape[1:]), -1, 0) for half in batches.second_moment])
-        tallies = np.moveaxis(total.numpy().reshape(shape), -1, 0)
-        return DerivativeTallies(self._names, tallies, self.derivative_units, moments)
+        units = self.derivative_units
+        if names == self._channels:
+            units = tuple(1.0 / float(self.model.derivatives.scale[p]) for p in range(len(names)))
+        return SignedTallies(names, np.moveaxis(total.numpy().reshape(shape), -1, 0), units, moments)
 
     @property
     def derivative_units(self) -> tuple[float, ...]:

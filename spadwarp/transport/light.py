@@ -10,7 +10,7 @@ import numpy as np
 
 from spadwarp.device import pick_devices
 from spadwarp.result import Truth
-from spadwarp.result.result import photons_per_position
+from spadwarp.result.photon_ids import photons_per_position
 from spadwarp.scene import Scene
 from spadwarp.transport.local_workers import LocalWorkers
 from spadwarp.transport.plan import make_plan

@@ -81,6 +81,7 @@ class LocalWorkers:
             "threads": threads,
             "batch_size": plan.batch_size,
             "derivatives": plan.derivatives,
+            "channels": plan.scene.camera.tallied_channels,
         }
         self.workers = [DeviceWorker(model, spec, tallies=tallies, **settings) for model in models]
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}

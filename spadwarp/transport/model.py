@@ -25,6 +25,7 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
+from spadwarp.transport.polarisation import polarised_model
 from spadwarp.transport.tally_unit import tally_scale
 
 if TYPE_CHECKING:
@@ -103,8 +104,10 @@ def build_model(
     if derivatives:
         found = make_derivatives(scene, derivatives, mesh, scale, device, model.layers.grid)
         model = dataclasses.replace(model, derivatives=found)
+    if scene.polarised:
+        model = polarised_model(model, scene, mesh)
     if camera:
-        _check_size(scene, model, copies, len(derivatives))
+        _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
     return model
 
 
@@ -257,6 +260,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         grid=grid_tracking(scene),
         derivatives=kinds,
         blocks=by_block,
+        polarised=scene.polarised,
+        channels=len(scene.camera.tallied_channels),
     )
     return spec._replace(**choices)
 
@@ -352,21 +357,19 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _check_size(scene: Scene, model: sk.Model, copies: float, derivatives: int) -> None:
+def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> None:
     """Refuses what cannot fit before anything is computed."""
     camera, size = scene.camera, model.tally_size
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
-    if derivatives and size * derivatives >= 2**31:
-        raise config_error(
-            scene,
-            f"{shape} x {derivatives} derivatives = {size * derivatives} is outside [1, {2**31 - 1}]; fewer pixels, "
-            "bins or blocks, or fewer derivatives a run, with the same seed",
-        )
+    if signed and size * signed >= 2**31:
+        text = f"{shape} x {signed} derivatives or channels = {size * signed} is outside [1, {2**31 - 1}]"
+        way_out = "fewer pixels, bins or blocks, or fewer derivatives a run, with the same seed"
+        raise config_error(scene, f"{text}; {way_out}")
     if size >= 2**31:
         raise config_error(scene, f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]")
     cuda = model.device.is_cuda
     # On the CPU counts on the device, their copy in the result, and the total of the components.
-    needed = (8 if cuda else 16) * size * (1 + derivatives) * copies / 2**30
+    needed = (8 if cuda else 16) * size * (1 + signed) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
     if available is not None and needed > available / 2**30:
         raise DeviceError(

@@ -41,7 +41,8 @@ class ClusterWorkers:
     ) -> None:
         camera, gate = plan.scene.camera, plan.scene.gate
         histograms = len(COMPONENTS) + (2 if plan.batch_size else 0)
-        size = 8 * histograms * (1 + len(plan.derivatives)) * camera.width * camera.height * gate.bins
+        signed = len(plan.derivatives) + len(camera.tallied_channels)
+        size = 8 * histograms * (1 + signed) * camera.width * camera.height * gate.bins
         prepare = functools.partial(_prepare, plan)
         self._ray = RayWorkers(engine, device, prepare=prepare, value_bytes=size, note=note)
         self._total: Tallies | None = None

@@ -26,6 +26,7 @@ ROOMS = (
     "tally",
     "photon",
     "derivatives",
+    "polarisation",
     "estimators",
     "transport",
     "detection",

@@ -47,6 +47,7 @@ class Request:
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
         target: The pixel of a scan, else -1.
         scores: Of the photon up to x.
+        stokes: Of the photon on its way along u, see `PhotonState`.
     """
 
     wanted: bool
@@ -63,6 +64,7 @@ class Request:
     slot: int
     target: int
     scores: Scores
+    stokes: wp.vec4
 
 
 @wp.struct
@@ -79,6 +81,8 @@ class Scored:
     Attributes:
         contribution: To the tally, if nothing stands between the scored point and the lens.
         origin, lens: The scored point, and where its light leaves the water: the point of the lens, or of a port [m].
+        to_lens: Unit direction of its light there.
+        inside: Direction in which it arrives, of any length.
         seen: Whether nothing does; else a shadow ray must be traced.
         shadow_queries: Shadow rays that were traced.
     """
@@ -86,6 +90,8 @@ class Scored:
     contribution: Contribution
     origin: wp.vec3
     lens: wp.vec3
+    to_lens: wp.vec3
+    inside: wp.vec3
     seen: bool
     shadow_queries: int
 
@@ -104,6 +110,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
     reflecting, tracks, derives = spec.reflecting, spec.grid is not None, bool(spec.derivatives)
+    polarised = spec.polarised
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
@@ -128,6 +135,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.component = FORWARD_SCATTERED
                 if wp.static(derives):
                     q.scores = s.scores
+                if wp.static(polarised):
+                    q.stokes = s.stokes
                 if s.hit.face >= 0:
                     q.slot = s.hit.slot
                     if s.collisions == 1:
@@ -231,7 +240,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
+    confocal, reflecting, merged, polarised = spec.confocal, spec.reflecting, spec.merged, spec.polarised
     water_extinction = spec.water.extinction
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
@@ -275,6 +284,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             component = wp.where(wp.static(merged), BALLISTIC, request.component)
             found.contribution.value = value_of(camera, extinction, weight, scattering, link)
             found.contribution.index = tally_index(camera, gate, pixel, path + link.path, component)
+        if wp.static(polarised):
+            found.to_lens = link.to_lens
+            found.inside = found.lens - link.image
         found.lens = link.end
         return found
 

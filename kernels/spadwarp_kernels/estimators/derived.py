@@ -1,4 +1,4 @@
-"""Contributions with their scores: what an estimator brings, for a spec with derivatives."""
+"""Contributions with their scores: what an estimator brings, for a spec with derivatives or of polarised light."""
 
 import functools
 
@@ -12,6 +12,10 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.polarisation.crossing import make_crossing_stokes
+from spadwarp_kernels.polarisation.events import make_event_stokes
+from spadwarp_kernels.polarisation.receiver import make_add_channels, make_leave_water, make_receive
+from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.scan import Scan
@@ -24,8 +28,8 @@ from .contribution import Request, Scored
 
 @functools.cache
 def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Function | None:
-    """The Warp function ``(s, camera, gate, limits, layers, derivatives) -> Contribution``: `Estimator.cross`, with
-    scores."""
+    """The Warp function ``(s, camera, gate, limits, layers, derivatives, polarisation) -> Contribution``:
+    `Estimator.cross`, with scores."""
     if cross is None:
         return None
     derives, crossing_scores = bool(spec.derivatives), make_crossing_scores(spec)
@@ -33,10 +37,17 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
     in_blocks = by_block is not None
     if by_block is not None:
         fly, copy = by_block.fly, by_block.copy
+    polarised, crossing_stokes, add_channels = spec.polarised, make_crossing_stokes(spec), make_add_channels(spec)
 
     @wp.func
     def derived_cross(
-        s: PhotonState, camera: Camera, gate: Gate, limits: Limits, layers: Layers, derivatives: Derivatives
+        s: PhotonState,
+        camera: Camera,
+        gate: Gate,
+        limits: Limits,
+        layers: Layers,
+        derivatives: Derivatives,
+        polarisation: Polarisation,
     ) -> Contribution:
         c = cross(s, camera, gate, limits)
         if wp.static(derives):
@@ -46,6 +57,9 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
             if c.value > 0.0:
                 copy(derivatives.blocks)
                 fly(derivatives.blocks, 1, s.x, s.u, to_lens(camera, s.x, s.u))
+        if wp.static(polarised):
+            if c.value > 0.0:
+                c = add_channels(c, polarisation, crossing_stokes(s, camera))
         return c
 
     return derived_cross
@@ -53,8 +67,8 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
 
 @functools.cache
 def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Function | None:
-    """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan, derivatives) -> Scored``:
-    `Estimator.score`, with scores."""
+    """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation)
+    -> Scored``: `Estimator.score`, with scores."""
     if score is None:
         return None
     derives, request_scores = bool(spec.derivatives), make_request_scores(spec)
@@ -62,6 +76,8 @@ def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Fun
     in_blocks = by_block is not None
     if by_block is not None:
         fly, turn, copy = by_block.fly, by_block.turn, by_block.copy
+    polarised, event_stokes, add_channels = spec.polarised, make_event_stokes(spec), make_add_channels(spec)
+    leave_water, receive = make_leave_water(spec), make_receive(spec)
 
     @wp.func
     def derived_score(
@@ -73,6 +89,7 @@ def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Fun
         surfaces: Surfaces,
         scan: Scan,
         derivatives: Derivatives,
+        polarisation: Polarisation,
     ) -> Scored:
         found = score(request, medium, layers, camera, gate, surfaces, scan)
         if wp.static(derives):
@@ -98,6 +115,14 @@ def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Fun
                 if request.slot < 0:
                     turn(derivatives.blocks, 1, medium, layers, point)
                 fly(derivatives.blocks, 1, point, way / length, length)
+        if wp.static(polarised):
+            if found.contribution.value > 0.0:
+                stokes = event_stokes(
+                    request.stokes, polarisation, surfaces, request.slot, found.origin, request.u, found.to_lens
+                )
+                inside = wp.normalize(found.inside)
+                stokes = receive(leave_water(camera, stokes, found.lens, found.to_lens, inside), inside)
+                found.contribution = add_channels(found.contribution, polarisation, stokes)
         return found
 
     return derived_score

@@ -88,7 +88,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, derives = spec.varies and not spec.random_albedo, bool(spec.derivatives)
+    local_albedo, derives, polarised = spec.varies and not spec.random_albedo, bool(spec.derivatives), spec.polarised
 
     @wp.func
     def request_flight(s: PhotonState) -> Request:
@@ -110,6 +110,8 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.target = s.target
         if wp.static(derives):
             q.scores = s.scores
+        if wp.static(polarised):
+            q.stokes = s.stokes
         return q
 
     return request_flight, make_event_request(spec, flights=True)

@@ -8,6 +8,7 @@ from spadwarp_kernels.derivatives.history import make_flight_scores
 from spadwarp_kernels.derivatives.request import make_turn_scores
 from spadwarp_kernels.intersect.box import segment_meets_box
 from spadwarp_kernels.medium.boundary import (
+    face_index,
     flipped,
     image_direction,
     image_point,
@@ -18,6 +19,9 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, next_face, to_next_face
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
+from spadwarp_kernels.polarisation.receiver import make_add_channels, make_leave_water, make_receive
+from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import u01, u01_high, u01_low
 from spadwarp_kernels.random.splitmix import join_words
 from spadwarp_kernels.sensor.camera import Camera, lens_point
@@ -141,9 +145,54 @@ def make_leaving_scores(spec: TransportSpec) -> wp.Function:
 
 
 @functools.cache
+def make_image_stokes(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(request, x, v, length, reflections, end, inside, camera, limits, surfaces, polarisation) ->
+    vec4`` of light that the event of a request sends along v, in the domain's axes from x on, and that is reflected so
+    many times on its way to the end of the water, where it leaves for the lens along `inside`."""
+    event_stokes, reflected_stokes = make_event_stokes(spec), make_reflected_stokes()
+    leave_water, receive = make_leave_water(spec), make_receive(spec)
+    turn_back = _from_domain if spec.rotated_domain else _same
+
+    @wp.func
+    def image_stokes(
+        request: Request,
+        x: wp.vec3,
+        v: wp.vec3,
+        length: float,
+        reflections: int,
+        end: wp.vec3,
+        inside: wp.vec3,
+        camera: Camera,
+        limits: Limits,
+        surfaces: Surfaces,
+        polarisation: Polarisation,
+    ) -> wp.vec4:
+        heading = turn_back(limits, v)
+        stokes = event_stokes(request.stokes, polarisation, surfaces, request.slot, request.x, request.u, heading)
+        begin = wp.vec3(x)
+        along = wp.vec3(v)
+        rest = float(length)
+        for _k in range(reflections):
+            part = wp.min(rest, to_next_face(limits, begin, along))
+            face = next_face(limits, begin, along)
+            begin += part * along
+            rest -= part
+            if face > 0:
+                along = flipped(along, (face - 1) // 2)
+                mirrored = turn_back(limits, along)
+                stokes = reflected_stokes(stokes, heading, mirrored, face_index(limits.boundary, face))
+                heading = mirrored
+        along = wp.normalize(inside)
+        return receive(leave_water(camera, stokes, end, heading, along), along)
+
+    return image_stokes
+
+
+@functools.cache
 def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
-    """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives) ->
-    Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked for.
+    """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
+    polarisation) -> Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked
+    for.
 
     `flights`: whether requests may ask for a point of a flight, which is not scored by way of reflections: events are.
     """
@@ -152,6 +201,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
     scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
     link_to, value_of = make_link(spec)
     flight_scores, leaving_scores = make_flight_scores(spec), make_leaving_scores(spec)
+    polarised, image_stokes, add_channels = spec.polarised, make_image_stokes(spec), make_add_channels(spec)
     turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)
 
     @wp.func
@@ -166,6 +216,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
         surfaces: Surfaces,
         scan: Scan,
         derivatives: Derivatives,
+        polarisation: Polarisation,
     ) -> Scored:
         found = Scored()
         if wp.static(flights):
@@ -220,6 +271,12 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
             found.contribution.rounding_sample = u01(request.rounding_sample)
             found.contribution.value = value_of(camera, extinction, request.weight, scattering, link)
             found.contribution.index = tally_index(camera, gate, pixel, request.path + link.path, component)
+            if wp.static(polarised):
+                stokes = image_stokes(
+                    request, x, heading, link.water, reflections_of(image), link.end, lens - link.image, camera,
+                    limits, surfaces, polarisation
+                )  # fmt: skip
+                found.contribution = add_channels(found.contribution, polarisation, stokes)
         return found
 
     return score_image
@@ -236,11 +293,11 @@ class MirroredScores:
 
 @functools.cache
 def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
-    """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives, tally,
-    gradients, ledger, pending_add, thread, scale) -> MirroredScores`` that scores an event by way of all images;
-    arguments as of `make_score_image`."""
+    """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
+    polarisation, tally, gradients, ledger, pending_add, thread, scale) -> MirroredScores`` that scores an event by way
+    of all images; arguments as of `make_score_image`."""
     score_image = make_score_image(spec, flights, brute_force)
-    deposit = make_deposit(len(spec.derivatives))
+    deposit = make_deposit(spec.signed)
 
     @wp.func
     def score_images(
@@ -253,6 +310,7 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         surfaces: Surfaces,
         scan: Scan,
         derivatives: Derivatives,
+        polarisation: Polarisation,
         tally: wp.array(dtype=wp.int64),
         gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
@@ -264,7 +322,9 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         scores.pending_add = pending_add
         if request.wanted:
             for number in range(limits.boundary.images.shape[0]):
-                found = score_image(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives)
+                found = score_image(
+                    request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives, polarisation
+                )
                 scores.shadow_queries += found.shadow_queries
                 if not found.contribution.value <= 0.0:  # NaN is counted as such
                     scores.contributions += 1

@@ -14,13 +14,16 @@ _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
 
 
 @functools.cache
-def make_queue(flights: bool, used: bool, derivatives: int = 0) -> tuple[wp.Function, wp.Function]:
+def make_queue(
+    flights: bool, used: bool, derivatives: int = 0, polarised: bool = False
+) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(index, size) -> Request``, for any lane.
 
     Args:
         flights: Whether requests have an interval and a point of the lens.
         used: Whether there is a queue at all; else `push` does nothing.
         derivatives: How many scores requests have.
+        polarised: Whether they have a Stokes vector.
     """
     score_vectors = -(-derivatives // 4)
 
@@ -49,6 +52,8 @@ def make_queue(flights: bool, used: bool, derivatives: int = 0) -> tuple[wp.Func
             a = request.scores
             part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
             queue_scores(True, entry + i * QUEUE_ENTRIES, part)
+        if wp.static(polarised):
+            queue_scores(True, entry, request.stokes)  # which goes without derivatives
 
     @wp.func
     def push(request: Request):
@@ -83,6 +88,8 @@ def make_queue(flights: bool, used: bool, derivatives: int = 0) -> tuple[wp.Func
             part = queue_scores(False, entry + i * QUEUE_ENTRIES, wp.vec4())
             for k in range(4):
                 request.scores[4 * i + k] = part[k]
+        if wp.static(polarised):
+            request.stokes = queue_scores(False, entry, wp.vec4())
         return request
 
     return push, pop

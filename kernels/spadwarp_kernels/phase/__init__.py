@@ -4,6 +4,7 @@ from .densities import (
     fournier_forand_density,
     henyey_greenstein_density,
     interpolated_density,
+    rayleigh_density,
     sphere_integral,
     two_term_henyey_greenstein_density,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "henyey_greenstein_score",
     "interpolated_density",
     "make_phase_tables",
+    "rayleigh_density",
     "sample_henyey_greenstein",
     "sphere_integral",
     "two_term_henyey_greenstein_density",

@@ -23,6 +23,14 @@ def two_term_henyey_greenstein_density(t: ArrayLike, g1: float, g2: float, alpha
     return alpha * henyey_greenstein_density(t, g1) + (1.0 - alpha) * henyey_greenstein_density(t, g2)
 
 
+def rayleigh_density(t: ArrayLike, depolarisation_ratio: float = 0.0) -> Floats:
+    """Molecules: 1 + cos^2(theta)(1 - r)/(1 + r), r in [0, 1] the depolarisation ratio of unpolarised light that is
+    scattered by 90 degrees (Hansen & Travis, Space Sci. Rev. 16, 527 (1974), eq 2.15)."""
+    check_number("depolarisation_ratio", depolarisation_ratio, "[0, 1]")
+    part = (1.0 - depolarisation_ratio) / (1.0 + depolarisation_ratio)
+    return (1.0 + part * (1.0 - check_numbers("t", t)) ** 2) / (4.0 * np.pi * (1.0 + part / 3.0))
+
+
 def fournier_forand_density(t: ArrayLike, particle_index: float, junge_slope: float) -> Floats:
     """Fournier & Forand (1994) as in Fournier & Jonasz, Proc. SPIE 3761, 62 (1999); infinite at t = 0.
 

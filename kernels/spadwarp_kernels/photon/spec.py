@@ -46,6 +46,10 @@ class TransportSpec(NamedTuple):
             described in `Model.derivatives`; at most MOST_DERIVATIVES.
         blocks: Kinds of the coefficients of a grid's cells by which it is differentiated block by block, each one of
             BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`.
+        polarised: Photons carry a Stokes vector, and scores are of the light that it stands for, see
+            `Model.polarisation`.
+        channels: What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a
+            tally of its own.
     """
 
     estimator: str = "next_event"
@@ -72,6 +76,13 @@ class TransportSpec(NamedTuple):
     grid: Water | None = None
     derivatives: tuple[str, ...] = ()
     blocks: tuple[str, ...] = ()
+    polarised: bool = False
+    channels: int = 0
+
+    @property
+    def signed(self) -> int:
+        """Tallies of a voxel that have signs, beside the histogram's: of derivatives or of channels."""
+        return len(self.derivatives) + self.channels
 
     @property
     def water(self) -> Water:

@@ -149,6 +149,8 @@ class PhotonState:
         reason: Ledger entry of the history's end; -1 after an event that is not the last.
         bounces: Reflections by faces of the domain, which `collisions` counts too.
         scores: Of the flights and events so far; 0 without derivatives.
+        stokes: Of its light, of weight 1 when it was emitted, with respect to `orthonormal_basis(u)`; left alone unless
+            it is polarised.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.
@@ -178,6 +180,7 @@ class PhotonState:
     reason: int
     bounces: Bounces
     scores: Scores
+    stokes: wp.vec4
     target: int
     view: wp.vec4
     # Its next event:

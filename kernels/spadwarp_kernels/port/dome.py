@@ -28,19 +28,31 @@ def _chord(r: float, b: float) -> float:
 
 
 @wp.func
-def _transmission(port: Port, p: float) -> float:
-    """That of a ray of index times distance p [m]."""
+def _cosines(port: Port, p: float) -> wp.vec4:
+    """Index times cosine at the interfaces, of a ray of index times distance p [m]."""
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
     b = p / n[1]
-    q = wp.vec4(
+    return wp.vec4(
         n[0] * _chord(inner, p / n[0]) / inner,
         n[1] * _chord(inner, b) / inner,
         n[1] * _chord(outer, b) / outer,
         n[2] * _chord(outer, p / n[2]) / outer,
     )
-    return transmission(wp.vec4(n[0], n[1], n[1], n[2]), q)
+
+
+@wp.func
+def cosines_dome(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
+    """Index times cosine at the interfaces of the ray through x in the water along u."""
+    return _cosines(port, port.index[2] * wp.length(wp.cross(x - port.centre, u)))
+
+
+@wp.func
+def _transmission(port: Port, p: float) -> float:
+    """That of a ray of index times distance p [m]."""
+    n = port.index
+    return transmission(wp.vec4(n[0], n[1], n[1], n[2]), _cosines(port, p))
 
 
 @wp.func

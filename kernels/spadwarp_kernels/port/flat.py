@@ -142,3 +142,14 @@ def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
     p.path = port.delay[0] * length + port.delay[1] * glass * n[1]
     p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(n[0] * cosine, q1, q1, q2))
     return p
+
+
+@wp.func
+def cosines_flat(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
+    """Index times cosine at the interfaces of the ray through x in the water along u."""
+    n = port.index
+    across = n[2] * wp.cross(u, port.normal)
+    k2 = wp.dot(across, across)
+    q0 = wp.sqrt(wp.max(n[0] * n[0] - k2, 0.0))
+    q1 = wp.sqrt(wp.max(n[1] * n[1] - k2, 0.0))
+    return wp.vec4(q0, q1, q1, n[2] * wp.abs(wp.dot(u, port.normal)))

@@ -9,8 +9,8 @@ import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_number, check_vector
 
-from .dome import apparent_centre_dome, apparent_dome, connect_dome, enter_dome, leave_dome
-from .flat import apparent_centre_flat, apparent_flat, connect_flat, enter_flat, leave_flat
+from .dome import apparent_centre_dome, apparent_dome, connect_dome, cosines_dome, enter_dome, leave_dome
+from .flat import apparent_centre_flat, apparent_flat, connect_flat, cosines_flat, enter_flat, leave_flat
 from .port import Port
 
 # Stands for no bound.
@@ -27,6 +27,8 @@ class PortKind(NamedTuple):
         apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
         leave: Warp function (port, x, u) -> Passage of a ray from the water to the plane z = 0 inside.
         enter: Warp function (port, x, u) -> Passage of a ray from inside into the water.
+        cosines: Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces,
+            in the order of `transmission`, of the ray through x in the water along u, on its way in or out.
     """
 
     name: str
@@ -35,12 +37,13 @@ class PortKind(NamedTuple):
     apparent_centre: wp.Function
     leave: wp.Function
     enter: wp.Function
+    cosines: wp.Function
 
 
-FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat)
+FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat, cosines_flat)
 """A plane window, or a calm surface without one."""
 
-DOME_PORT = PortKind("dome", connect_dome, apparent_dome, apparent_centre_dome, leave_dome, enter_dome)
+DOME_PORT = PortKind("dome", connect_dome, apparent_dome, apparent_centre_dome, leave_dome, enter_dome, cosines_dome)
 """A spherical window."""
 
 

@@ -25,7 +25,7 @@ MOST_DERIVATIVES = len(Scores())
 
 @wp.struct
 class Derivatives:
-    """The parameters of a spec with derivatives, in its order; made by `make_derivatives`.
+    """The parameters of a spec with derivatives, in its order, or of its channels; made by `make_derivatives`.
 
     Attributes:
         value: Of each parameter.
@@ -47,27 +47,35 @@ def make_derivatives(
     value: Sequence[float],
     scale: Sequence[float],
     *,
+    channels: int = 0,
     waters: Sequence[int] = (),
     faces: Any = (),
     blocks: Any = None,
     device: wp.DeviceLike = None,
 ) -> Derivatives:
-    """The parameters of a spec whose `derivatives` are `kinds`; see `Derivatives` for the others.
+    """The parameters of a spec whose `derivatives` are `kinds`; see `Derivatives` for the others. Of one with
+    `channels` so many, which have scales alone.
 
     `blocks`: from `make_blocks`, of a spec with blocks; without them, one kind at least. Raises `ArgumentError` for a
     kind that is not one of DERIVATIVES, or a number out of range.
     """
+    channels = check_integer("channels", channels, 0, MOST_DERIVATIVES)
+    device, count = check_device("device", device), check_integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
     least = 1 if blocks is None else 0
-    device, count = check_device("device", device), check_integer("derivatives", len(kinds), least, MOST_DERIVATIVES)
-    if not len(value) == len(scale) == count:
-        raise ArgumentError(f"{count} derivatives, {len(value)} values, {len(scale)} scales; one each are needed")
+    tallies = check_integer("derivatives and channels", count + channels, least, MOST_DERIVATIVES)
+    if len(value) != count or len(scale) != tallies:
+        raise ArgumentError(
+            f"{count} derivatives, {channels} channels, {len(value)} values, {len(scale)} scales: each needs a scale, "
+            "derivatives a value"
+        )
     for p, kind in enumerate(kinds):
         check_choice(f"kinds[{p}]", kind, DERIVATIVES)
         check_number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
-        check_number(f"scale[{p}]", scale[p], "(0, inf)")
+    for p, one in enumerate(scale):
+        check_number(f"scale[{p}]", one, "(0, inf)")
     derivatives = Derivatives()
-    rest = [0.0] * (MOST_DERIVATIVES - count)
-    derivatives.value, derivatives.scale = Scores(*value, *rest), Scores(*scale, *rest)
+    derivatives.value = Scores(*value, *[0.0] * (MOST_DERIVATIVES - count))
+    derivatives.scale = Scores(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     derivatives.waters = wp.array(waters, dtype=int, device=device, shape=len(waters))
     derivatives.faces = wp.array(faces, dtype=int, device=device, shape=len(faces))
     if blocks is not None:

@@ -29,6 +29,7 @@ from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.phase.tabulated import TABULATED
 from spadwarp_kernels.photon.records import Records
 from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
+from spadwarp_kernels.polarisation.request import MATRIX_POINTS, MOST_CHANNELS, Polarisation
 from spadwarp_kernels.port.kinds import PortKind, check_port
 from spadwarp_kernels.random.density_tables import TABLE_CELLS
 from spadwarp_kernels.sensor.camera import Camera, check_camera
@@ -57,6 +58,7 @@ _STRUCTS = {
     "layers": Layers,
     "scan": Scan,
     "derivatives": Derivatives,
+    "polarisation": Polarisation,
 }
 _MEDIUM = {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
 _GUIDING = {
@@ -92,9 +94,14 @@ def check_spec(spec: Any) -> None:
         raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
     if spec.reflecting and not spec.bounded:
         raise ArgumentError("spec.reflecting = True needs spec.bounded = True")
-    if spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.derivatives):
-        raise ArgumentError("spec.merged goes with guided and next_event, without spec.reflecting and spec.derivatives")
+    if spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.signed):
+        raise ArgumentError(
+            "spec.merged goes with guided and next_event, without spec.reflecting, spec.derivatives and spec.channels"
+        )
     _check_kinds(spec)
+    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
+    if spec.polarised and (spec.derivatives or spec.blocks):
+        raise ArgumentError("spec.polarised goes without spec.derivatives and spec.blocks")
 
 
 def _check_kinds(spec: TransportSpec) -> None:
@@ -157,6 +164,8 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
         _check_scan(model, estimator)
     if spec.derivatives or spec.blocks:
         _check_derivatives(spec, model)
+    if spec.polarised:
+        _check_polarisation(spec, model)
     _check_data(spec, model, data, estimator, photon_count)
 
 
@@ -287,6 +296,23 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
         check_array("model.derivatives.faces", derivatives.faces, wp.int32, (count,), device)
 
 
+def _check_polarisation(spec: TransportSpec, model: Model) -> None:
+    polarisation, device = model.polarisation, model.device
+    if model.medium.axis_threshold < 1.0:
+        raise ArgumentError(
+            f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without the "
+            "near-axis rule, which has no plane of scattering"
+        )
+    points = check_array("model.polarisation.first", polarisation.first, wp.vec4, (None,), device).size
+    check_integer("points of model.polarisation.first", points, MATRIX_POINTS, MATRIX_POINTS)
+    check_array("model.polarisation.last", polarisation.last, wp.float32, (points,), device)
+    for k in range(spec.channels):
+        check_number(f"model.derivatives.scale[{k}]", model.derivatives.scale[k], "(0, inf)")
+    if spec.specular:
+        count = model.surfaces.order.size
+        check_array("model.polarisation.facet_index", polarisation.facet_index, wp.float32, (count,), device)
+
+
 def _check_scan(model: Model, estimator: Estimator) -> None:
     scan, camera = model.scan, model.camera
     most = camera.width * camera.height if estimator.scores else 2**31 - 1
@@ -301,9 +327,9 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
     bins = model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
     size = check_integer("bins of the tally", bins, 1) if estimator.scores else None
     check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
-    derivatives = len(spec.derivatives) + len(spec.blocks) * model.derivatives.blocks.count
-    if derivatives and size is not None:
-        size = check_integer("bins of data.gradients", size * derivatives, 1)
+    signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count
+    if signed and size is not None:
+        size = check_integer("bins of data.gradients", size * signed, 1)
         check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)

@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.photon.lanes import exchange
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, reweigh
 from spadwarp_kernels.port.kinds import PortKind
@@ -78,6 +79,21 @@ def make_emit(spec: TransportSpec) -> wp.Function:
         return wp.spatial_vector(start, heading)
 
     return emit
+
+
+@functools.cache
+def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
+    """The Warp function ``(laser, scan, seed, id, entry) -> spatial_vector`` of a photon: on CUDA the one that a lane
+    of the warp has put at an entry, see `exchange`."""
+    emit = make_emit(spec)
+
+    @wp.func
+    def take_emitted(laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64, entry: int) -> wp.spatial_vector:
+        if wp.static(cuda):
+            return exchange(False, entry, wp.spatial_vector())
+        return emit(laser, scan, seed, id)
+
+    return take_emitted
 
 
 @functools.cache

@@ -53,6 +53,8 @@ from spadwarp_kernels.photon.state import (
     shorten,
     sum_bounces,
 )
+from spadwarp_kernels.polarisation.emission import make_first_stokes
+from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import RoundKeys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -66,7 +68,7 @@ from spadwarp_kernels.tally.tally import TOO_LONG
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
-from .emit import make_emit, make_enter, make_first_photon
+from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
 from .flight import draw_albedo, make_fly
 from .scatter import make_flies, make_scatter
@@ -106,14 +108,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     in_blocks = bool(spec.blocks)
     queues = scores and cuda and not has_bvh and not in_blocks  # scores of blocks stay with the thread
     ray_lanes = RAY_LANES if has_bvh else 32
-    emit, enter = make_emit(spec), make_enter(spec.laser_port)
+    emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
-    push, pop = make_queue(flights, queues, len(spec.derivatives))
-    deposit = make_deposit(len(spec.derivatives), len(spec.blocks))
-    begin_history, fly_history = make_begin_history(spec), make_fly_history(spec)
+    push, pop = make_queue(flights, queues, len(spec.derivatives), spec.polarised)
+    deposit = make_deposit(spec.signed, len(spec.blocks))
+    begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
     score_images = make_score_images(spec, flights, brute_force)
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
@@ -136,6 +138,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         surfaces: Surfaces,
         scan: Scan,
         derivatives: Derivatives,
+        polarisation: Polarisation,
         # Photons:
         seed: wp.uint64,
         keys: RoundKeys,
@@ -197,7 +200,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.flight.interval = wp.vec2(0.0, 0.0)
                     if round == 1 and arrives(s):
                         if wp.static(crosses):
-                            crossing = cross(s, camera, gate, limits, layers, derivatives)
+                            crossing = cross(s, camera, gate, limits, layers, derivatives, polarisation)
                             if wp.static(reflecting):
                                 s.bounces.dropped += wp.where(crossing.index == TOO_LONG, 1, 0)
                             if not crossing.value <= 0.0:
@@ -234,7 +237,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 first = wp.max(queued - 32, 0)
                                 asked.request = pop(first + lane, queued)
                                 queued = queue_size(SET_SIZE, first)
-                            found = score(asked.request, medium, layers, camera, gate, surfaces, scan, derivatives)
+                            found = score(
+                                asked.request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation
+                            )
                             if asked.request.wanted and not found.contribution.value <= 0.0:  # NaN is counted as such
                                 s.contributions += 1
                                 found = look(found, camera, surfaces)
@@ -253,8 +258,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(reflecting):
                                 more = score_images(
                                     asked.request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
-                                    tally, gradients, ledger, s.pending_add, thread, scale
-                                )  # fmt: skip
+                                    polarisation, tally, gradients, ledger, s.pending_add, thread, scale)  # fmt: skip
                                 s.contributions += more.contributions
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
@@ -262,14 +266,14 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
                     id = base + wp.uint64(s.photon)
-                    new = scatter(
-                        s, medium, layers, camera, limits, surfaces, guiding, derivatives, keys, id, ledger, thread
-                    )
+                    new = scatter(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
+                                  keys, id, ledger, thread)  # fmt: skip
                     s.u = new.u
                     s.weight = new.weight
                     s.analog_weight = new.analog_weight
                     s.surface_count = new.surface_count
                     s.scores = new.scores
+                    s.stokes = new.stokes
                     s.absorbed_surface += new.absorbed_surface
                     s.directed += new.directed
                     s.reason = new.reason
@@ -303,10 +307,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(confocal):
                                 s.target = int(id % wp.uint64(scan.count))
                                 s.view = scan.view[s.target]
-                            if wp.static(cuda):
-                                start = enter(laser, exchange(False, entry, wp.spatial_vector()), s, ledger, thread)
-                            else:
-                                start = enter(laser, emit(laser, scan, seed, id), s, ledger, thread)
+                            emitted = take_emitted(laser, scan, seed, id, entry)
+                            start = enter(laser, emitted, s, ledger, thread)
                             s.x = start.x
                             s.u = start.u
                             s.weight = start.weight
@@ -315,6 +317,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.collisions = 0
                             s.surface_count = 0
                             s.scores = begin_history(derivatives)
+                            s.stokes = first_stokes(polarisation, laser, scan, s.target, emitted, s.x, s.u)
 
                 if wp.static(has_bvh):
                     waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)

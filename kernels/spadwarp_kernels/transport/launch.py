@@ -12,6 +12,7 @@ from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.records import Records, make_records
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import round_keys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -47,7 +48,8 @@ class Model:
         scale: Tally units per emitted photon.
         layers: Of a layered spec, from `make_layers`; empty otherwise.
         scan: Raster of a confocal spec; empty otherwise.
-        derivatives: The parameters of a spec with derivatives, from `make_derivatives`.
+        derivatives: The parameters of a spec with derivatives or channels, from `make_derivatives`.
+        polarisation: Those of a polarised spec, from `make_polarisation`.
 
     Raises:
         ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
@@ -66,6 +68,7 @@ class Model:
     layers: Layers = field(default_factory=Layers)
     scan: Scan = field(default_factory=Scan)
     derivatives: Derivatives = field(default_factory=Derivatives)
+    polarisation: Polarisation = field(default_factory=Polarisation)
 
     def __post_init__(self) -> None:
         check_model(self)
@@ -88,7 +91,8 @@ class Data:
             stream.
         offset: uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on.
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
-        gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives; None without them.
+        gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
+            without them.
     """
 
     tally: wp.array
@@ -189,6 +193,7 @@ def launch_transport(
             model.surfaces,
             model.scan,
             derivatives,
+            model.polarisation,
             seed,
             round_keys(seed),
             first_id,

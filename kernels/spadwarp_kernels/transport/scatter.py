@@ -15,6 +15,8 @@ from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight, reweigh
+from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
+from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
@@ -44,7 +46,7 @@ class Scattering:
         surface_count: Events at surfaces so far.
         absorbed_surface, directed: For the ledger, in its units.
         reason: Ledger entry that ends the history here, or after the flight of its last event's light; else -1.
-        scores: See `PhotonState`.
+        scores, stokes: See `PhotonState`.
     """
 
     u: wp.vec3
@@ -55,6 +57,7 @@ class Scattering:
     directed: wp.int64
     reason: int
     scores: Scores
+    stokes: wp.vec4
 
 
 @functools.cache
@@ -176,6 +179,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     `directed`: weight and analog weight differ; `flies_on`: see `make_flies`.
     """
     rotated, terminate, flies = spec.rotated_domain, make_terminate(spec), make_flies(flies_on)
+    polarised, reflected_stokes = spec.polarised, make_reflected_stokes()
 
     @wp.func
     def bounce(
@@ -195,6 +199,8 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         new.weight = reweigh(s.weight, part)
         new.surface_count = s.surface_count
         new.scores = s.scores
+        if wp.static(polarised):
+            new.stokes = reflected_stokes(s.stokes, s.u, u, face_index(limits.boundary, face))
         new.reason = s.reason
         # The light of an event that was the last is accounted for by what has ended the history.
         add_to_ledger(ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason), new.weight.taken)
@@ -210,8 +216,8 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
 
 @functools.cache
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
-    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, keys, id, ledger, thread)
-    -> Scattering``.
+    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation, keys,
+    id, ledger, thread) -> Scattering``.
 
     `flies_on`: see `make_flies`.
     """
@@ -223,6 +229,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     in_blocks = by_block is not None
     if by_block is not None:
         turn_in_block = by_block.turn
+    polarised, event_stokes = spec.polarised, make_event_stokes(spec)
 
     @wp.func
     def scatter(
@@ -234,6 +241,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         surfaces: Surfaces,
         guiding: Guiding,
         derivatives: Derivatives,
+        polarisation: Polarisation,
         keys: RoundKeys,
         id: wp.uint64,
         ledger: wp.array(dtype=wp.int64),
@@ -277,6 +285,9 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         if wp.static(in_blocks):
             if not on_surface:
                 turn_in_block(derivatives.blocks, 0, medium, layers, s.x)
+        if wp.static(polarised):
+            slot = wp.where(on_surface, s.hit.slot, -1)
+            new.stokes = event_stokes(s.stokes, polarisation, surfaces, slot, s.x, s.u, new.u)
         if wp.static(directed):
             new.weight = reweigh(new.weight, heading.factor)
             new.directed = new.weight.taken

@@ -1,4 +1,4 @@
-"""Derivatives of a result's histogram with respect to the water and the targets, in fixed point with a sign."""
+"""Tallies with a sign beside a result's histogram: its derivatives, and channels of a receiver of polarised light."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
-__all__ = ["DerivativeTallies", "check_derivatives", "derivative_errors", "derivative_values", "short_names"]
+__all__ = ["SignedTallies", "channel_values", "check_signed", "derivative_values", "short_names"]
 
 
 @dataclass(frozen=True, eq=False)
-class DerivativeTallies:
-    """Tallies of the derivatives of a histogram.
+class SignedTallies:
+    """Tallies of the derivatives of a histogram, or of channels.
 
     Attributes:
-        names: Of the P parameters, such as "medium.absorption".
-        tallies: int64 `[P, 3, H, W, T]`, by component; derivative = tally · unit / photons.
-        units: Of each parameter's tallies: fraction of one emitted photon per unit of the parameter, a power of two.
+        names: Of the P parameters, such as "medium.absorption", or channels, such as "cross".
+        tallies: int64 `[P, 3, H, W, T]`, by component; derivative or channel = tally · unit / photons.
+        units: Fraction of one emitted photon, per unit of the parameter, that a tally unit stands for; powers of two.
         second_moment: uint64 `[2, P, H, W, T]`, as `Result.second_moment`; None without batches.
     """
 
@@ -34,18 +34,20 @@ class DerivativeTallies:
     units: tuple[float, ...]
     second_moment: NDArray[np.uint64] | None = None
 
-    def copy(self) -> DerivativeTallies:
+    def copy(self) -> SignedTallies:
         """With arrays of its own."""
         moments = None if self.second_moment is None else self.second_moment.copy()
         return replace(self, tallies=self.tallies.copy(), second_moment=moments)
 
-    def add(self, other: DerivativeTallies) -> None:
+    def add(self, other: SignedTallies) -> None:
         """Adds those of other photons. Raises `ConfigError` where they are of other parameters."""
         if (self.names, self.units) != (other.names, other.units):
-            raise ConfigError(f"the results have derivatives by {_listed(self.names)} and by {_listed(other.names)}")
+            raise ConfigError(f"the results have tallies of {_listed(self.names)} and of {_listed(other.names)}")
         self.tallies[...] += other.tallies
         if np.abs(self.tallies.sum(axis=1, dtype=np.float64)).max(initial=0.0) >= 2.0**62:
-            raise SpadwarpError("a bin of a derivative overflowed; run fewer photons at a time and average the results")
+            raise SpadwarpError(
+                "a bin of a derivative or a channel overflowed; run fewer photons at a time and average the results"
+            )
         if self.second_moment is not None and other.second_moment is not None:
             add_moments(self.second_moment, other.second_moment)
 
@@ -62,48 +64,59 @@ def add_moments(total: NDArray[np.uint64], more: NDArray[np.uint64]) -> None:
     high += low < more[0]  # the carry
 
 
-def check_derivatives(found: DerivativeTallies, shape: tuple[int, ...], batches: bool) -> None:
-    """Raises `ArgumentError` where the arrays are not those of a result with tallies of a shape."""
+def check_signed(result: Result, shape: tuple[int, ...]) -> None:
+    """Raises `ArgumentError` where signed tallies of a result are not those of its scene, beside tallies of a shape."""
+    channels = () if result.channel_tallies is None else result.channel_tallies.names
+    expected = result.scene.camera.tallied_channels
+    if channels != expected:
+        raise ArgumentError(f"channel_tallies are of {channels}; {expected} are the camera's")
+    for name in ("derivative_tallies", "channel_tallies"):
+        found: SignedTallies | None = getattr(result, name)
+        if found is not None:
+            _check_arrays(name, found, shape, result.second_moment is not None)
+
+
+def _check_arrays(name: str, found: SignedTallies, shape: tuple[int, ...], batches: bool) -> None:
     count = len(found.names)
     expected = (count, *shape)
     if found.tallies.dtype != np.int64 or found.tallies.shape != expected or len(found.units) != count:
         found_as = f"{found.tallies.dtype} {found.tallies.shape} with {len(found.units)} units"
-        raise ArgumentError(f"derivative_tallies are {found_as}; int64 {expected} with {count} units are needed")
+        raise ArgumentError(f"{name} are {found_as}; int64 {expected} with {count} units are needed")
     moments = (2, count, *shape[1:])
     if (found.second_moment is not None) != batches:
-        raise ArgumentError("derivative_tallies and tallies: both have a second moment, or none of them")
+        raise ArgumentError(f"{name} and tallies: both have a second moment, or none of them")
     if found.second_moment is not None and (found.second_moment.dtype, found.second_moment.shape) != (
         np.uint64,
         moments,
     ):
-        raise ArgumentError(f"derivative_tallies.second_moment is not uint64 {moments}")
+        raise ArgumentError(f"{name}.second_moment is not uint64 {moments}")
 
 
 _BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
 
 
 class _Values(Mapping[str, NDArray[np.float64]]):
-    """Parameter → array, made from integers when it is asked for; the name without a block stands for all of them,
-    `[x, y, z, ...]`."""
+    """Name → array, made from integers when it is asked for; that of a derivative without its block stands for all of
+    them, `[x, y, z, ...]`."""
 
-    def __init__(self, result: Result, errors: bool) -> None:
-        self._result, self._errors = result, errors
+    def __init__(self, result: Result, found: SignedTallies | None, names: tuple[str, ...], errors: bool) -> None:
+        self._result, self._found, self._names, self._errors = result, found, names, errors
 
     def __iter__(self) -> Iterator[str]:
-        found = self._result.derivative_tallies
-        return iter(() if found is None else found.names)
+        return iter(self._names)
 
     def __len__(self) -> int:
-        found = self._result.derivative_tallies
-        return 0 if found is None else len(found.names)
+        return len(self._names)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
-        result, found = self._result, self._result.derivative_tallies
+        result, found = self._result, self._found
         if found is not None and (places := _places(found.names, name)):
             blocks = np.stack([self[f"{name}[{i},{j},{k}]"] for i, j, k in places])
             return blocks.reshape(*_shape(places), *blocks.shape[1:])
-        if found is None or name not in found.names:
-            raise KeyError(f"{name!r} is not one of the derivatives: {', '.join(self) or 'none were asked for'}")
+        if name not in self._names:
+            raise KeyError(f"{name!r} is not one of {', '.join(self) or 'those of the result, which has none'}")
+        if found is None or name not in found.names:  # the intensity, which is the histogram
+            return result.standard_error if self._errors else result.tallies * result.tally_value[..., None]
         p = found.names.index(name)
         value = (found.units[p] / result.unit * result.tally_value)[..., None]
         if not self._errors:
@@ -139,14 +152,15 @@ def _places(names: tuple[str, ...], name: str) -> list[tuple[int, int, int]]:
     return [(int(match[1]), int(match[2]), int(match[3])) for match in behind if match is not None]
 
 
-def derivative_values(result: Result) -> Mapping[str, NDArray[np.float64]]:
-    """Parameter → float64 `[3, H, W, T]`."""
-    return _Values(result, errors=False)
+def derivative_values(result: Result, *, errors: bool = False) -> Mapping[str, NDArray[np.float64]]:
+    """Parameter → float64 `[3, H, W, T]`, or standard error of the sum over components, `[H, W, T]`."""
+    found = result.derivative_tallies
+    return _Values(result, found, () if found is None else found.names, errors)
 
 
-def derivative_errors(result: Result) -> Mapping[str, NDArray[np.float64]]:
-    """Parameter → standard error of the sum over components, float64 `[H, W, T]`."""
-    return _Values(result, errors=True)
+def channel_values(result: Result, *, errors: bool = False) -> Mapping[str, NDArray[np.float64]]:
+    """Channel of the receiver → as `derivative_values`."""
+    return _Values(result, result.channel_tallies, result.scene.camera.channels, errors)
 
 
 def standard_error(tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int) -> NDArray[np.float64]:
