@@ -70,6 +70,7 @@ def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str
             "returns": f"in {summary['pixels_with_return']} pixels, {summary['detections_per_pulse']:.4g} detections a "
             "pulse",
             **({"derivatives": "by " + ", ".join(summary["derivatives"])} if "derivatives" in summary else {}),
+            **({"channels": ", ".join(summary["channels"])} if "channels" in summary else {}),
         },
         "Collected, as fractions of the emitted light": collected,
         f"Energy balance, {'exact' if ledger['exact'] else 'off by ' + str(ledger['difference']) + ' units'}": {

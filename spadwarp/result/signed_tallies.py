@@ -99,8 +99,10 @@ class _Values(Mapping[str, NDArray[np.float64]]):
     """Name → array, made from integers when it is asked for; that of a derivative without its block stands for all of
     them, `[x, y, z, ...]`."""
 
-    def __init__(self, result: Result, found: SignedTallies | None, names: tuple[str, ...], errors: bool) -> None:
-        self._result, self._found, self._names, self._errors = result, found, names, errors
+    def __init__(
+        self, kind: str, result: Result, found: SignedTallies | None, names: tuple[str, ...], errors: bool
+    ) -> None:
+        self._kind, self._result, self._found, self._names, self._errors = kind, result, found, names, errors
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -114,7 +116,7 @@ class _Values(Mapping[str, NDArray[np.float64]]):
             blocks = np.stack([self[f"{name}[{i},{j},{k}]"] for i, j, k in places])
             return blocks.reshape(*_shape(places), *blocks.shape[1:])
         if name not in self._names:
-            raise KeyError(f"{name!r} is not one of {', '.join(self) or 'those of the result, which has none'}")
+            raise KeyError(f"{name!r} is not one of the {self._kind}: {', '.join(self) or 'none were asked for'}")
         if found is None or name not in found.names:  # the intensity, which is the histogram
             return result.standard_error if self._errors else result.tallies * result.tally_value[..., None]
         p = found.names.index(name)
@@ -155,12 +157,12 @@ def _places(names: tuple[str, ...], name: str) -> list[tuple[int, int, int]]:
 def derivative_values(result: Result, *, errors: bool = False) -> Mapping[str, NDArray[np.float64]]:
     """Parameter → float64 `[3, H, W, T]`, or standard error of the sum over components, `[H, W, T]`."""
     found = result.derivative_tallies
-    return _Values(result, found, () if found is None else found.names, errors)
+    return _Values("derivatives", result, found, () if found is None else found.names, errors)
 
 
 def channel_values(result: Result, *, errors: bool = False) -> Mapping[str, NDArray[np.float64]]:
     """Channel of the receiver → as `derivative_values`."""
-    return _Values(result, result.channel_tallies, result.scene.camera.channels, errors)
+    return _Values("channels", result, result.channel_tallies, result.scene.camera.channels, errors)
 
 
 def standard_error(tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int) -> NDArray[np.float64]:
