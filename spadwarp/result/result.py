@@ -220,7 +220,7 @@ class Result:
 
     @property
     def channels(self) -> Mapping[str, NDArray[np.float64]]:
-        """ "co" and "cross" of an analyser, or "I", "Q", "U" and "V" → what that channel of the camera gets, as
+        """Channel of the camera, "co" and "cross" of an analyser or "I", "Q", "U" and "V", → what it gets, as
         `derivatives`; the histogram is of light without an analyser."""
         return channel_values(self)
 
