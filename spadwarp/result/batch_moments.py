@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spadwarp.errors import ConfigError
-from spadwarp.result.derivatives import standard_error
+from spadwarp.result.signed_tallies import standard_error
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
