@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
 __all__ = ["ComponentError", "component_errors", "dominance_warnings", "joined_moments", "moments_of"]
-__all__ += ["batches_of", "relative_error"]
+__all__ += ["batches_of", "pixel_standard_error", "relative_error"]
 
 # Share of the variance between batches from which one batch is said to decide a standard error. Chance alone exceeds
 # it with a probability of _FALSE_ALARM at most, see `_threshold`.
@@ -90,6 +90,13 @@ def batches_of(result: Result) -> tuple[NDArray[np.uint64], int]:
     if result.second_moment is None or result.photons < 2 * result.batch_size:
         raise ConfigError("the result holds no batches; simulate with uncertainty=True and more photons")
     return result.second_moment, result.photons // result.batch_size
+
+
+def pixel_standard_error(result: Result, row: int, column: int) -> NDArray[np.float64]:
+    """`Result.standard_error` of one pixel, float64 `[T]`, without that of the others."""
+    moments, count = batches_of(result)
+    own = standard_error(result.tallies[:, row, column], moments[:, row, column], count)
+    return np.asarray(own * result.tally_value[row, column])
 
 
 def relative_error(result: Result) -> float:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.frames import Method
 from spadwarp.result import COMPONENTS, Result
+from spadwarp.result.batch_moments import pixel_standard_error
 from spadwarp.scene import Medium
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
@@ -98,7 +99,7 @@ def _show_depth(panels: Panels, result: Result, frame: NDArray[np.float64], meth
 
 def _show_intensity(panels: Panels, result: Result) -> None:
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-    ballistic = result.component("ballistic").sum(axis=-1)
+    ballistic = result.tallies[COMPONENTS.index("ballistic")].sum(axis=-1) * result.tally_value
     panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
     panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
 
@@ -154,7 +155,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     time = 1e9 * result.bin_edges
     total = parts.sum(axis=0)
     known = result.second_moment is not None and result.photons >= 2 * result.batch_size
-    error = result.standard_error[row, column] * per_pulse if known else None
+    error = pixel_standard_error(result, row, column) * per_pulse if known else None
     variance = typical_weight(total) * total if error is None else error**2
     edges, groups = shared_edges(parts, variance)
     groups[COMPONENTS.index("ballistic")] = np.arange(len(time))
