@@ -13,9 +13,10 @@ from spadwarp.analytic.largest_range import largest_range as find_largest_range
 from spadwarp.analytic.largest_range import with_plane
 from spadwarp.analytic.optics import beam_axis_fluence
 from spadwarp.analytic.photon_budget import axis_line
-from spadwarp.errors import ArgumentError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import METHODS, Method
 from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
+from spadwarp.result import CHANNELS, Channel
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.scene.sight import port_advance
 from spadwarp.units import quantity, range_from_time
@@ -77,12 +78,15 @@ class Proposal(Exposure):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, in numbers and text that JSON can hold."""
-        fields = {name: value for name, value in vars(self).items() if name not in ("scene", "eye", "pilot")}
+        fields = {
+            name: value for name, value in vars(self).items() if name not in ("scene", "eye", "pilot", "channels")
+        }
         return {
             "values": self.values,
             **fields,
             "eye": dataclasses.asdict(self.eye),
             "pilot": dataclasses.asdict(self.pilot),
+            "channels": {name: dataclasses.asdict(pilot) for name, pilot in self.channels.items()},
         }
 
 
@@ -109,6 +113,7 @@ def plan(
     photons: int = 2_000_000,
     seed: int = 0,
     largest_range: bool = True,
+    channel: Channel = "I",
     device: str | None = None,
     progress: Progress | None = None,
 ) -> Proposal:
@@ -134,6 +139,7 @@ def plan(
         photons: Of the Monte Carlo run.
         seed: Of it.
         largest_range: Whether to look for the largest range, which takes several shorter runs.
+        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.received`.
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 
@@ -158,7 +164,11 @@ def plan(
         scene = with_plane(scene, span[1])
     else:
         span = target_span(scene, device)
-    question = Question(depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device)
+    if check_choice("channel", channel, CHANNELS) != "I" and not scene.camera.channels:
+        raise ConfigError(f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'")
+    question = Question(
+        depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device, channel
+    )
     gate = propose_gate(scene, span, margin)
     exposure = propose_exposure(scene, gate, question, photons, progress)
     line = axis_line(scene)

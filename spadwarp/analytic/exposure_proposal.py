@@ -17,6 +17,7 @@ from spadwarp.analytic.pilot import Pilot, measure, trace, window
 from spadwarp.device import pick_device
 from spadwarp.frames import Method, detector_response
 from spadwarp.frames.response import FWHM_PER_SIGMA
+from spadwarp.result import CHANNELS, Channel
 from spadwarp.units import range_from_time, with_prefix
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class Question:
     eye_exposure: float
     seed: int
     device: str | None
+    channel: Channel = "I"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,8 @@ class Exposure:
         limit: The largest of them.
         advice: What would help.
         pilot: What was measured by Monte Carlo.
+        channels: The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera
+            without one.
     """
 
     scene: Scene = field(repr=False)
@@ -81,6 +85,7 @@ class Exposure:
     limit: str
     advice: str
     pilot: Pilot
+    channels: dict[str, Pilot] = field(default_factory=dict)
 
 
 def propose_exposure(
@@ -101,7 +106,7 @@ def propose_exposure(
     scene = scene.with_overrides(gate=fields, laser={"repetition_rate": rate}, transport={"max_path": None})
     small = window(scene, question.device)
     runs = trace(small, photons, question.seed, question.device, progress)
-    pilot = measure(runs, scene, question.device, even=even)
+    pilot = measure(runs, scene, question.device, even=even, channel=question.channel)
     eye = scene_eye_limit(scene, distance=question.eye_distance or 0.1, exposure=question.eye_exposure)
     piled = laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
     allowed = {"pile-up": piled} | ({} if question.eye_distance is None else {"eye": eye.pulse_energy})
@@ -110,12 +115,13 @@ def propose_exposure(
     if allowed[lowest] > 0 and (question.full_power or laser.pulse_energy > allowed[lowest]):
         energy_limit = lowest
         scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(allowed[lowest])})
-        pilot = measure(runs, scene, question.device, even=even)
+        pilot = measure(runs, scene, question.device, even=even, channel=question.channel)
     pulses, purpose = _pulses(scene, pilot, question)
     terms = _terms(pilot, pulses, question.method)
     frame_time = pulses * positions / rate
     limit = _limit(scene, pilot, terms, pulses, question.method)
     counts = {"pulses_per_frame": pulses}
+    compared = CHANNELS if small.camera.channels and not even else ()
     return Exposure(
         scene=scene.with_overrides(detector=counts, analytic={"pulses_per_depth_frame": pulses}),
         pile_up_energy=piled,
@@ -129,6 +135,7 @@ def propose_exposure(
         limit=limit,
         advice=_advice(limit, purpose, frame_time, rate, gate.largest_rate, question),
         pilot=pilot,
+        channels={name: measure(runs, scene, question.device, channel=name) for name in compared},
     )
 
 

@@ -21,7 +21,7 @@ from spadwarp.errors import ConfigError
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.estimators import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result import merge
+from spadwarp.result import Channel, merge, received
 from spadwarp.scene import noise_rate
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
@@ -130,13 +130,21 @@ def trace(
     return runs[0], runs[1]
 
 
-def measure(runs: tuple[Result, Result], scene: Scene, device: str | None = None, *, even: bool = False) -> Pilot:
-    """What the runs say about `scene`, whose laser's energy and detector may differ from those that were traced.
+def measure(
+    runs: tuple[Result, Result],
+    scene: Scene,
+    device: str | None = None,
+    *,
+    even: bool = False,
+    channel: Channel = "I",
+) -> Pilot:
+    """What the runs say about `scene`, whose laser's energy and detector may differ from those that were traced, seen
+    in a channel of an analyser.
 
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
     """
-    first, second = (dataclasses.replace(run, scene=_as_traced(run.scene, scene)) for run in runs)
+    first, second = (received(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs)
     both = merge([first, second])
     frames = detect(both, pulses=1, seed=0, device=device)
     light = frames.expected.astype(np.float64)

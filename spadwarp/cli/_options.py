@@ -163,6 +163,23 @@ class Estimator(enum.StrEnum):
     likelihood = "likelihood"
 
 
+class Channel(enum.StrEnum):
+    """`spadwarp.result.CHANNELS`, known without loading them."""
+
+    I = "I"
+    co = "co"
+    cross = "cross"
+
+
+ChannelName = Annotated[
+    Channel,
+    typer.Option(
+        "--channel",
+        help="Which light of a result with an analyser counts: I (all of it, without the analyser), co or cross.",
+    ),
+]
+
+
 def read_scene(
     path: Path, *, mesh: Path | None, overrides: list[str] | None, photons: int | None = None, seed: int | None = None
 ) -> Scene:
@@ -196,10 +213,11 @@ def one_device(devices: str | None, engine: Ray | None) -> str | None:
     return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]
 
 
-def load_run(place: Path) -> Result:
+def load_run(place: Path, channel: Channel = Channel.I) -> Result:
     """The result in a file, or in the directory of a run; a checkpoint where there is no result."""
     path = spadwarp.files.locate(place)
-    return spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
+    result = spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
+    return spadwarp.result.received(result, channel.value)
 
 
 def read_part(text: str | None, option: str) -> tuple[int, int] | None:

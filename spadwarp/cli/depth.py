@@ -39,6 +39,7 @@ def depth(
     ],
     out: opt.Out,
     method: Annotated[opt.Estimator, typer.Option(help="Estimator of the arrival time.")] = opt.Estimator.centroid,
+    channel: opt.ChannelName = opt.Channel.I,
     dataset: measured.Dataset = None,
     axes: measured.Axes = None,
     image_size: measured.ImageSize = None,
@@ -99,7 +100,7 @@ def depth(
     reduced = spadwarp.files.stored_depth(spadwarp.load(place)) if spadwarp.files.is_own_file(place) else None
     size, histograms = 0, None
     if reduced is None:
-        histograms = read_histograms(place, **given)
+        histograms = read_histograms(place, channel=channel.value, **given)
         size = histograms.values.size // histograms.values.shape[-1]
         for text in histograms.notes:
             complain(f"note: {text}")

@@ -57,6 +57,7 @@ def detect(
             help="Start [ns] and bins of the detector's window, such as 10 512 or 10ns 512. By default the run's gate.",
         ),
     ] = None,
+    channel: opt.ChannelName = opt.Channel.I,
     overrides: opt.Overrides = None,
     device: opt.Device = None,
     overwrite: opt.Overwrite = False,
@@ -78,7 +79,7 @@ def detect(
     from spadwarp.viz import draw_recording
 
     recorded = _window(window)
-    result = _with_detector(opt.load_run(run), overrides)
+    result = _with_detector(opt.load_run(run, channel), overrides)
     chosen: Any = [one.value for one in method or opt.Estimator]
     width, height = result.scene.camera.width, result.scene.camera.height
     pixels, bins = max(frames, 0) * width * height, result.scene.gate.bins if recorded is None else recorded[1]
@@ -116,7 +117,7 @@ def detect(
         lines = _lines(recording, summary)
         lines["written"] = ", ".join(path.name for path in written) + f" in {out}"
         say(opt.rows(lines))
-    outputs.write_json({**summary, "files": written})
+    outputs.write_json({**summary, "channel": channel.value, "files": written})
 
 
 def _window(window: tuple[str, str] | None) -> tuple[float, int] | None:

@@ -50,6 +50,7 @@ def export(
         int,
         typer.Option(parser=opt.whole_number, metavar="N", help="fusion: finer pixels of the camera image, each way."),
     ] = 8,
+    channel: opt.ChannelName = opt.Channel.I,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     json_path: opt.Json = None,
@@ -95,7 +96,9 @@ def export(
                 source, out, stem=stem, factor=factor, frames=chosen, split=split
             )
             continue
-        written[one.value] = spadwarp.export(source, out / f"{stem}.{one.value}", frames=chosen, split=split)
+        written[one.value] = spadwarp.export(
+            source, out / f"{stem}.{one.value}", frames=chosen, split=split, channel=channel.value
+        )
     if not quiet:
         lines = {}
         for name, paths in written.items():

@@ -70,7 +70,7 @@ def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str
             "returns": f"in {summary['pixels_with_return']} pixels, {summary['detections_per_pulse']:.4g} detections a "
             "pulse",
             **({"derivatives": "by " + ", ".join(summary["derivatives"])} if "derivatives" in summary else {}),
-            **({"channels": ", ".join(summary["channels"])} if "channels" in summary else {}),
+            **_polarisation(summary),
         },
         "Collected, as fractions of the emitted light": collected,
         f"Energy balance, {'exact' if ledger['exact'] else 'off by ' + str(ledger['difference']) + ' units'}": {
@@ -86,6 +86,17 @@ def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str
             "in": ", ".join(f"{name} {seconds:.3g} s" for name, seconds in timing.items()),
         },
     }
+
+
+def _polarisation(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Of the channels of a result, or of the one that it holds."""
+    if "channel" in summary:
+        return {"light": f"{summary['channel']}-polarised alone, behind an analyser"}
+    if "channels" not in summary:
+        return {}
+    parts = ", ".join(f"{name} {value:.4g}" for name, value in summary["channels"].items())
+    degree = summary["degree_of_polarisation"]
+    return {"polarisation": f"{parts}; degree of polarisation {'unknown' if degree is None else f'{degree:.3g}'}"}
 
 
 def _plain(value: Any) -> str:

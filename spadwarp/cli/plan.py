@@ -66,6 +66,7 @@ def plan(
     ] = "2000000",  # type: ignore[assignment]
     seed: Annotated[int, typer.Option(parser=opt.whole_number, metavar="N", help="Key of the random numbers.")] = "0",  # type: ignore[assignment]
     no_range: Annotated[bool, typer.Option("--no-range", help="Do not look for the largest range.")] = False,
+    channel: opt.ChannelName = opt.Channel.I,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Scene file to write with the proposed values.")
     ] = None,
@@ -107,6 +108,7 @@ def plan(
             photons=photons,
             seed=seed,
             largest_range=not no_range,
+            channel=channel.value,
             device=device,
             progress=report,
         )
@@ -118,6 +120,8 @@ def plan(
     if not quiet:
         say(opt.rows(_lines(found)))
         opt.show_table(_terms(found))
+        for name in ("co", "cross") if found.channels else ():
+            say(_reception(found, name))
         say(_verdict(found))
         say(f"What would help: {found.advice}.")
         if found.pilot.run_noise > 0.5 * found.terms["forward scattering"]:
@@ -186,6 +190,21 @@ def _lines(found: Proposal) -> dict[str, str]:
             f"{found.largest_range:.3g} m for {asked}, {_PLANE}{ends}" if found.largest_range else none
         )
     return lines
+
+
+def _reception(found: Proposal, name: str) -> str:
+    """What a channel of the analyser keeps of all light."""
+    whole, part = found.channels["I"], found.channels[name]
+
+    def share(field: str) -> str:
+        return f"{100 * getattr(part, field) / getattr(whole, field):.3g} %" if getattr(whole, field) else "none"
+
+    text = f"{name.capitalize()}-polarised reception keeps {share('target')} of the target's light"
+    text += f", {share('backscatter')} of the backscatter and {share('noise')} of the noise"
+    if not math.isfinite(part.bound) or not math.isfinite(whole.bound):
+        return text + "."
+    ratio = part.bound / whole.bound
+    return f"{text}; the same Cramér–Rao bound takes {ratio**2:.2g} times the pulses."
 
 
 def _terms(found: Proposal) -> Table:

@@ -21,6 +21,7 @@ def view(
         typer.Option(metavar="NAME", help='Estimator of depth: "peak", "centroid", "matched" or "likelihood".'),
     ] = None,
     frame: opt.Frame = 0,
+    channel: opt.ChannelName = opt.Channel.I,
     device: opt.Device = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
@@ -36,6 +37,6 @@ def view(
       spadwarp view frames/frames.h5 --frame 3 --out frame.html
     """
     opt.check_outputs(files={"--out": out}, inputs=(run,), overwrite=overwrite)
-    path = spadwarp.viz.view(run, out, method=method, frame=frame, device=device)
+    path = spadwarp.viz.view(run, out, method=method, frame=frame, channel=channel.value, device=device)
     if not quiet:
         say(f"written: {path} ({opt.in_bytes(path.stat().st_size)})")

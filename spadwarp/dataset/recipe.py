@@ -148,6 +148,15 @@ class MonteCarlo(Table):
     counts: Literal["none", "sparse", "dense", "smaller"] = Field(
         "smaller", description="how the counts of frames are stored, if at all"
     )
+    channel: Literal["I", "co", "cross"] = Field(
+        "I", description="light that the camera counts: all, or what an analyser passes at or across its angle"
+    )
+
+    @model_validator(mode="after")
+    def _traced(self) -> Self:
+        if self.channel != "I" and self.share < 1.0:
+            raise ValueError(f"channel = {self.channel!r} needs share = 1: the analytic simulator has no polarisation")
+        return self
 
 
 class Recipe(Table):

@@ -15,6 +15,7 @@ from spadwarp.dataset.rendered import (
 )
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames import Frames, crlb, detect
+from spadwarp.result import received
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import simulate
@@ -31,6 +32,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
     if result.partial:
         raise KeyboardInterrupt
+    result = received(result, plan.recipe.monte_carlo.channel)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.component("backscatter")
     returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale

@@ -51,6 +51,7 @@ def _frames(file: FramesFile) -> dict[str, Any]:
         "counts_per_pixel": float(np.mean(mean)) if mean else None,
         "depth_by": list(file.methods),
         "response_fwhm_ps": 1e12 * file.irf.fwhm,
+        **({} if file.channel == "I" else {"channel": file.channel}),
     }
 
 

@@ -62,6 +62,7 @@ class FramesFile:
         truth_depth: float32 `[H, W]` [m].
         methods: Estimators whose depth frames the file holds.
         monte_carlo_noise: As of `Frames`.
+        channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
     """
 
     path: Path
@@ -79,6 +80,7 @@ class FramesFile:
     truth_depth: NDArray[np.float32]
     methods: tuple[Method, ...]
     monte_carlo_noise: float | None = None
+    channel: str = "I"
 
     def __repr__(self) -> str:
         height, width = self.truth_depth.shape
@@ -117,6 +119,7 @@ class FramesFile:
                 scene=scene,
                 truth_depth=file.array("truth/depth", np.float32, shape[:2]),
                 methods=methods,
+                channel=file.text_attribute("channel", "I"),
                 expected=_expectation(file, "expected", shape),
                 background=_expectation(file, "background", shape),
                 monte_carlo_noise=None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
@@ -310,4 +313,5 @@ def _metadata(result: Result, part: Frames, frames: int) -> dict[str, Any]:
         "notes": list(part.notes),
         "source": str(scene.source or ""),
         "photons": result.photons,
+        "channel": result.provenance.get("channel", "I"),
     }

@@ -27,6 +27,7 @@ from spadwarp.io.npy import read_npy
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import check_real
 from spadwarp.result.file import load_result
+from spadwarp.result.received import Channel, received
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -96,6 +97,7 @@ def read_histograms(
     gate_start: float | None = None,
     irf: InstrumentResponse | None = None,
     sum_frames: bool = False,
+    channel: Channel = "I",
 ) -> Histograms:
     """Reads histograms; the ending of the file says which kind of file it is.
 
@@ -116,6 +118,7 @@ def read_histograms(
         gate_start: Time of flight at the start of bin 0, or at tag 0 [s].
         irf: The response that the histograms contain.
         sum_frames: Add frames up.
+        channel: Of a result: which light counts, see `spadwarp.result.received`.
 
     Raises:
         FileError: No such file, not readable, of an unknown kind, without such an array, or with values that are
@@ -138,7 +141,9 @@ def read_histograms(
         given = {**vars(asked), "gate_start": gate_start, "irf": irf}
         if clash := [name.replace("_", " ") for name, value in given.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
-        return _read_own(path)
+        return _read_own(path, channel)
+    if channel != "I":
+        raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
     raw = _read(path, ending, asked)
     values, notes = raw.values, list(raw.notes)
     _check(values, path)
@@ -200,8 +205,10 @@ def _is_own(path: Path) -> bool:
     return (hdf5_format(path) or "").startswith("spadwarp")
 
 
-def _read_own(path: Path) -> Histograms:
+def _read_own(path: Path, channel: Channel) -> Histograms:
     if is_frames_file(path):
+        if channel != "I":
+            raise ArgumentError(f"channel = {channel!r}: {path} holds frames, whose channel was chosen when drawn")
         file = FramesFile.load(path)
         return Histograms(
             values=file.counts(),
@@ -212,7 +219,7 @@ def _read_own(path: Path) -> Histograms:
             response=file.irf,
             scene=file.scene,
         )
-    result = load_result(path)
+    result = received(load_result(path), channel)
     scene = result.scene
     return Histograms(
         values=result.histogram,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError
 from spadwarp.result.batch_moments import batches_of, dominance_warnings, relative_error
 from spadwarp.result.photon_ids import photons_per_position
+from spadwarp.result.received import polarisation_summary
 from spadwarp.result.signed_tallies import (
     SignedTallies,
     channel_values,
@@ -355,7 +356,7 @@ class Result:
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
             **({"derivatives": short_names(tuple(self.derivatives))} if self.derivatives else {}),
-            **({"channels": list(self.channels)} if self.channels else {}),
+            **polarisation_summary(self),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }

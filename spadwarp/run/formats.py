@@ -16,6 +16,7 @@ from spadwarp.frames.frames import Frames
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.limits import check_choice
+from spadwarp.result.received import Channel, received
 from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.run.sensor_fusion import write_sensor_fusion
 from spadwarp.scene.calibration import CALIBRATION_ENDINGS, save_calibration
@@ -32,6 +33,7 @@ def export(
     frames: int | slice | None = None,
     split: str = "all",
     result: Result | None = None,
+    channel: Channel = "I",
 ) -> list[Path]:
     """Writes a result, frames or a dataset in another program's format, which the ending of `path` selects.
 
@@ -56,6 +58,7 @@ def export(
         frames: Only this one, from 0, or these.
         split: Of a dataset: "train", "validation", "test" or "all".
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
+        channel: Of a result: which light counts, see `spadwarp.result.received`.
 
     Returns:
         The files that were written.
@@ -75,7 +78,9 @@ def export(
             if ending in CALIBRATION_ENDINGS:
                 return [_write_calibration(opened, path)]
             if isinstance(opened, Result):
-                return [_write_result(opened, path, ending, frames)]
+                return [_write_result(received(opened, channel), path, ending, frames)]
+            if channel != "I":
+                raise ArgumentError(f"channel = {channel!r}: only results have channels")
             chosen = _chosen(opened, frames)
             if ending in (".npy", ".ptu"):
                 return [(write_npy if ending == ".npy" else write_ptu)(opened, path, chosen)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,18 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.frames import Method
-from spadwarp.result import COMPONENTS, Result
+from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation, received
 from spadwarp.result.batch_moments import pixel_standard_error
 from spadwarp.scene import Medium
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
 from spadwarp.viz.sparse import merged_means, shared_edges, typical_weight
-from spadwarp.viz.style import COMPONENTS as STYLES
 from spadwarp.viz.style import (
+    CHANNEL_NAMES,
     INTENSITY_MAP,
     MISSING,
     PAGE,
+    PURPLE,
     TEXT,
     log_axis,
     new_figure,
@@ -31,6 +32,7 @@ from spadwarp.viz.style import (
     spaced,
     wrapped_items,
 )
+from spadwarp.viz.style import COMPONENTS as STYLES
 
 __all__ = ["KINDS", "draw_result", "result_figure"]
 
@@ -79,7 +81,8 @@ def result_figure(
     """One of the figures of `draw_result`, of `KINDS`."""
     if kind == "histogram":
         return _histogram_figure(result, width)
-    panels = Panels(result.truth.depth.shape, 2 if kind == "intensity" else 3, width=width)
+    two = kind == "intensity" and not result.channels
+    panels = Panels(result.truth.depth.shape, 2 if two else 3, width=width)
     panels.caption(_caption(result))
     if kind == "depth":
         frame = result.depth(method=method, device=device) if depth is None else np.asarray(depth, dtype=np.float64)
@@ -102,6 +105,10 @@ def _show_intensity(panels: Panels, result: Result) -> None:
     ballistic = result.tallies[COMPONENTS.index("ballistic")].sum(axis=-1) * result.tally_value
     panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
     panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
+    if result.channels:
+        part = degree_of_polarisation(result, gated=True)
+        low = -1.0 if (part < 0.0).any() else 0.0
+        panels.show(part, "Degree of polarisation", "of all light in the gate", "viridis", (low, 1.0))
 
 
 def _show_truth(panels: Panels, result: Result) -> None:
@@ -127,6 +134,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     order = order[intensity.ravel()[order] > 0]
     group = "on the target" if on_target else "of those with a return"
     handles: dict[str, Any] = {}
+    channels = {name: received(result, name) for name in CHANNEL_NAMES} if result.channels else {}
     for axis, name, index in zip(
         figure.subplots(2, 1), ("Brightest", "Median"), (-1, (len(order) - 1) // 2), strict=True
     ):
@@ -137,7 +145,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
         else:
             row, column = divmod(int(order[index]), intensity.shape[1])
             axis.set_title(f"{name} pixel {group}: row {row}, column {column}")
-            _plot_pixel(result, axis, row, column)
+            _plot_pixel(result, axis, row, column, channels)
             handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
     if handles:
         columns = 5 if width > 5.0 else 2
@@ -145,8 +153,9 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     return figure
 
 
-def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
-    """Components of one pixel over time of flight, and over the range along its line of sight.
+def _plot_pixel(result: Result, axis: Axes, row: int, column: int, channels: Mapping[Channel, Result]) -> None:
+    """Components of one pixel over time of flight, and over the range along its line of sight; of polarised light also
+    what each channel has of all of them.
 
     Where light is sparse, bins are added up until their sum is known to a third; see `shared_edges`.
     """
@@ -172,6 +181,12 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
         axis.stairs(
             np.maximum(values, 0.01 * bottom), time[own], baseline=None, label=label, color=colour,
             linewidth=1.4 if ballistic else 0.9, zorder=3 if ballistic else 2,
+        )  # fmt: skip
+    for (channel, part), line in zip(channels.items(), ("--", ":"), strict=False):
+        seen = part.tallies[:, row, column].sum(axis=0) * (part.tally_value[row, column] * per_pulse)
+        axis.stairs(
+            np.maximum(merged_means(seen, edges), 0.01 * bottom), time[edges], baseline=None,
+            label=CHANNEL_NAMES[channel], color=PURPLE, linewidth=1.1, linestyle=line, zorder=4,
         )  # fmt: skip
     arrival_line(axis, 1e9 * float(result.true_path()[row, column]) / result.pulse_speed, time)
     axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
@@ -228,7 +243,13 @@ def _caption(result: Result) -> str:
         mantissa, power = photons.split("e+")
         photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"
     partial = ", interrupted" if result.partial else ""
-    return f"{photons} photons{partial}; {water}; seed {result.seed}"
+    return f"{photons} photons{partial}{channel_text(result)}; {water}; seed {result.seed}"
+
+
+def channel_text(result: Result) -> str:
+    """What a caption says of the channel that a result holds alone, if any."""
+    channel = result.provenance.get("channel")
+    return "" if channel is None else f", {CHANNEL_NAMES[channel]} light"
 
 
 def _phase_text(medium: Medium) -> str:

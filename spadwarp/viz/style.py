@@ -23,8 +23,20 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 from spadwarp.errors import FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.limits import check_real
+from spadwarp.result import Channel
 
-__all__ = ["BACKGROUND", "BLUE", "BOUND_MAP", "COLUMN", "COMPONENTS", "DASHED", "DEPTH_MAP", "ERROR_MAP", "GREEN"]
+__all__ = [
+    "BACKGROUND",
+    "BLUE",
+    "BOUND_MAP",
+    "CHANNEL_NAMES",
+    "COLUMN",
+    "COMPONENTS",
+    "DASHED",
+    "DEPTH_MAP",
+    "ERROR_MAP",
+    "GREEN",
+]
 __all__ += ["INTENSITY_MAP", "LIGHT_MAP", "MISSING", "ORANGE", "PAGE", "PROBABILITY_MAP", "PURPLE", "RED"]
 __all__ += ["SERIES", "SKY", "STYLE", "TEXT", "colour_map", "columns_that_fit", "log_axis", "new_figure", "paper"]
 __all__ += ["plain_axis", "save", "spaced", "wrapped", "wrapped_items"]
@@ -48,6 +60,8 @@ COMPONENTS = {
     "backscatter": ("water, backscatter", GREEN),
 }
 """Label and colour of the components of a result."""
+CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polarised"}
+"""Words for the channels of an analyser."""
 
 DEPTH_MAP, INTENSITY_MAP = "viridis_r", "cividis"
 BOUND_MAP, PROBABILITY_MAP, LIGHT_MAP = "magma_r", "inferno_r", "inferno"

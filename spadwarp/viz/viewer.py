@@ -18,12 +18,13 @@ from spadwarp.frames.export import FrameSequence
 from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.paths import check_apart
-from spadwarp.result import Result
+from spadwarp.result import Channel, Result, received
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 from spadwarp.viz import style
 from spadwarp.viz.pages import write_page
 from spadwarp.viz.panels import median_pixel
+from spadwarp.viz.result import channel_text
 
 __all__ = ["HISTOGRAM_BYTES", "reported_depths", "view"]
 
@@ -72,6 +73,7 @@ def view(
     *,
     method: str | None = None,
     frame: int = 0,
+    channel: Channel = "I",
     device: Any = None,
 ) -> Path:
     """Writes one self-contained HTML file; returns its path.
@@ -88,11 +90,12 @@ def view(
         path: The file to write.
         method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
         frame: Number of the frame, from 0, where the source holds frames.
+        channel: Of a result: which light counts, see `spadwarp.result.received`.
         device: Warp device for the depth frame.
 
     Raises:
         FileError: plotly is not installed, or a file cannot be read or written.
-        ArgumentError: No such frame or method.
+        ArgumentError: No such frame, method or channel.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -103,7 +106,9 @@ def view(
     if isinstance(held, SequenceFile):
         raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp video` shows it, frame by frame")
     if isinstance(held, Result):
-        page = _of_result(held, method, device)
+        page = _of_result(received(held, channel), method, device)
+    elif channel != "I":
+        raise ArgumentError(f"channel = {channel!r}: only results have channels")
     else:
         page = _of_frames(held, method, frame) if isinstance(held, FramesFile) else _of_depth(held, method, frame)
     write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
@@ -123,6 +128,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         title=_name(scene),
         caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
         + (", interrupted" if result.partial else "")
+        + channel_text(result)
         + "; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
