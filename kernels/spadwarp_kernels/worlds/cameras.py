@@ -6,6 +6,7 @@ import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_items, check_kind
 
+from .checks import check_poses, check_room
 from .config import SpadConfig, check_config
 from .detect import Detection
 from .frames import optical_to
@@ -55,10 +56,14 @@ class WorldCameras:
         self.config = check_config(config)
         self.device = check_device("device", device)
         self.cameras = check_integer("cameras", cameras, 1)
+        sizes = {"cameras": self.cameras, "config.height": self.config.height, "config.width": self.config.width}
+        image = tuple(sizes.values())
+        sizes["config.bins"] = self.config.bins
+        check_room("rates, counts and background", sizes, 8 + 24 // self.cameras, self.device, rows=3)
         self._optical = optical_to(frame)
         self._world = camera_worlds(world, self.cameras, self.device)
         self._most_worlds = 0 if isinstance(world, wp.array) else int(self._world.numpy().max()) + 1
-        image = (self.cameras, self.config.height, self.config.width)
+        self._poses_checked = False
         self._detection = Detection(self.config, self.cameras, self.device)
         self.rates, self.histogram = self._detection.rates, self._detection.histogram
         self.counts, self.depth, self.step = self._detection.counts, self._detection.depth, self._detection.step
@@ -72,6 +77,12 @@ class WorldCameras:
         check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
         if self._most_worlds > shapes.worlds:
             raise ArgumentError(f"world = {self._most_worlds - 1} is none of the {shapes.worlds} worlds of the shapes")
+        if not (self._poses_checked or self.device.is_capturing):  # once: later steps wait for nothing
+            check_poses("camera_q", camera_q)
+            if body_q is not None:
+                check_array("body_q", body_q, wp.transform, (None,), self.device)
+                check_poses("body_q", body_q, shapes.bodies)
+            self._poses_checked = True
         move_shapes(shapes, body_q)
         inputs = [shapes.table, camera_q, self._optical, self._world, self._detection.view]
         outputs = [self.true_depth, self.normal, self.albedo]

@@ -221,7 +221,7 @@ def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp
         hit = _intersect_box(size, y, u, least)
     elif kind == CONE:
         hit = _intersect_cone(size, y, u, least)
-    else:
+    elif kind == MESH:
         start = float(0.0)
         hit = _intersect_scaled_mesh(mesh, size, x, u, reach)
     hit.distance += start

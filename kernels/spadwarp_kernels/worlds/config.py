@@ -13,7 +13,6 @@ from spadwarp_kernels.arguments import (
     check_choice,
     check_integer,
     check_number,
-    check_seed,
     check_vector,
 )
 from spadwarp_kernels.detection.arrival_time import PHASES
@@ -27,8 +26,8 @@ PLANCK = 6.62607015e-34  # [J s]
 
 _RANGES = {
     "horizontal_fov": "(0, 3.1)",
-    "pulse_energy": "[0, inf)",
-    "wavelength": "(0, inf)",
+    "pulse_energy": "[0, 1e6]",
+    "wavelength": "(0, 1]",
     "pde": "[0, 1]",
     "dark_rate": "[0, inf)",
     "timing_sigma": "(0, inf)",
@@ -106,7 +105,12 @@ class SpadConfig:
         if self.laser_half_angle is not None:
             check_number("config.laser_half_angle", self.laser_half_angle, "(0, 3.1416]")
         check_choice("config.method", self.method, ("centroid", "peak", "matched", "likelihood"))
-        check_seed(self.seed)
+        check_integer("config.seed", self.seed, 0, 2**64 - 1)
+        if (bins := self.timing_sigma * self.speed / self.bin_path) > 1e4:
+            width = self.bin_path / self.speed
+            raise ArgumentError(
+                f"config.timing_sigma = {self.timing_sigma} s is {bins:.3g} bins of {width:.3g} s; 10000 are possible"
+            )
 
     @property
     def pixel_tangent(self) -> float:

@@ -18,7 +18,8 @@ from spadwarp_kernels.arguments import (
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
-from .closed_forms import MESH, SHAPE_KINDS, ShapeHit, intersect_shape
+from .checks import check_shapes
+from .closed_forms import SHAPE_KINDS, ShapeHit, intersect_shape
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,7 +102,7 @@ def make_shapes(
         size: [m], see `ShapeTable`.
         body: -1, the default, stands still in its world.
         local: Poses on the bodies (x, y, z, qx, qy, qz, qw).
-        mesh: `wp.Mesh` objects, or ids of such, which the caller keeps alive; None or 0 for the other kinds.
+        mesh: `wp.Mesh` objects, or ids of such; None or 0 for the other kinds. The shapes keep them alive.
         albedo: A number, or one for each shape.
         world: Index of the world of each shape, -1 for a shape that stands in all; read once, on the host. By default
             all stand in world 0, or in all worlds if there are several.
@@ -111,10 +112,11 @@ def make_shapes(
         device: Where the arrays are.
 
     Raises:
-        ArgumentError: Arrays of another length or on another device, an unknown kind, or a world that there is not.
+        ArgumentError: Arrays of another length or on another device, values out of range, or a world or mesh that
+            there is not.
     """
     device = check_device("device", device)
-    worlds = check_integer("worlds", worlds, 1)
+    worlds = check_integer("worlds", worlds, 1, 1 << 24)
     table = ShapeTable()
     if not isinstance(kind, wp.array):
         kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
@@ -138,6 +140,8 @@ def make_shapes(
         scalar = {wp.int32: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
         if not (np.isfinite(rows).all() and (np.abs(rows) <= np.finfo(np.float32).max).all()):
             raise ArgumentError(f"{name} is not finite for some of {count} shapes")
+        if dtype == wp.int32 and not (rows == np.clip(np.rint(rows), -(2**31), 2**31 - 1)).all():
+            raise ArgumentError(f"{name} is not an integer of 32 bits for some of {count} shapes")
         return wp.array(rows.astype(scalar), dtype=dtype, device=device)
 
     meshes: tuple[wp.Mesh, ...] = ()
@@ -155,35 +159,31 @@ def make_shapes(
     if textures is not None:
         check_struct("textures", textures, Textures)
     table.textures = no_textures(device) if textures is None else textures
-    _check_shapes(table)
-    bodies = int(table.body.numpy().max()) + 1
     if world is None:
         world = np.full(count, 0 if worlds == 1 else -1)
-    world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
+    world = _plain_array("world", world)
     if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
         raise ArgumentError(f"world is not one of -1 to {worlds - 1} for each of {count} shapes")
     seen = np.arange(count)
     if visible is not None:
-        if np.shape(visible) not in ((), (count,)):
-            raise ArgumentError(f"visible has shape {np.shape(visible)}; one for each of {count} shapes is needed")
+        visible = _plain_array("visible", visible)
+        if visible.shape not in ((), (count,)) or visible.dtype.kind not in "biu":
+            kind_given = f"{visible.dtype} of shape {visible.shape}"
+            raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
         seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
+    meshes = check_shapes(table, seen, meshes)
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
     table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
     table.pose = wp.clone(table.local)
-    return Shapes(table, worlds, device, meshes, bodies)
+    return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1)
 
 
-def _check_shapes(table: ShapeTable) -> None:
-    kind, mesh = table.kind.numpy(), table.mesh.numpy()
-    if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
-        raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
-    albedo = table.albedo.numpy()
-    if not ((albedo >= 0.0) & (albedo <= 1.0)).all():
-        raise ArgumentError(f"albedo holds {albedo.min()} to {albedo.max()}, outside [0, 1]")
-    without = np.flatnonzero((kind == MESH) & (mesh == 0))
-    if without.size:
-        raise ArgumentError(f"kind[{without[0]}] is a mesh and mesh[{without[0]}] = 0 is none")
+def _plain_array(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value.numpy() if isinstance(value, wp.array) else value)
+    except ValueError:
+        raise ArgumentError(f"{name} is not an array: its rows have different lengths") from None
 
 
 @wp.kernel(enable_backward=False)
@@ -192,7 +192,7 @@ def _move_kernel(table: ShapeTable, body_q: wp.array(dtype=wp.transform)):
     k = wp.tid()
     pose = table.local[k]
     body = table.body[k]
-    if body >= 0:
+    if body >= 0 and body < body_q.shape[0]:
         pose = wp.transform_multiply(body_q[body], pose)
     table.pose[k] = pose
 
@@ -258,6 +258,8 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> S
     worlds = table.first.shape[0] - 2
     for part in range(2):
         slot = wp.where(part == 0, world, worlds)
+        if slot < 0 or slot > worlds:
+            continue  # worlds of cameras may change in place
         for m in range(table.first[slot], table.first[slot + 1]):
             k = table.member[m]
             inverse = wp.transform_inverse(table.pose[k])

@@ -159,8 +159,9 @@ def _rates_kernel(
 class SpadCamera(WorldCameras):
     """Single-photon cameras in many worlds: histograms, counts and noisy depth of all in a few launches.
 
-    A pixel sees one surface, the water between by single scattering, and dark counts. A step allocates nothing, reads
-    nothing back and has its random numbers from a counter on the device: it can be captured in a CUDA graph.
+    A pixel sees one surface, the water between by single scattering, and dark counts. The first
+    step checks the poses. Every other one allocates nothing, reads nothing back and has its random numbers from a
+    counter on the device: it can be captured in a CUDA graph.
 
     Args:
         config: Laser, detector and water; the same for all cameras.

@@ -19,7 +19,8 @@ from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choic
 from spadwarp_kernels.transport.launch import Data, Model, launch_transport, make_data
 
 from .cameras import WorldCameras
-from .config import SpadConfig
+from .checks import check_room
+from .config import SpadConfig, check_config
 from .shapes import Shapes
 from .triangles import CameraMeshes, _albedo_kernel
 
@@ -80,8 +81,9 @@ class _Lane:
 class SpadTracer(WorldCameras):
     """As `SpadCamera`, with all scattering: photons are traced through the water and against the shapes.
 
-    A step is a loop over the cameras of launches that wait for nothing; it allocates nothing and reads nothing back, so
-    that it can be captured in a CUDA graph, after a first one that builds the meshes. Round shapes become polygons of
+    A step is a loop over the cameras of launches that wait for nothing, then one launch for the counts of all; it
+    allocates nothing and reads nothing back, so that it can be captured in a CUDA graph, after a first one that checks
+    the poses and builds the meshes. Round shapes become polygons of
     48 sides. The light of a photon depends on `config.seed` and its number, and every step has new photons.
 
     Args:
@@ -120,6 +122,10 @@ class SpadTracer(WorldCameras):
         device: wp.DeviceLike = None,
     ) -> None:
         check_kind("shapes", shapes, Shapes)
+        config = check_config(config)
+        self._parts = check_integer("oversampling", oversampling, 1, 1024)
+        sizes = {"config.height": config.height, "config.width": config.width, "config.bins": config.bins}
+        check_room("tallies", {**sizes, "oversampling": self._parts}, 12, shapes.device, rows=4)
         super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
@@ -133,7 +139,6 @@ class SpadTracer(WorldCameras):
         for v, faces in enumerate(self._meshes.face_shape):
             if not len(faces):
                 raise ArgumentError(f"world {worlds[v]} of camera {v} has no shapes")
-        self._parts = check_integer("oversampling", oversampling, 1, 1024)
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(taps, dtype=float, device=self.device)
         self._lane_count = min(check_integer("lanes", lanes, 1, 64), self.cameras if self.device.is_cuda else 1)

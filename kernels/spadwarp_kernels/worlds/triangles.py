@@ -177,11 +177,13 @@ class CameraMeshes:
                 start += count
             self._indices.append(np.concatenate(indices) if indices else np.zeros((0, 3), int))
             self.face_shape.append(np.concatenate(owner) if owner else np.zeros(0, int))
-        self._ends = np.cumsum([0, *(int(np.count_nonzero(np.concatenate(camera) == v)) for v in range(len(world)))])
+        self._ends = np.cumsum(
+            [0, *(int(np.count_nonzero(np.concatenate([[], *camera]) == v)) for v in range(len(world)))]
+        )
         self.corners = Corners()
         for name, rows, dtype in (("camera", camera, int), ("shape", shape, int), ("source", source, int)):
-            setattr(self.corners, name, wp.array(np.concatenate(rows), dtype=dtype, device=device))
-        self.corners.unit = wp.array(np.concatenate(unit), dtype=wp.vec4, device=device)
+            setattr(self.corners, name, wp.array(np.concatenate([[], *rows]), dtype=dtype, device=device))
+        self.corners.unit = wp.array(np.concatenate([np.zeros((0, 4)), *unit]), dtype=wp.vec4, device=device)
         self.points = wp.zeros(int(self._ends[-1]), dtype=wp.vec3, device=device)
 
     def place(self, camera_q: wp.array, optical: wp.transform, reach: float) -> None:

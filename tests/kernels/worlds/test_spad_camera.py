@@ -276,7 +276,10 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
         (lambda: sk.make_shapes(["box"], [(1, 1, 1)], albedo=1.5, device="cpu"), r"albedo holds .* outside \[0, 1\]"),
         (lambda: sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[-1], device="cpu"), r"mesh = -1 is outside"),
         (lambda: sk.make_shapes(["box"], [(1, 1, 1)], mesh=2, device="cpu"), "mesh is int; a list is needed"),
-        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], visible=[True] * 3, device="cpu"), r"visible has shape \(3,\)"),
+        (
+            lambda: sk.make_shapes(["box"], [(1, 1, 1)], visible=[True] * 3, device="cpu"),
+            r"visible is bool of shape \(3,\)",
+        ),
         (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
         (lambda: sk.move_shapes(3, None), "shapes is int; a Shapes is needed"),
         (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),

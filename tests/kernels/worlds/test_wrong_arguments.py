@@ -1,0 +1,130 @@
+"""Wrong arguments of the cameras for simulators: errors that name argument and value, and no crash of the process."""
+
+import dataclasses
+import gc
+
+import numpy as np
+import pytest
+import warp as wp
+
+import spadwarp_kernels as sk
+
+SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
+STILL = (0, 0, 0, 0, 0, 0, 1)
+
+
+def poses(*rows):
+    return wp.array(np.array(rows, np.float32), dtype=wp.transform, device="cpu")
+
+
+def triangle(last=2):
+    points = wp.array(np.array([(0, 0, 3), (1, 0, 3), (0, 1, 3)], np.float32), dtype=wp.vec3, device="cpu")
+    return wp.Mesh(points, wp.array([0, 1, last], dtype=int, device="cpu"))
+
+
+def boxes(**arguments):
+    given = {"kind": ["plane", "box"], "size": [(0, 0, 0), (0.3, 0.2, 0.2)], "body": [-1, 0], "device": "cpu"}
+    given |= {"local": [(0, 0, 4, 0, 0, 0, 1), STILL]} | arguments
+    return sk.make_shapes(given.pop("kind"), given.pop("size"), **given)
+
+
+def meshed(mesh, **arguments):
+    return sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh], device="cpu", **arguments)
+
+
+def one_step(kind, shapes, camera_q, body_q):
+    if kind == "camera":
+        camera = sk.SpadCamera(SMALL, device="cpu")
+        camera.update(shapes, camera_q, body_q)
+    else:
+        camera = sk.SpadTracer(shapes, SMALL, photons=500)
+        camera.update(camera_q, body_q)
+    return camera
+
+
+@pytest.mark.parametrize("kind", ["camera", "tracer"])
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ((np.nan,) * 7, r"\[nan, .*\] is not finite"),
+        ((np.inf, 0, 0, 0, 0, 0, 1), r"\[inf, .*\] is not finite"),
+        ((0,) * 7, "has the quaternion .* of length 0; one of length 1 is needed"),
+        ((0, 0, 0, 0, 0, 0, 2), "has the quaternion .* of length 2; one of length 1 is needed"),
+    ],
+)
+def test_poses_of_a_first_step(kind, row, text):
+    with pytest.raises(sk.ArgumentError, match=r"camera_q\[0\].* " + text):
+        one_step(kind, boxes(), poses(row), poses(STILL))
+    with pytest.raises(sk.ArgumentError, match=r"body_q\[0\].* " + text):
+        one_step(kind, boxes(), poses(STILL), poses(row))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"size": [(0, 0, 0), (-1, 1, 1)]}, r"size\[1\] = \[-1.0, 1.0, 1.0\] of a box is not finite and 0 or more"),
+        ({"size": wp.full(2, wp.vec3(np.nan), device="cpu")}, r"size\[0\] = \[nan, .* of a plane is not finite"),
+        ({"body": [-1, 2.5]}, "body is not an integer of 32 bits for some of 2 shapes"),
+        ({"body": [-1, 2**31]}, "body is not an integer of 32 bits"),
+        ({"body": [-1, -7]}, r"body\[1\] = -7 is outside \[-1, 2147483647\]"),
+        ({"local": [STILL, (0,) * 7]}, r"local\[1\] has the quaternion .* of length 0"),
+        ({"world": [[0], [0, 1]]}, "world is not an array: its rows have different lengths"),
+        ({"worlds": 2**31 - 1}, r"worlds = 2147483647 is outside \[1, 16777216\]"),
+        ({"visible": "yes"}, "visible is .*; true or false for each of 2 shapes is needed"),
+        ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh that exists"),
+        ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\] has indices 0 to 9, outside \[0, 2\]"),
+        ({"kind": ["mesh"] * 2, "mesh": [triangle()] * 2, "first_face": 99}, "reach beyond the 0 faces of textures"),
+    ],
+)
+def test_shapes(arguments, text):
+    with pytest.raises(sk.ArgumentError, match=text):
+        boxes(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"pulse_energy": 1e30}, r"config.pulse_energy = 1e\+30 is outside \[0, 1e6\]"),
+        ({"timing_sigma": 1e3}, "config.timing_sigma = 1000.0 s is .* bins"),
+        ({"seed": None}, "config.seed = None is not an integer"),
+    ],
+)
+def test_configs(arguments, text):
+    with pytest.raises(sk.ArgumentError, match=text):
+        sk.SpadConfig(**arguments)
+
+
+def test_arrays_that_no_device_holds():
+    with pytest.raises(sk.ArgumentError, match=r"cameras x config.height x config.width = 48000000000 is outside"):
+        sk.SpadCamera(SMALL, 10**9, device="cpu")
+    with pytest.raises(sk.ArgumentError, match=r"= 40000000 x 6 x 8 x 8192: .* need 1.26e\+05 GB, and cpu has"):
+        sk.SpadCamera(dataclasses.replace(SMALL, bins=8192), 4 * 10**7, device="cpu")
+    with pytest.raises(sk.ArgumentError, match="oversampling = 17179869184 is outside"):
+        sk.SpadTracer(boxes(), sk.SpadConfig(width=512, height=512, bins=64), oversampling=1024)
+    with pytest.raises(sk.ArgumentError, match="world 0 of camera 0 has no shapes"):
+        sk.SpadTracer(boxes(visible=False), SMALL)
+
+
+@pytest.mark.parametrize("kind", ["camera", "tracer"])
+def test_a_mesh_lives_as_long_as_its_shapes(kind):
+    mesh = triangle()
+    shapes = meshed(mesh.id)
+    del mesh
+    gc.collect()
+    assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
+
+
+def test_what_changes_in_place_to_something_that_there_is_not(device):
+    """Worlds of cameras and kinds of shapes: nothing is seen there."""
+    world = wp.zeros(1, dtype=int, device=device)
+    shapes = sk.make_shapes(["plane"], [(0, 0, 0)], local=[(0, 0, 4, 0, 0, 0, 1)], device=device)
+    camera = sk.SpadCamera(SMALL, world=world, device=device)
+    pose = wp.array([STILL], dtype=wp.transform, device=device)
+    for there in (0, 7, -3):
+        world.fill_(there)
+        camera.update(shapes, pose)
+        assert np.isfinite(camera.true_depth.numpy()).all() == (there == 0)
+    world.zero_()
+    shapes.table.kind.fill_(99)
+    camera.update(shapes, pose)
+    assert np.isnan(camera.true_depth.numpy()).all()
