@@ -55,7 +55,9 @@ def denoise(
     depth: Annotated[
         bool, typer.Option("--depth", help="Three dimensions in .npy and .mat are frames of depth, not a histogram.")
     ] = False,
-    channel: Annotated[str | None, typer.Option(metavar="NAME", help="Channel of an EXR that holds depth.")] = None,
+    channel: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Channel of an EXR that holds depth; of a result: co or cross.")
+    ] = None,
     scale: Annotated[
         float, typer.Option(parser=opt.real_number, metavar="M", help="Metres per unit of stored depth; 0.01 for cm.")
     ] = 1.0,

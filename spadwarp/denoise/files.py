@@ -204,7 +204,8 @@ def read_depth(
     Args:
         path: The file.
         as_depth: Three dimensions in `.npy` and `.mat` are frames `[N, H, W]` of depth, not a histogram.
-        channel: Of an EXR; default: the first of Z, depth, range, A that it has.
+        channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
+            "co" or "cross", see `spadwarp.result.received`; default: "I", all light.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
         method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
             where the response is not known.
@@ -221,10 +222,12 @@ def read_depth(
         raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ArgumentError(f"scale = {scale} is outside (0, inf)")
-    truth = None
+    truth: NDArray[np.float32] | None = None
+    of_result: dict[str, Any] = {}
     if is_own_file(place):
         held = load(place)
         own, truth = stored_depth(held), _truth(held)
+        of_result = {"channel": channel or "I"} if isinstance(held, Result) else {}
         if own is not None:
             frames = own.values.astype(np.float32)
             return DepthReading(
@@ -242,7 +245,7 @@ def read_depth(
         frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
         source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = read_histograms(place, **measured)
+    histograms = read_histograms(place, **measured, **of_result)
     return dataclasses.replace(_estimate_depth(histograms, method, group_index, device), truth=truth)
 
 

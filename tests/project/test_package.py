@@ -65,6 +65,7 @@ LOADED_LATE = {
     "denoise/training_steps.py",
     "denoise/votes.py",
     "transport/device_worker.py",
+    "transport/polarisation.py",
     "transport/local_workers.py",
     "transport/model.py",
 }

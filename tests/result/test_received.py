@@ -7,8 +7,9 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, run, tables
+from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
-from spadwarp.dataset import Recipe
+from spadwarp.dataset import Recipe, iterate_dataset
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result import COMPONENTS, degree_of_polarisation, received
 
@@ -153,3 +154,33 @@ def test_recipes_take_a_channel_of_traced_scenes_only():
     with pytest.raises(ConfigError, match=r"channel = 'cross' needs share = 1"):
         recipe.with_overrides({"monte_carlo.channel": "cross"})
     assert isinstance(recipe.with_overrides({"monte_carlo.share": 1.0, "monte_carlo.channel": "cross"}), Recipe)
+
+
+def test_data_sets_and_denoisers_take_a_channel(analysed, tmp_path):
+    place = analysed.save(tmp_path / "result.h5")
+    seen = {name: spadwarp.denoise.read_depth(place, channel=name, device="cpu") for name in (None, "I", "cross")}
+    np.testing.assert_array_equal(seen[None].depth, seen["I"].depth)
+    assert not np.array_equal(seen["cross"].depth, seen["I"].depth)
+    np.testing.assert_allclose(seen["cross"].depth[0], received(analysed, "cross").depth(), atol=0.05)
+    changes = {
+        "targets.builtin": ["staircase"],
+        "targets.validation": [],
+        "frames.per_scene": 2,
+        "gate.bins": 64,
+        "scenes_per_target": 1,
+        "scene.camera.width": 8,
+        "scene.camera.height": 6,
+        "scene.camera.polarisation": "analyser",
+        "scene.laser.polarisation": "linear",
+        "scene.medium.scattering_matrix": "voss_fry",
+        "scene.transport.axis_threshold": 1.0,
+        "monte_carlo.share": 1.0,
+        "monte_carlo.photons": 20_000,
+        "monte_carlo.counts": "dense",
+    }
+    light = {}
+    for name in ("I", "cross"):
+        make(recipe(**changes, **{"monte_carlo.channel": name, "exposure.signal_photons": None}), tmp_path / name)
+        items = iterate_dataset(tmp_path / name, "test", fields=("expected",))
+        light[name] = sum(item["expected"].sum(dtype=np.float64) for item in items)
+    assert 0.3 < light["cross"] / light["I"] < 0.51
