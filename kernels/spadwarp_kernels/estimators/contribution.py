@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
+from spadwarp_kernels.math.bits import from_bits
 from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
@@ -41,7 +42,8 @@ class Request:
         lens: The point of the lens by which a flight is scored; others draw one from `first`.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
         first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
-            tracking through a grid.
+            tracking through a grid. With `takes_collisions` the second has the bits of the distance to the collision
+            [m] where that is scored.
         rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
         component: Index into COMPONENTS.
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
@@ -150,6 +152,17 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
     return event_request
 
 
+@wp.func
+def scores_collision(word: wp.uint32) -> bool:
+    """Whether a flight is scored at its collision: by the first bit of the first word of its request."""
+    return word >= wp.uint32(0x80000000)
+
+
+def takes_collisions(spec: TransportSpec) -> bool:
+    """Whether half the points of flights are where the photon collides, if it does so in their interval."""
+    return spec.water.profile is not None and spec.water.profile.draw is None
+
+
 @functools.cache
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
@@ -158,9 +171,8 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
-    # What the flight has passed where its point was drawn is known, unless that was drawn from blocks.
-    has_profile, exact = profile is not None, profile is not None and profile.depth is not None
-    depth_along = profile.depth if profile is not None and profile.depth is not None else water_extinction
+    has_profile, collides = profile is not None, takes_collisions(spec)
+    depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
     apparent_lens = make_apparent_lens(spec)
 
     @wp.func
@@ -175,6 +187,9 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         from_lens = request.x - apparent_lens(camera, middle, request.lens)
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
+        if wp.static(collides):
+            if scores_collision(request.first):
+                xi = from_bits(int(request.second))
         if wp.static(has_profile):
             flight = sample_flight(from_lens, request.u, request.interval, 0.0, medium, xi_choice, xi, layers, begin)
         else:
@@ -186,7 +201,19 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         weight = float(request.weight)
         if wp.static(local_albedo):
             weight *= there.albedo
-        if wp.static(exact):
+        if wp.static(collides):
+            # What is scored at collisions has lost light by chance already. Both kinds of points share a density, of
+            # about 1/2 c exp(-depth) + 3/4 p(angle): any would do that does not depend on chance (balance heuristic).
+            from_angle = 1.5 * flight.density  # half of p
+            about = wp.exp(-depth_along(medium, layers, request.x, request.u, flight.s))
+            flight.density = from_angle + 0.5 * there.extinction * about
+            if scores_collision(request.first):
+                weight *= there.extinction * about
+            else:
+                passed = water_extinction(medium, layers, request.x, request.u, flight.s, seed)
+                weight *= 0.75 * there.extinction * wp.exp(-passed * flight.s)
+                flight.density = wp.where(from_angle > 0.0, flight.density, 0.0)
+        elif wp.static(has_profile):
             before = float(0.0)
             if s0 > 0.0:
                 before = depth_along(medium, layers, request.x, request.u, s0)

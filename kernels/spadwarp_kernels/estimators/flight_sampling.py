@@ -124,9 +124,11 @@ def _chord_slope(d: float, along: float, r: float) -> float:
 @functools.cache
 def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Profile | None = None) -> wp.Function:
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
-    profile ``(..., layers, begin_point)``, the latter where the interval begins."""
-    has_profile = profile is not None
-    draw = profile.draw if profile is not None else sample_lens  # any function: it is not called
+    profile ``(..., layers, begin_point)``, the latter where the interval begins. With a profile that draws nothing xi
+    is the distance to the collision unless the point is to be drawn from the angle, and the density is that of the
+    angle alone."""
+    has_profile, draws = profile is not None, profile is not None and profile.draw is not None
+    draw = profile.draw if profile is not None and profile.draw is not None else sample_lens  # any: it is not called
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
     # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
     turn_of, along_of, slope = (
@@ -176,12 +178,14 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
         if xi_choice < angular:
             g = begin - xi * span
             s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
-            if wp.static(has_profile):
+            if wp.static(draws):
                 given = wp.clamp(s, s0, s1) - s0
         else:
             if wp.static(not has_profile):
                 s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
-        if wp.static(has_profile):
+            if wp.static(has_profile and not draws):
+                s = xi
+        if wp.static(draws):
             drawn = draw(medium, layers, begin_point, u, width, given, xi)
             s = s0 + drawn.s
             sample.depth = drawn.depth
@@ -189,8 +193,10 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
 
         along = s - t_c
         r = wp.sqrt(d * d + along * along)
-        if wp.static(has_profile):
+        if wp.static(draws):
             linear_density = drawn.density
+        elif wp.static(has_profile):
+            linear_density = 0.0
         else:
             linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
         towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)

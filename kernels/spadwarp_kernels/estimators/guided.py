@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from spadwarp_kernels.math.bits import bits_of
 from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
@@ -30,7 +31,7 @@ from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
 
-from .contribution import Request, make_event_request, make_score
+from .contribution import Request, make_event_request, make_score, scores_collision, takes_collisions
 from .estimator import Direction, Estimator, FlightPlan
 from .flight_sampling import make_sample_lens
 from .link import make_toward
@@ -89,6 +90,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
     local_albedo, derives, polarised = spec.varies and not spec.random_albedo, bool(spec.derivatives), spec.polarised
+    collides = takes_collisions(spec)
 
     @wp.func
     def request_flight(s: PhotonState) -> Request:
@@ -104,6 +106,15 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.interval = s.flight.interval
         q.first = s.flight.sample_block[0]
         q.second = s.flight.sample_block[1]
+        if wp.static(collides):
+            # Half of the collisions in the interval are scored. The other flights are scored at a point drawn from the
+            # angle, those that might have been scored at their collision with twice the weight.
+            collision = s.flight.interval[0] <= s.flight.distance and s.flight.distance < s.flight.interval[1]
+            if collision and scores_collision(q.first):
+                q.second = wp.uint32(bits_of(s.flight.distance))
+            else:
+                q.weight *= wp.where(collision, 2.0, 1.0)
+                q.first = q.first & wp.uint32(0x7FFFFFFF)
         q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1

@@ -23,8 +23,8 @@ from .grid import (
 from .layers import Layers, Profile, ProfileSample, Water
 from .water import Medium
 
-# Pieces of a flight in which `guided` draws its points from the extinction of the block in the middle.
-_PIECES = wp.constant(10)
+# Pieces of a flight whose optical depth is estimated from the block in the middle of each.
+_PIECES = wp.constant(4)
 
 
 @wp.func
@@ -95,61 +95,25 @@ def draw_by_cells(
 
 
 @wp.func
-def draw_by_blocks(
-    medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, width: float, given: float, xi: float
-) -> ProfileSample:
-    """A point of [0, width] by the extinction of the blocks in the middle of _PIECES pieces.
-
-    A piece is chosen as it comes, with the chance of its weight among all so far, and a point in it from the
-    exponential of its extinction. That has a floor: wherever there may be water, there is a density.
-    """
+def depth_by_blocks(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+    """About the optical depth between x and x + length u: from the mean extinction of the blocks in the middle of
+    _PIECES pieces."""
     grid = layers.grid
-    step = width / float(_PIECES)
-    wanted = int(-1)
-    if given >= 0.0:
-        wanted = wp.min(int(given / step), _PIECES - 1)
+    step = length / float(_PIECES)
     scale = 1.0 / float(grid.block_edge)
     along = (scale * step) * (grid.turn * u)
     p = scale * (grid.turn * x + grid.shift) + 0.5 * along
     size = scale * wp.vec3(float(grid.size[0]), float(grid.size[1]), float(grid.size[2]))
-    rest = float(xi)
-    passed = float(1.0)
-    total = float(0.0)
-    chosen = int(0)
-    weight = float(0.0)
-    extinction = float(0.0)
+    depth = float(0.0)
     k = int(0)
     while k < _PIECES:  # not unrolled: registers are few
         c = float(medium.extinction)
         if wp.min(p[0], wp.min(p[1], p[2])) >= 0.0 and p[0] < size[0] and p[1] < size[1] and p[2] < size[2]:
             c = grid.block_control[(int(p[0]) * grid.block_size[1] + int(p[1])) * grid.block_size[2] + int(p[2])][0]
+        depth += c * step
         p += along
-        c += 0.1 / width
-        left = wp.exp(-c * step)
-        share = passed * wp.min(c * step, 1.0)
-        passed *= left
-        total += share
-        chance = share / wp.max(total, 1.0e-30)
-        take = rest < chance
-        rest = wp.where(take, rest / wp.max(chance, 1.0e-30), (rest - chance) / wp.max(1.0 - chance, 1.0e-30))
-        if wanted >= 0:
-            take = k == wanted
-        if take:
-            chosen = k
-            weight = share
-            extinction = c
         k += 1
-    sample = ProfileSample()
-    kept = 1.0 - wp.exp(-extinction * step)
-    thick = extinction * step > 1.0e-3
-    within = given - float(chosen) * step
-    if given < 0.0:
-        rest = wp.clamp(rest, 0.0, 1.0)
-        within = wp.min(wp.where(thick, -wp.log(1.0 - rest * kept) / extinction, rest * step), step)
-    sample.s = float(chosen) * step + within
-    density = wp.where(thick, extinction * wp.exp(-extinction * within) / kept, 1.0 / step)
-    sample.density = density * weight / wp.max(total, 1.0e-30)
-    return sample
+    return depth
 
 
 @wp.func
@@ -242,5 +206,5 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 
-REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(draw_by_cells, depth_along))
-DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(draw_by_blocks))
+REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(depth_along, draw_by_cells))
+DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(depth_by_blocks))

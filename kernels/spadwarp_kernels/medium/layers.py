@@ -153,8 +153,7 @@ def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 @wp.struct
 class ProfileSample:
-    """A point of a line: its distance s [m], the density over s of the draw [1/m], and with an exact profile the
-    optical depth up to it."""
+    """A point of a line: its distance s [m], the density over s of the draw [1/m], and the optical depth up to it."""
 
     s: float
     density: float
@@ -162,17 +161,17 @@ class ProfileSample:
 
 
 class Profile(NamedTuple):
-    """Extinction along a line, from which `guided` draws a point of a flight, as Warp functions.
+    """Extinction along a line, by which `guided` takes a point of a flight, as Warp functions.
 
     Attributes:
-        draw: ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width], near to c(s)
+        depth: ``(medium, layers, x, u, length) -> float``, the optical depth.
+        draw: ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width] from c(s)
             exp(-depth(s)); or, where that is not negative, the point `given` with the density that it would have.
-        depth: ``(medium, layers, x, u, length) -> float``, the optical depth of the water itself; None: `draw` does not
-            know it either.
+            None: the point is where the photon collides, and `depth` is an estimate without chance.
     """
 
-    draw: wp.Function
-    depth: wp.Function | None = None
+    depth: wp.Function
+    draw: wp.Function | None = None
 
 
 class Water(NamedTuple):
