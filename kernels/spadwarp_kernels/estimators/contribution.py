@@ -155,7 +155,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
 @wp.func
 def scores_collision(word: wp.uint32) -> bool:
     """Whether a flight is scored at its collision: by the first bit of the first word of its request."""
-    return word >= wp.uint32(0x80000000)
+    return (word >> wp.uint32(31)) > wp.uint32(0)
 
 
 def takes_collisions(spec: TransportSpec) -> bool:

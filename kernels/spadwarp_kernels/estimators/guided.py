@@ -114,7 +114,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
                 q.second = wp.uint32(bits_of(s.flight.distance))
             else:
                 q.weight *= wp.where(collision, 2.0, 1.0)
-                q.first = q.first & wp.uint32(0x7FFFFFFF)
+                q.first = (q.first << wp.uint32(1)) >> wp.uint32(1)
         q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1

@@ -23,9 +23,6 @@ from .grid import (
 from .layers import Layers, Profile, ProfileSample, Water
 from .water import Medium
 
-# Pieces of a flight whose optical depth is estimated from the block in the middle of each.
-_PIECES = wp.constant(4)
-
 
 @wp.func
 def _over(depth: float, extinction: float) -> float:
@@ -95,25 +92,18 @@ def draw_by_cells(
 
 
 @wp.func
-def depth_by_blocks(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
-    """About the optical depth between x and x + length u: from the mean extinction of the blocks in the middle of
-    _PIECES pieces."""
+def depth_by_block(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+    """A guess of the optical depth between x and x + length u, from the mean extinction of the block in the middle."""
     grid = layers.grid
-    step = length / float(_PIECES)
-    scale = 1.0 / float(grid.block_edge)
-    along = (scale * step) * (grid.turn * u)
-    p = scale * (grid.turn * x + grid.shift) + 0.5 * along
-    size = scale * wp.vec3(float(grid.size[0]), float(grid.size[1]), float(grid.size[2]))
-    depth = float(0.0)
-    k = int(0)
-    while k < _PIECES:  # not unrolled: registers are few
-        c = float(medium.extinction)
-        if wp.min(p[0], wp.min(p[1], p[2])) >= 0.0 and p[0] < size[0] and p[1] < size[1] and p[2] < size[2]:
-            c = grid.block_control[(int(p[0]) * grid.block_size[1] + int(p[1])) * grid.block_size[2] + int(p[2])][0]
-        depth += c * step
-        p += along
-        k += 1
-    return depth
+    p = grid.turn * (x + (0.5 * length) * u) + grid.shift
+    extinction = float(medium.extinction)
+    size = wp.vec3(float(grid.size[0]), float(grid.size[1]), float(grid.size[2]))
+    if wp.min(p[0], wp.min(p[1], p[2])) >= 0.0 and p[0] < size[0] and p[1] < size[1] and p[2] < size[2]:
+        p /= float(grid.block_edge)
+        extinction = grid.block_control[(int(p[0]) * grid.block_size[1] + int(p[1])) * grid.block_size[2] + int(p[2])][
+            0
+        ]
+    return extinction * length
 
 
 @wp.func
@@ -207,4 +197,4 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
 
 
 REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(depth_along, draw_by_cells))
-DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(depth_by_blocks))
+DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(depth_by_block))

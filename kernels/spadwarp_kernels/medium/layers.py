@@ -167,7 +167,7 @@ class Profile(NamedTuple):
         depth: ``(medium, layers, x, u, length) -> float``, the optical depth.
         draw: ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width] from c(s)
             exp(-depth(s)); or, where that is not negative, the point `given` with the density that it would have.
-            None: the point is where the photon collides, and `depth` is an estimate without chance.
+            None: the point is where the photon collides, and `depth` is a guess without chance.
     """
 
     depth: wp.Function

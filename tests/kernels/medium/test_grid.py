@@ -150,8 +150,8 @@ def test_points_of_a_flight_have_the_density_that_is_said(device):
     assert counted[expected < 1e-9].sum() == 0
     chi2 = ((counted - expected) ** 2 / np.maximum(expected, 1.0))[expected > 20].sum()
     assert chi2 < bins + 4.0 * (2.0 * bins) ** 0.5
-    # What guided takes from the blocks' mean is a guess, the same for the same line.
-    assert np.ptp(about) == 0.0 and about[0] == pytest.approx(optical_depth(extinction, x[0], u[0], 3.0), rel=0.3)
+    # With delta tracking guided takes a guess from blocks, the same for the same line.
+    assert np.ptp(about) == 0.0 and about[0] == pytest.approx(optical_depth(extinction, x[0], u[0], 3.0), rel=0.5)
 
 
 @pytest.mark.parametrize("block_edge", [2, 4, 13])
