@@ -6,6 +6,8 @@ of eight numbers: the components of the planes, then the lower and the upper cor
 
 import warp as wp
 
+from spadwarp_kernels.math.memory import zeros
+
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
 WIDENING = wp.constant(4.0e-7)
 
@@ -126,7 +128,7 @@ def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) ->
 
 def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
     """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks]."""
-    faces = wp.zeros(face_vectors(order.size, mesh.device), dtype=wp.vec4, device=mesh.device)
+    faces = zeros(face_vectors(order.size, mesh.device), wp.vec4, mesh.device)
     set_faces(mesh, extent, order, faces)
     return faces
 

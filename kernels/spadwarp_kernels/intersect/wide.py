@@ -204,7 +204,7 @@ def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.arra
     nodes, leaves = counts.numpy()
     rows = np.zeros((nodes, 7, LANES), np.float32)
     rows[:, 6] = children.numpy()[: LANES * nodes].reshape(nodes, LANES).view(np.float32)
-    tree = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu")
+    tree = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu", copy=False)  # in large pages, see `zeros`
     order = wp.clone(order[: LANES * leaves])
     faces = pack_faces(mesh, extent, order)
     wp.launch(_boxes_kernel, 1, [faces], [tree], device="cpu")

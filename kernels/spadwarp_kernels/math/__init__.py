@@ -1,7 +1,8 @@
-"""Directions and bits."""
+"""Directions, bits and memory."""
 
 from .bits import bits_of, from_bits
 from .float64 import expm1, log1p, normal_cdf, one_minus_exp
+from .memory import zeros
 from .rotations import cos_sin_turn, cotangent, one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
 
 __all__ = [
@@ -17,4 +18,5 @@ __all__ = [
     "orthonormal_basis",
     "rotate_direction",
     "snap_direction",
+    "zeros",
 ]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import warp as wp
 
 from spadwarp_kernels.arguments import check_array, check_device, check_integer, check_kind, check_seed
+from spadwarp_kernels.math.memory import zeros
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -121,7 +122,7 @@ def make_data(
     check_kind("model", model, Model)
     size = check_integer("bins of the tally", model.tally_size, 0) if histogram else 1
     if tally is None:
-        tally = wp.zeros(size, dtype=wp.int64, device=model.device)
+        tally = zeros(size, wp.int64, model.device)
     else:
         check_array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
     derivatives = check_integer("derivatives", derivatives, 0, MOST_DERIVATIVES + MOST_BLOCK_DERIVATIVES)
@@ -133,7 +134,7 @@ def make_data(
         cursor=wp.zeros(1, dtype=int, device=model.device),
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
         reflecting=any((*model.limits.boundary.low, *model.limits.boundary.high)),
-        gradients=wp.zeros(signed, dtype=wp.int64, device=model.device) if histogram and derivatives else None,
+        gradients=zeros(signed, wp.int64, model.device) if histogram and derivatives else None,
     )
 
 
