@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spadwarp.errors import ArgumentError, FileError
+from spadwarp.inverse.blocks import with_block_means
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, read_unknowns, with_values
 from spadwarp.limits import SEED, check_integer
-from spadwarp.scene import SceneLike, as_scene
-from spadwarp.transport import simulate
+from spadwarp.scene import Scene, SceneLike, as_scene
+from spadwarp.transport import resolve_derivatives, simulate
+from spadwarp.transport.block_derivatives import is_of_grid
 
 if TYPE_CHECKING:
     import torch
@@ -30,7 +34,10 @@ def render(
     Args:
         scene: With values for all that is not a parameter.
         parameters: By name ("medium.absorption", "medium.scattering", "medium.anisotropy", "targets[k].reflectance",
-            or short, as `read_unknowns` takes them) tensors of one number each.
+            or short, as `read_unknowns` takes them) tensors of one number each. "medium.grid.absorption" and
+            "medium.grid.scattering", or "medium.grid.extinction" at fixed albedo: tensors `[x, y, z]`, the mean of the
+            cells of each block [1/m]; cells differ from it as they do in the scene. As of `simulate(blocks=…)`, their
+            numbers divide those of the cells.
         photons: Of each of the two runs.
         seed: 64 bits; another one for every step, or the noise of the simulation is learned.
         device: As in `simulate`; the tensors may lie elsewhere.
@@ -39,7 +46,9 @@ def render(
         `[H, W, T]` before instrument response and noise, of the type and on the device of the first parameter.
 
     Raises:
-        ArgumentError: A parameter that has no scored derivative, is no single number or out of the scene's range.
+        ArgumentError: A parameter that has no scored derivative, is no single number, no blocks, or out of the scene's
+            range.
+        ConfigError: Cells that cannot be divided so, or have no slope.
         FileError: torch is not installed.
     """
     try:
@@ -47,33 +56,61 @@ def render(
     except ModuleNotFoundError as error:
         raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
     given, seed = as_scene(scene), check_integer("seed", seed, SEED)
-    unknowns = read_unknowns(given, list(parameters))
-    for one, value in zip(unknowns, parameters.values(), strict=True):
-        if one.name in (DEPTH, BACKGROUND) or one.per_pixel:
-            raise ArgumentError(f"parameters: {one} has no scored derivative")
-        if not isinstance(value, torch.Tensor) or value.numel() != 1:
-            raise ArgumentError(f"parameters: {one} is not a tensor of one number")
-    names = tuple(one.name for one in unknowns)
+    names, shape = _checked(given, parameters)
+    of_grid = [name for name in names if is_of_grid(name)]
 
     class Rendering(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, *values: torch.Tensor) -> torch.Tensor:
-            numbers = {name: float(value) for name, value in zip(names, values, strict=True)}
+            arrays = {name: value.detach().double().cpu().numpy() for name, value in zip(names, values, strict=True)}
+            numbers = {name: float(value) for name, value in arrays.items() if name not in of_grid}
             at = with_values(given, numbers)
             run: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
-            result = simulate(at, **run)
-            scale = at.laser.photons_per_pulse * at.detections_per_photon
-            ctx.slopes = None
-            if any(ctx.needs_input_grad):
-                other = simulate(at, first_photon=photons, derivatives=list(names), **run)
-                ctx.slopes = [(scale * cube.sum(axis=0)).astype(np.float32) for cube in other.derivatives.values()]
+            with tempfile.TemporaryDirectory() as folder:
+                if of_grid:
+                    means = {name.rpartition(".")[2]: arrays[name] for name in of_grid}
+                    at = with_block_means(at, means, Path(folder))
+                result = simulate(at, **run)
+                scale = at.laser.photons_per_pulse * at.detections_per_photon
+                ctx.slopes = None
+                if any(ctx.needs_input_grad):
+                    other = simulate(at, first_photon=photons, derivatives=names, blocks=shape, **run)
+                    ctx.slopes = [(scale * other.derivatives[name].sum(axis=-4)).astype(np.float32) for name in names]
             return torch.as_tensor(scale * result.histogram, dtype=values[0].dtype, device=values[0].device)
 
         @staticmethod
         def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, ...]:
             (gradient,) = gradients
             slopes = [torch.as_tensor(cube, dtype=gradient.dtype, device=gradient.device) for cube in ctx.slopes]
-            return tuple((gradient * cube).sum() for cube in slopes)
+            return tuple((gradient * cube).sum((-3, -2, -1)) for cube in slopes)
 
-    shapes = [value.reshape(()) for value in parameters.values()]
-    return Rendering.apply(*shapes)  # type: ignore[no-any-return,no-untyped-call]
+    return Rendering.apply(  # type: ignore[no-any-return,no-untyped-call]
+        *(value if is_of_grid(name) else value.reshape(()) for name, value in parameters.items())
+    )
+
+
+def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list[str], tuple[int, ...] | None]:
+    """Full names of the parameters, those of a grid without the block, and the numbers of blocks."""
+    import torch
+
+    plain = [name for name in parameters if not is_of_grid(name)]
+    unknowns = dict(zip(plain, read_unknowns(scene, plain), strict=True)) if plain else {}
+    names, shapes = list[str](), set[tuple[int, ...]]()
+    for name, value in parameters.items():
+        if name not in unknowns:
+            if not isinstance(value, torch.Tensor) or value.ndim != 3:
+                raise ArgumentError(f"parameters: {name} is not a tensor [x, y, z] of blocks")
+            shapes.add(tuple(value.shape))
+            names.append(name)
+            continue
+        one = unknowns[name]
+        if one.name in (DEPTH, BACKGROUND) or one.per_pixel:
+            raise ArgumentError(f"parameters: {one} has no scored derivative")
+        if not isinstance(value, torch.Tensor) or value.numel() != 1:
+            raise ArgumentError(f"parameters: {one} is not a tensor of one number")
+        names.append(one.name)
+    if len(shapes) > 1:
+        raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
+    shape = shapes.pop() if shapes else None
+    resolve_derivatives(scene, [name for name in names if is_of_grid(name)], shape)
+    return names, shape

@@ -1,9 +1,13 @@
 """The renderer as a function of torch."""
 
+import numpy as np
 import pytest
 
 import spadwarp
 from helpers.inverse import CLEAR, plate
+from helpers.scenes import scene as small_scene
+from spadwarp.inverse.blocks import with_block_means
+from spadwarp.scene.grid_cells import grid_cells
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.physics
@@ -43,6 +47,39 @@ def test_gradients_of_a_loss_point_to_the_truth():
         light = spadwarp.inverse.render(scene, {**values, **moved}, photons=100_000, seed=2, device="cpu")
         ((light.sum((0, 1)) - measured) ** 2).sum().backward()
         assert (moved["medium.scattering"].grad > 0) == (factor > 1)
+
+
+def test_blocks_of_a_grid(tmp_path):
+    """Means of blocks move the cells; gradients are the derivatives by block, beside that of a target."""
+    cells = np.linspace(0.5, 1.5, 4 * 2 * 4).reshape(4, 2, 4)
+    np.savez(tmp_path / "cells.npz", extinction=cells, albedo=np.full(cells.shape, 0.8), size=[1.0, 1.0, 1.0])
+    grid = {"file": str(tmp_path / "cells.npz"), "scale": 1.2, "translation": [0.1, 0.0, 1.1], "tracking": "delta"}
+    one = small_scene(medium={"grid": {**grid, "rotation_deg": [0.0, 20.0, 0.0]}}, transport={"estimator": "guided"})
+    means = torch.tensor(cells.reshape(2, 2, 1, 2, 2, 2).mean(axis=(1, 3, 5)), requires_grad=True)
+    reflectance = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    values = {"medium.grid.extinction": means, "reflectance": reflectance}
+    light = spadwarp.inverse.render(one, values, photons=20_000, seed=3, device="cpu")
+    choices = {"photons": 20_000, "seed": 3, "device": "cpu"}
+    torch.testing.assert_close(light, torch.tensor(spadwarp.simulate(one, **choices).detections), rtol=1e-3, atol=0)
+    light.sum().backward()
+    names = ["medium.grid.extinction", "reflectance"]
+    other = spadwarp.simulate(one, first_photon=20_000, derivatives=names, blocks=(2, 1, 2), **choices)
+    scale = one.laser.photons_per_pulse * one.detections_per_photon
+    expected = scale * other.derivatives[names[0]].sum(axis=(3, 4, 5, 6))
+    np.testing.assert_allclose(means.grad, expected, rtol=1e-3)
+    assert reflectance.grad.item() == pytest.approx(scale * other.derivatives["targets[0].reflectance"].sum(), rel=1e-3)
+
+    moved = with_block_means(one, {"extinction": means.detach().numpy() + 0.25}, tmp_path)
+    np.testing.assert_allclose(grid_cells(moved.medium).extinction, cells + 0.25, rtol=1e-6)
+    np.testing.assert_allclose(grid_cells(moved.medium).size, 1.2)
+    for values, words in (
+        ({"medium.grid.extinction": torch.ones(2, 2)}, "is not a tensor"),
+        ({"medium.grid.extinction": torch.ones(3, 1, 1)}, "possible are 1, 2, 4"),
+        ({"medium.grid.absorption": torch.zeros(1, 1, 1)}, "outside"),
+        ({f"medium.grid.{name}": torch.ones(1, 1, 1) for name in ("absorption", "extinction")}, "goes without"),
+    ):
+        with pytest.raises(spadwarp.SpadwarpError, match=words):
+            spadwarp.inverse.render(one, values, **choices)
 
 
 @pytest.mark.parametrize(
