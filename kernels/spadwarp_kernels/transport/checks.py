@@ -309,7 +309,7 @@ def _check_polarisation(spec: TransportSpec, model: Model) -> None:
     for k in range(spec.channels):
         check_number(f"model.derivatives.scale[{k}]", model.derivatives.scale[k], "(0, inf)")
     if spec.specular:
-        count = model.surfaces.order.size
+        count = model.surfaces.reflectance.size
         check_array("model.polarisation.facet_index", polarisation.facet_index, wp.float32, (count,), device)
 
 

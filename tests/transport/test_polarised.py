@@ -1,0 +1,329 @@
+"""Polarised light: the intensity's bits, single scatter by quadrature, Rayleigh atmospheres, surfaces, estimators."""
+
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.estimators import clear_at_the_lens
+from helpers.scenes import PLATE, scene
+from helpers.statistics_of_samples import equal_means_p
+from reference.polarised_lidar import linear, stokes_factor
+from reference.rayleigh_tables import TABLES, UPPER
+from reference.single_scatter import Lidar, single_scatter
+from reference.stokes import block_matrix
+from spadwarp.errors import ConfigError
+
+pytestmark = pytest.mark.physics
+
+POLARISED = {
+    "medium": {"scattering_matrix": "voss_fry"},
+    "laser": {"polarisation": "linear", "polarisation_angle_deg": 30.0},
+    "camera": {"polarisation": "stokes"},
+}
+
+
+def polarised(**sections):
+    return scene(**{**sections, **{name: {**fields, **sections.get(name, {})} for name, fields in POLARISED.items()}})
+
+
+def totals(result):
+    """Each channel's light in all pixels, by component and bin: [channels, components, bins]."""
+    return np.array([values.sum(axis=(1, 2)) for values in result.channels.values()])
+
+
+@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
+def test_the_intensity_keeps_its_bits_where_nothing_polarises(estimator, device):
+    """With m12 = 0 and no Fresnel element, I is the unpolarised run's, photon by photon."""
+    transport = {"estimator": estimator}
+    plain = spadwarp.simulate(scene(transport=transport), photons=20_000, device=device)
+    medium = {"scattering_matrix": "scaled_rayleigh", "largest_polarisation": 0.0}
+    result = spadwarp.simulate(polarised(medium=medium, transport=transport), photons=20_000, device=device)
+    np.testing.assert_array_equal(result.tallies, plain.tallies)
+    assert result.ledger == plain.ledger and result.counters == plain.counters
+    assert not plain.channels and list(result.channels) == ["I", "Q", "U", "V"]
+    np.testing.assert_allclose(result.channels["I"].sum(axis=0), plain.histogram, rtol=1e-14)
+    # Light that one Lambertian plate has sent here is not polarised.
+    q = result.channels["Q"]
+    assert not q[0].any() and np.abs(q).sum() > 0.0
+
+
+LIDAR = Lidar(pixels=4, field_of_view=math.radians(30.0), half_angle=math.radians(12.0), anisotropy=0.6,
+              edges=np.linspace(3.0, 7.0, 5))  # fmt: skip
+ONCE = {
+    "medium": {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.6, "group_index": 1.0},
+    "laser": {"half_angle_deg": 12.0, "position": [-0.1, 0.0, 0.0]},
+    "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 30.0, "aperture_diameter": 2 * math.sqrt(1e-4 / math.pi)},
+    "gate": {"start_ns": 3.0 / 0.299792458, "bin_width_ps": 1e3 / 0.299792458, "bins": 4},
+    "targets": [],
+    "transport": {"estimator": "guided", "max_collisions": 1, "axis_threshold": 1.0},
+}
+
+
+def spread_matrix(cosine):
+    """A matrix with m34, `[n, 5]`: circular light becomes linear."""
+    c = np.asarray(cosine, np.float64)
+    s2, whole = 1.0 - c**2, 1.0 + c**2
+    return np.stack([-0.6 * s2 / whole, 1.0 + 0.0 * c, 2.0 * c / whole, 0.5 * s2 / whole, 2.0 * c / whole], -1)
+
+
+def in_blocks(elements):
+    def matrices(c):
+        flat = elements(np.ravel(c))
+        return block_matrix(*np.moveaxis(flat, -1, 0)).reshape(*np.shape(c), 4, 4)
+
+    return matrices
+
+
+@pytest.mark.parametrize("laser", ["linear", "right_circular"])
+@pytest.mark.parametrize("estimator", ["guided", "next_event"])
+def test_single_scatter_is_the_quadrature(estimator, laser, device, tmp_path):
+    """Every channel of every pixel within 0.3 % of its intensity, and of all pixels with their signs too."""
+    angles = np.linspace(0.0, 180.0, 721)
+    table = tmp_path / "matrix.csv"
+    np.savetxt(table, np.column_stack([angles, spread_matrix(np.cos(np.radians(angles)))]), delimiter=",")
+    medium = {**ONCE["medium"], "scattering_matrix": "tabulated", "matrix_table": str(table)}
+    beam = {**ONCE["laser"], "polarisation": laser}
+    stokes = (1.0, 0.0, 0.0, 1.0)
+    if laser == "linear":
+        beam["polarisation_angle_deg"] = 30.0
+        stokes = linear(math.radians(30.0))
+    camera = {**ONCE["camera"], "polarisation": "stokes"}
+    transport = {**ONCE["transport"], "estimator": estimator}
+    one = scene(**{**ONCE, "medium": medium, "laser": beam, "camera": camera, "transport": transport})
+    result = spadwarp.simulate(one, photons=2_000_000 if estimator == "guided" else 4_000_000, device=device)
+    found = np.stack([values.sum(axis=0) for values in result.channels.values()], -1)
+    expected = single_scatter(LIDAR, order=40, factor=stokes_factor(LIDAR, in_blocks(spread_matrix), stokes))
+    for kept in ((0, 1), (0, 1, 2)):  # the whole field by bin, and all of it
+        intensity = expected[..., 0].sum(axis=kept)
+        off = (found - expected).sum(axis=kept) / intensity[..., None]
+        assert np.abs(off).max() < 0.003, off
+    assert np.abs(expected.sum(axis=(0, 1, 2))[1:] / expected[..., 0].sum()).max() > 0.3
+
+
+APERTURE = 100.0
+
+
+def far(table):
+    """The camera's distance from the slab, which is 1 m thick [m]; less where light bounces off a ground, from which
+    its next flight is kept away by a part of the coordinates."""
+    return 2.0**12 if table.ground else 2.0**14
+
+
+def atmosphere(table, mu, phi_deg, estimator="next_event"):
+    """A slab of molecules between empty layers, seen by a camera that is far off and whose axis is the slab's normal.
+
+    A pencil beam and a camera that collects the light of the whole slab stand for a wide beam and a point of it. All
+    light leaves for the camera at one zenith angle; its azimuth is that of −x, and the image's y is the φ̂ of the
+    tables, so that their Q and U are −Q and −U of the image.
+    """
+    distance = far(table)
+    across, beam = math.radians(phi_deg) - math.pi, math.sqrt(1.0 - table.mu0**2)
+    direction = np.array([beam * math.cos(across), beam * math.sin(across), table.mu0])
+    entry = np.array([distance * math.sqrt(1.0 - mu * mu), 0.0, distance * mu])
+    empty = {"absorption": 1e-12, "scattering": 0.0}
+    layers = [
+        {"start": distance * mu, "absorption": 0.0, "scattering": table.optical_depth},
+        {"start": distance * mu + 1.0, **empty},
+    ]
+    ground = {
+        **PLATE,
+        "size": [1e4, 1e4],
+        "translation": [entry[0], 0.0, distance * mu + 1.0],
+        "reflectance": table.ground,
+    }
+    water = {"phase_function": "rayleigh", "scattering_matrix": "rayleigh", "depolarisation_ratio": 0.0}
+    start = (entry - 0.5 * direction).tolist()
+    return spadwarp.Scene.from_dict(
+        {
+            "medium": {**empty, **water, "group_index": 1.0, "layers": layers},
+            "laser": {"profile": "collimated", "position": start, "direction": direction.tolist()},
+            "camera": {
+                "width": 1,
+                "height": 1,
+                "horizontal_fov_deg": 179.0,
+                "aperture_diameter": APERTURE,
+                "pinhole": True,
+                "polarisation": "stokes",
+            },
+            "gate": {"start_ns": (distance - 2e3) / 0.299792458, "bin_width_ps": 4e6 / 0.299792458, "bins": 1},
+            "targets": [ground] if table.ground else [],
+            "transport": {
+                "estimator": estimator,
+                "axis_threshold": 1.0,
+                "max_collisions": 200,
+                "weight_cutoff": 0.0,
+                "max_path": 2.0 * distance,
+            },
+        }
+    )
+
+
+def check_atmosphere(table, row, photons, device):
+    """I, Q and U of a row within 4 standard errors; returns the largest standard error over I."""
+    _face, mu, phi, *expected = row
+    result = spadwarp.simulate(atmosphere(table, mu, phi), photons=photons, device=device, uncertainty=True)
+    # The lens has the part A µ/R² sr of the radiant intensity µ L/(π µ0) of the slab, for a flux of π.
+    per_radiance = math.pi * (APERTURE / 2.0) ** 2 * (mu / far(table)) ** 2 / (math.pi * table.mu0)
+    for channel, sign, value in zip("IQU", (1.0, -1.0, -1.0), expected, strict=True):
+        found, error = (float(one[channel].sum()) / per_radiance for one in (result.channels, result.channel_errors))
+        assert abs(sign * found - value) < 4.0 * error + table.digits, f"{channel}: {sign * found} is not {value}"
+    return error / expected[0]
+
+
+CASES = [(table, row) for table in TABLES for row in table.rows if row[0] == UPPER]
+
+
+@pytest.mark.parametrize("case", [0, 1, 6, 9])
+def test_rayleigh_atmosphere_is_that_of_the_tables(case, device):
+    check_atmosphere(*CASES[case], 400_000, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", range(len(CASES)))
+def test_rayleigh_atmospheres_to_a_thousandth(case, device):
+    table, row = CASES[case]
+    # At the horizon one photon in fifty tells anything.
+    assert check_atmosphere(table, row, 40_000_000 if row[1] <= 0.02 else 4_000_000, device) < 1.1e-3
+
+
+def sampled(one, device, photons, seeds):
+    """Channels of each component and bin, all pixels together, of each seed: [seeds, cells]."""
+    rows = [totals(spadwarp.simulate(one, photons=photons, seed=seed, device=device)).ravel() for seed in range(seeds)]
+    return np.array(rows)
+
+
+def agree(one, device, photons=(60_000, 30_000), seeds=32):
+    """Whether analog and guided have the same channels, and next_event and guided in water clear at the lens."""
+    clear = clear_at_the_lens(one)
+    for other, where, count in zip(("analog", "next_event"), (one, clear), photons, strict=True):
+        runs = [where.with_overrides({"transport.estimator": name}) for name in (other, "guided")]
+        a, b = sampled(runs[0], device, count, seeds), sampled(runs[1], device, photons[1], seeds)
+        intensity = np.abs(b).reshape(seeds, 4, -1)[:, 0].mean(axis=0)
+        assert intensity.sum() > 0.0
+        assert equal_means_p(a, b, 0.2) > 1e-3, f"{other} and guided differ"
+
+
+@pytest.mark.slow
+def test_estimators_agree_in_every_channel(device):
+    agree(polarised(), device)
+
+
+SHINY = {**PLATE, "reflectance": 0.2, "specular": 0.6, "roughness": 0.3, "specular_index": 1.6}
+
+
+@pytest.mark.slow
+def test_estimators_agree_on_facets(device):
+    agree(polarised(targets=[{**SHINY, "rotation_deg": [0.0, 35.0, 0.0]}]), device)
+
+
+BOX = {"shape": "box", "lower": [-0.9, -0.7, -0.3], "upper": [0.8, 0.9, 3.0]}
+FACES = {"x_low": 1.6, "x_high": 1.0, "y_low": 1.0, "z_high": 2.0}
+
+
+@pytest.mark.slow
+def test_estimators_agree_between_walls_that_reflect(device):
+    """Fresnel's matrix in the walk of the photon and in the images of next events, total reflection among them."""
+    domain = {**BOX, "outside_index": FACES, "max_reflections": 2}
+    agree(polarised(targets=[], domain=domain), device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("port", [{"shape": "flat", "distance": 0.1}, {"shape": "dome", "radius": 0.3, "offset": 0.05}])
+def test_estimators_agree_behind_ports(port, device):
+    agree(polarised(camera={"port": port, "aperture_diameter": 0.1}, laser={"port": "camera"}), device)
+
+
+CLEAR = {"extinction": 1e-6, "albedo": 0.0, "phase_index": 1.34}
+
+
+def fresnel(cosine, index):
+    """Reflection amplitudes r_s and r_p of a boundary, and the transmissions of both polarisations."""
+    behind = np.sqrt(1.0 - (1.0 - cosine**2) / index**2)
+    s = (cosine - index * behind) / (cosine + index * behind)
+    p = (index * cosine - behind) / (index * cosine + behind)
+    return s, p, 1.0 - s**2, 1.0 - p**2
+
+
+@pytest.mark.parametrize("laser", ["none", "right_circular"])
+def test_facets_polarise_as_fresnel_says(laser, device):
+    """A beam from the side, off the facets of a plate: Q and V of their angle of incidence."""
+    index, source, spot = 1.6, np.array([-2.5, 0.0, 0.0]), np.array([0.0, 0.0, 2.2])
+    one = scene(
+        medium=CLEAR,
+        laser={"profile": "collimated", "position": source.tolist(), "direction": (spot - source).tolist(),
+               "polarisation": laser},
+        camera={"aperture_diameter": 0.01, "polarisation": "stokes"},
+        targets=[{**SHINY, "reflectance": 0.0, "roughness": 0.5, "specular_index": index}],
+        transport={"estimator": "next_event"},
+    )  # fmt: skip
+    result = spadwarp.simulate(one, photons=20_000, device=device)
+    i, q, u, v = totals(result).sum(axis=(1, 2))
+    before, after = (w / np.linalg.norm(w) for w in (spot - source, -spot))
+    s, p, *_ = fresnel(math.sqrt(0.5 * (1.0 - before @ after)), index / 1.34)
+    assert q / i == pytest.approx((p**2 - s**2) / (p**2 + s**2), rel=1e-3)
+    assert v / i == pytest.approx(0.0 if laser == "none" else 2.0 * s * p / (s**2 + p**2), abs=1e-3)
+    assert abs(u / i) < 1e-3 and i > 0.0
+
+
+def test_a_port_polarises_what_it_lets_through(device):
+    """Light of a Lambertian plate through a plane surface: more of it polarised along the field than across."""
+    one = scene(
+        medium=CLEAR,
+        laser={"half_angle_deg": 60.0, "position": [0.0, 0.0, 0.6]},
+        camera={"width": 9, "height": 1, "horizontal_fov_deg": 100.0, "aperture_diameter": 0.01,
+                "port": {"shape": "flat", "distance": 0.1, "thickness": 0.0}, "polarisation": "stokes"},
+        targets=[{**PLATE, "size": [20.0, 20.0]}],
+        transport={"estimator": "next_event"},
+    )  # fmt: skip
+    result = spadwarp.simulate(one, photons=400_000, device=device)
+    i, q, u, v = (values.sum(axis=(0, 1, 3)) for values in result.channels.values())
+    tangent = np.arange(-4.0, 5.0) * 2.0 * math.tan(math.radians(50.0)) / 9.0
+    cosine = 1.0 / np.sqrt(1.0 + tangent**2)
+    *_, across, along = fresnel(cosine, 1.34)
+    np.testing.assert_allclose(q / i, (along - across) / (along + across), atol=0.004)
+    assert q[0] / i[0] > 0.02 and np.abs(u / i).max() < 0.01 and not v.any()
+
+
+def test_an_analyser_splits_the_stokes_vector(device, tmp_path):
+    """co and cross from I, Q and U of the same photons; errors, files, merging and resuming of channels."""
+    analyser = {"polarisation": "analyser", "analyser_angle_deg": 30.0, "extinction_ratio": 50.0}
+    one = polarised(transport={"estimator": "guided"})
+    split = one.with_overrides(camera=analyser)
+    whole = spadwarp.simulate(split, photons=8192, device=device, uncertainty=True)
+    stokes = spadwarp.simulate(one, photons=8192, device=device, uncertainty=True)
+    leak, (i, q, u, _v) = 1.0 / 50.0, stokes.channels.values()
+    along = q * math.cos(math.radians(60.0)) + u * math.sin(math.radians(60.0))
+    for name, sign in (("co", 1.0), ("cross", -1.0)):
+        expected = 0.5 * ((1.0 + leak) * i + sign * (1.0 - leak) * along)
+        np.testing.assert_allclose(whole.channels[name], expected, rtol=1e-4, atol=1e-6 * i.max())
+    # Backscatter keeps much of the laser's polarisation, a Lambertian plate nothing.
+    ratio = totals(whole)[1].sum(axis=1) / totals(whole)[0].sum(axis=1)
+    assert ratio[0] == pytest.approx(1.0, rel=1e-5) and ratio[2] < 0.5
+    assert (whole.channel_errors["cross"] <= whole.standard_error * 1.2).all()
+    assert list(whole.summary()["channels"]) == ["co", "cross"]
+    halves = [spadwarp.simulate(split, photons=8192, device=device, uncertainty=True, shard=(k, 2)) for k in (1, 2)]
+    loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
+    resumed = spadwarp.simulate(split, photons=8192, device=device, resume=halves[0])
+    for other in (loaded, spadwarp.merge(halves), resumed):
+        np.testing.assert_array_equal(other.channel_tallies.tallies, whole.channel_tallies.tallies)
+        np.testing.assert_array_equal(other.channel_errors["co"], whole.channel_errors["co"])
+    with pytest.raises(ConfigError, match=r"medium\.scattering = .* light is polarised"):
+        spadwarp.simulate(split, photons=100, device=device, derivatives=["scattering"])
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"transport": {"axis_threshold": 0.9998}}, "axis_threshold = 0.9998 does not go with polarised light"),
+        ({"medium": {"scattering_matrix": "none"}}, "scattering_matrix = 'none' does not go with polarised light"),
+        ({"medium": {"scattering_matrix": "tabulated"}}, "needs matrix_table"),
+        ({"medium": {"matrix_table": "a.csv"}}, "goes with scattering_matrix = 'tabulated' only"),
+        ({"targets": [{**SHINY, "specular_index": 1.3415}]}, "specular_index = 1.3415 is that of the water"),
+        ({"camera": {"extinction_ratio": 0.5}}, r"extinction_ratio = 0\.5 .* is outside \[1, inf\]"),
+    ],
+)
+def test_what_does_not_go_with_polarised_light_is_refused_by_name(sections, message):
+    with pytest.raises(ConfigError, match=message):
+        polarised().with_overrides(sections)
