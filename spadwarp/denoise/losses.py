@@ -38,7 +38,11 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
             error = error + share * F.binary_cross_entropy_with_logits(part, truth)
     if chosen.shape[1]:  # the candidates' errors, so that one is chosen and not a mean of several
         candidates = torch.cat([batch.frame[:, :1], 0.5 + batch.frame[:, 3 : 3 + POOLED]], dim=1)
-        square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1:], dim=1)
+        square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1 : 2 + POOLED], dim=1)
+        error = error + 0.5 * _depth_error(square.sum(dim=1, keepdim=True), batch.hit, weight, kind, floor)
+    if chosen.shape[1] > 2 + POOLED:  # the same of the selection, which changes nothing before it
+        candidates, scores = chosen[:, 2 + POOLED :].chunk(2, dim=1)
+        square = (candidates - batch.clean).square() * torch.softmax(scores, dim=1)
         error = error + 0.5 * _depth_error(square.sum(dim=1, keepdim=True), batch.hit, weight, kind, floor)
     return error
 

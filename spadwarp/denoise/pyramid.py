@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED
-from spadwarp.denoise.histogram_features import MOST, SEEN
+from spadwarp.denoise.histogram_features import SEEN
+from spadwarp.denoise.selection import Selection, selected
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
 from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
@@ -26,10 +27,7 @@ CLOSE = 0.01
 
 _WIDEST = 0.1  # depths this far from the first answer still count for the second [gate widths]
 
-# Scores, a tenth of them as among the features of histograms.
-_CLEAR = 1.4  # of the median pixel's return, from which semi-global matching decides between surfaces
-_OUTWEIGHED = 1.4  # by which a pixel's own return has to exceed the answer, to replace it
-_SUPPORTED = 0.8  # of a return besides what is usual elsewhere in a histogram
+_SELECTED_AT_ONCE = 1 << 18  # pixels whose candidates are held in memory
 
 
 class _Residual(nn.Module):
@@ -65,9 +63,9 @@ class PyramidNet(nn.Module):
     With `histograms` it also sees the channels of `spadwarp.denoise.histogram_features`. Each pixel then first gets a
     depth from the candidates among them, which replaces the reported one in all that follows: the most probable one,
     never the mean of two returns. The delay of scattered light, which the shape of the return shows, is subtracted from
-    the result. Where photons are enough for semi-global matching, an answer beside its surface that 3×3 pixels find
-    less likely is replaced by it; and one that the pixel's own histogram refutes, by the pixel's own return.
-    A fifth output is the depth of the candidates, and one for each candidate its logit.
+    the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate. A fifth output is the depth of
+    the candidates, and one for each candidate its logit. While it learns, there are also the candidates of the
+    selection and their scores, and the depth is that before the selection.
     """
 
     radius = 2
@@ -128,6 +126,7 @@ class PyramidNet(nn.Module):
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
             self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1]))  # weights of log-likelihoods in these logits
+            self.select = Selection()
             with torch.no_grad():
                 assert self.choose.bias is not None
                 self.enter_features.weight.mul_(0.3)
@@ -161,7 +160,15 @@ class PyramidNet(nn.Module):
             strips = zip(*(part.split(8, 2) for part in parts), strict=True)
             found = torch.cat([_answer_in_place(*strip) for strip in strips], 2)
         if delay is not None:
-            found = _decided(found, frame[:, 3:].float()) - delay
+            parts = found.detach(), others.detach(), frame[:, 3:].float()
+            if torch.is_grad_enabled():
+                candidates, scores = self.select(*parts)
+                extra += [candidates - delay.detach(), scores]
+            else:
+                frames = max(1, _SELECTED_AT_ONCE // depth[0].numel())
+                some = zip(*(part.split(frames) for part in parts), strict=True)
+                found = torch.cat([selected(*self.select(*part)) for part in some])
+            found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 
     def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
@@ -259,33 +266,6 @@ def _answer_in_place(weights: Tensor, trusts: Tensor, values: Tensor, reach: Ten
         found = torch.mul(weight, values, out=part).sum(dim=1, keepdim=True)
         found.div_(weight.sum(dim=1, keepdim=True).add_(1e-12))
     return found
-
-
-def _decided(found: Tensor, features: Tensor) -> Tensor:
-    """The answer, or one that the scores among the features make far more likely."""
-    candidates, own = 0.5 + features[:, :POOLED], features[:, SEEN : SEEN + POOLED]
-    around = features[:, 2 * POOLED : 3 * POOLED]  # of 3×3 pixels, below the highest
-    tops = features[:, POOLED + SCORED * POOLED :]
-    strong = (_median(tops[:, :1]) > _CLEAR) & (tops[:, 1:2] > 0.1 * MOST - 0.01)
-    usual = _median(own[:, 1:2])  # elsewhere in a histogram
-
-    def at(scores: Tensor, answer: Tensor, otherwise: float, reach: float) -> Tensor:
-        near = (candidates - answer).abs() < reach
-        return torch.where(near, scores, otherwise).amax(dim=1, keepdim=True)
-
-    matched = candidates[:, 2:3]
-    apart = (matched - found).abs() > CLOSE
-    better = around[:, 2:3] >= at(around, found, -0.1 * MOST, CLOSE)
-    found = torch.where(strong & apart & better, matched, found)
-
-    answer = at(own, found, 0.0, 2.0 * CLOSE)
-    outweighed = own[:, :1] - torch.maximum(answer, usual) > _OUTWEIGHED
-    return torch.where(outweighed & (answer < usual + _SUPPORTED), candidates[:, :1], found)
-
-
-def _median(scores: Tensor) -> Tensor:
-    """Of all pixels, `[B, 1, 1, 1]`."""
-    return scores.flatten(1).median(dim=1).values[:, None, None, None]
 
 
 def _candidates(

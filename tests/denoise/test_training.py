@@ -6,12 +6,12 @@ import signal
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from spadwarp import ConfigError, FileError
-from spadwarp.denoise import network_files, networks, pyramid
+from spadwarp.denoise import network_files, networks, pyramid, selection
 from spadwarp.denoise.frames import POOLED
-from spadwarp.denoise.histogram_features import FEATURES, SEEN
+from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.losses import loss_of
 from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
@@ -114,16 +114,27 @@ def test_the_answer_in_place_is_the_answer():
         assert all(torch.equal(part, before) for part, before in zip(parts, kept, strict=True))
 
 
-def test_an_answer_that_the_pixel_s_own_photons_refute_is_replaced():
-    """Twenty units of log-likelihood speak for the own return at 0.2, none for the answer 0.7."""
-    features = torch.zeros(1, FEATURES, 4, 4)
-    features[:, :POOLED] = 0.2  # candidates at 0.7
-    features[:, 0] = -0.3  # the own return at 0.2
-    features[:, SEEN] = 2.0
-    answer = torch.full((1, 1, 4, 4), 0.7)
-    assert torch.allclose(pyramid._decided(answer, features), torch.tensor(0.2))
-    features[:, SEEN + 2] = 1.0  # ten for a return at 0.7
-    assert torch.equal(pyramid._decided(answer, features), answer)
+def test_a_new_selection_takes_the_answer_of_the_network():
+    generator = torch.Generator().manual_seed(6)
+    found, logits = torch.rand(2, 1, 8, 9, generator=generator), torch.randn(2, 3, 8, 9, generator=generator)
+    candidates, scores = selection.Selection()(found, logits, torch.randn(2, FEATURES, 8, 9, generator=generator))
+    assert candidates.shape == scores.shape == (2, selection.CHOICES, 8, 9)
+    assert (scores.argmax(dim=1) == 0).float().mean() > 0.95
+
+
+def test_the_selection_is_never_the_mean_of_two_surfaces():
+    candidates = torch.tensor([0.2, 0.2, 0.7, 0.7])[None, :, None, None]
+    for scores, expected in (([0.0, 0.0, 0.1, 0.0], 0.7), ([0.1, 0.0, 0.0, 0.0], 0.2)):
+        found = selection.selected(candidates, torch.tensor(scores)[None, :, None, None])
+        assert torch.allclose(found, torch.tensor(expected))
+
+
+def test_weights_without_a_selection_still_load(tmp_path):
+    path = tmp_path / "histograms.safetensors"
+    kept = {n: v for n, v in networks.build_network("histograms").state_dict().items() if not n.startswith("select.")}
+    save_file(kept, path, metadata={"model": "histograms"})
+    network = network_files.load_network("histograms", path)
+    assert torch.equal(network.state_dict()["evidence"], kept["evidence"])
 
 
 def test_drawn_scenes_are_varied_and_repeatable():

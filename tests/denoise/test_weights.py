@@ -8,7 +8,7 @@ import pytest
 
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
-from spadwarp.denoise import baselines, estimate, inference, weights_metadata
+from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.gates import bins_of_target, gate_of_target
@@ -257,3 +257,12 @@ def test_exports_of_an_engine_are_denoised_as_well_as_other_frames(name):
     noisy = noisy_frame(clean, 0.264)
     found, _ = inference.denoise_frames(depth_frames(noisy, gate=GATE), model="pyramid", device="cpu")
     assert scores(clean, found[0]).psnr > scores(clean, noisy).psnr + 18
+
+
+def test_where_pixels_see_two_surfaces_the_network_is_better_than_the_tuned_classical_estimates():
+    vase = evaluation_scene("vase", "wall", size=(64, 64))
+    found = evaluate_histograms(
+        photons=(10,), sbr=(1.0,), backgrounds=("flat",), returns=(2,), scenes=[vase], device="cpu"
+    )
+    (rmse,) = found.rmse.values()
+    assert rmse["histograms"] < 0.9 * min(value for name, value in rmse.items() if name != "histograms")
