@@ -57,6 +57,7 @@ LOADED_LATE = {
     "denoise/losses.py",
     "denoise/networks.py",
     "denoise/pyramid.py",
+    "denoise/selection.py",
     "denoise/semi_global.py",
     "denoise/shapes.py",
     "denoise/symmetric.py",
