@@ -160,13 +160,13 @@ class PyramidNet(nn.Module):
             strips = zip(*(part.split(8, 2) for part in parts), strict=True)
             found = torch.cat([_answer_in_place(*strip) for strip in strips], 2)
         if delay is not None:
-            parts = found.detach(), others.detach(), frame[:, 3:].float()
+            seen = found.detach(), others.detach(), frame[:, 3:].float()
             if torch.is_grad_enabled():
-                candidates, scores = self.select(*parts)
+                candidates, scores = self.select(*seen)
                 extra += [candidates - delay.detach(), scores]
             else:
                 frames = max(1, _SELECTED_AT_ONCE // depth[0].numel())
-                some = zip(*(part.split(frames) for part in parts), strict=True)
+                some = zip(*(part.split(frames) for part in seen), strict=True)
                 found = torch.cat([selected(*self.select(*part)) for part in some])
             found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
