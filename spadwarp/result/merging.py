@@ -92,6 +92,7 @@ def merge(results: Iterable[ResultLike]) -> Result:
             ("tally unit", first.unit, other.unit),
             ("batch size", first.batch_size, other.batch_size),
             ("list of derivatives", tuple(first.derivatives), tuple(other.derivatives)),
+            ("channel", first.provenance.get("channel"), other.provenance.get("channel")),
         ):
             if a != b:
                 detail = f" ({a} and {b})"

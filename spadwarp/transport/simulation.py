@@ -198,6 +198,9 @@ class _Run:
         self._plan, self._workers, self._resumed, self._checkpoint = plan, workers, resumed, checkpoint
         self._report = (lambda stage, done, total: None) if progress is None else progress
         self._unit = 1.0 / plan.scale
+        if resumed is not None and "channel" in resumed.provenance:
+            channel = resumed.provenance["channel"]
+            raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")
         if resumed is not None and resumed.unit != self._unit:
             raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
         self._focus_distance = focus_distance(plan.scene, plan.mesh)

@@ -149,6 +149,14 @@ def test_channels_that_are_not_there_are_refused(analysed):
         spadwarp.plan(scene(targets=[PLANE]), channel="co", device="cpu")
 
 
+def test_a_channel_is_not_added_to_other_light(analysed):
+    cross = received(analysed, "cross")
+    with pytest.raises(ConfigError, match="resume: the result holds cross-polarised light alone"):
+        spadwarp.simulate(cross.scene, photons=2 * cross.photons, resume=cross, device="cpu")
+    with pytest.raises(ConfigError, match="merge: the channel of the results differs"):
+        spadwarp.merge([cross, received(analysed, "co")])
+
+
 def test_recipes_take_a_channel_of_traced_scenes_only():
     recipe = spadwarp.dataset.load_recipe("small")
     with pytest.raises(ConfigError, match=r"channel = 'cross' needs share = 1"):
