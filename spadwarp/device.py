@@ -113,6 +113,9 @@ def start_warp() -> None:
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     with _kernel_cache():
         _init_quietly()
+    from spadwarp_kernels.compiled import unpack_kernels
+
+    unpack_kernels()
     load = wp.Module.load
 
     @functools.wraps(load)

@@ -14,6 +14,7 @@ from .analytic import (
     statistics_maps,
 )
 from .arguments import ArgumentError
+from .compiled import unpack_kernels
 from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
 from .estimators import ESTIMATORS, Estimator, next_event_value
 from .intersect import segment_meets_box
@@ -282,6 +283,7 @@ __all__ = [
     "u01",
     "u01_fine",
     "u01_tail",
+    "unpack_kernels",
     "unshadowed",
     "update_surfaces",
     "voxel_values_kernel",

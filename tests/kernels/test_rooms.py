@@ -13,6 +13,7 @@ ROOT = Path(sk.__file__).parent
 # A room imports those before it.
 ROOMS = (
     "arguments",
+    "compiled",
     "pixels",
     "math",
     "random",

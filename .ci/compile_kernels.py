@@ -1,0 +1,74 @@
+"""Compiles the CPU kernels of common runs into kernels/spadwarp_kernels/compiled.zip, which goes into the wheel.
+
+python .ci/compile_kernels.py
+
+With both packages installed, on Linux x86-64, before the wheels are built. The scenes that come with the package are
+run with both estimators, their counts drawn and their depth estimated; Warp compiles for `x86-64-v3` meanwhile, and
+keeps the objects under the names that it looks for later.
+"""
+
+import contextlib
+import json
+import re
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+import warp._src.build
+
+import spadwarp
+from spadwarp.io import examples
+from spadwarp_kernels import compiled
+
+
+def compile_for_target() -> None:
+    """Replaces the processor at hand, for which Warp would compile."""
+    build = warp._src.build.build_cpu
+
+    def build_for_target(*args: Any, extra_flags: str = "", **options: Any) -> Any:
+        assert "-march=native" in extra_flags.split(), extra_flags
+        flags = extra_flags.replace("-march=native", f"-target-cpu {compiled.TARGET}")
+        return build(*args, extra_flags=flags, **options)
+
+    warp._src.build.build_cpu = build_for_target
+
+
+def run_common() -> None:
+    for name in examples("scenes"):
+        for estimator in ("guided", "next_event"):
+            scene = spadwarp.load_scene(name, {"transport.estimator": estimator})
+            photons = 64 * scene.scan_positions
+            result = spadwarp.simulate(scene, photons=photons, device="cpu", uncertainty=estimator == "guided")
+        response = spadwarp.frames.detector_response(scene.detector, scene.laser)
+        result.depth(device="cpu")
+        result.depth(method="matched", irf=response, device="cpu")
+        spadwarp.detect(result, pulses=1000, seed=0, device="cpu")
+        with contextlib.suppress(spadwarp.ConfigError):  # of scenes that only `simulate` takes
+            spadwarp.simulate_analytic(scene, frames=1, seed=0, device="cpu")
+        print(name, flush=True)
+
+
+def pack(cache: Path) -> None:
+    with zipfile.ZipFile(compiled.ARCHIVE, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        archive.writestr(compiled.MANIFEST, json.dumps(compiled.this_system()))
+        for path in sorted(cache.glob("*/*.o")):
+            module = re.sub(r"\.cpu[0-9a-f]+\.o$", "", path.name)
+            archive.write(path, f"{module}.o")
+            archive.write(path.with_name(f"{module}.meta"), f"{module}.meta")
+    size = compiled.ARCHIVE.stat().st_size
+    print(f"{compiled.ARCHIVE}: {len(archive.namelist()) // 2} modules, {size / 2**20:.2f} MiB")
+
+
+def main() -> None:
+    compiled.ARCHIVE.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as cache:
+        wp.config.kernel_cache_dir = cache
+        compile_for_target()
+        run_common()
+        pack(Path(wp.config.kernel_cache_dir))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Compiled kernels of the package: put where Warp looks for them, and only where they can be used."""
+
+import json
+import zipfile
+
+import pytest
+import warp as wp
+
+from spadwarp_kernels import compiled, unpack_kernels
+
+
+@pytest.fixture
+def archive(tmp_path, monkeypatch):
+    """Makes an archive with one module, for a system of these properties; Warp's cache is a folder of its own."""
+
+    def make(features=compiled.FEATURES, **changed):
+        with zipfile.ZipFile(tmp_path / "compiled.zip", "w") as file:
+            file.writestr(compiled.MANIFEST, json.dumps({**compiled.this_system(), **changed}))
+            file.writestr("wp_module_0123456.o", b"object")
+            file.writestr("wp_module_0123456.meta", b"{}")
+        monkeypatch.setattr(compiled, "_processor_features", lambda: set(features))
+
+    wp.init()
+    monkeypatch.setattr(compiled, "ARCHIVE", tmp_path / "compiled.zip")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    return make
+
+
+def test_objects_have_the_names_that_warp_looks_for(archive, tmp_path):
+    archive()
+    assert unpack_kernels() == 1
+
+    @wp.kernel(module="unique")
+    def fill(values: wp.array(dtype=float)):
+        values[wp.tid()] = 1.0
+
+    wp.launch(fill, dim=1, outputs=[wp.zeros(1, dtype=float, device="cpu")], device="cpu")
+    own, ours = sorted((tmp_path / "cache").glob("*/*.o"), key=lambda path: "module_0123456" in path.name)
+    assert own.name.split(".")[1:] == ours.name.split(".")[1:]
+    assert ours.name.startswith("wp_module_0123456.") and ours.parent.name == "wp_module_0123456"
+    assert sorted(path.suffix for path in ours.parent.iterdir()) == [".meta", ".o"]  # and nothing temporary
+
+
+def test_what_is_there_stays(archive, tmp_path):
+    archive()
+    unpack_kernels()
+    (place,) = (tmp_path / "cache").glob("*/*.o")
+    place.write_bytes(b"Warp's own")
+    assert unpack_kernels() == 0 and place.read_bytes() == b"Warp's own"
+
+
+@pytest.mark.parametrize("changed", [{"warp": "1.0"}, {"system": "Plan9"}, {"machine": "vax"}, {"features": ("avx",)}])
+def test_an_archive_for_another_system_is_left_alone(archive, tmp_path, changed):
+    archive(**changed)
+    assert unpack_kernels() == 0 and not (tmp_path / "cache").exists()
+
+
+def test_none_and_a_damaged_archive_are_no_failure(archive):
+    assert unpack_kernels() == 0
+    compiled.ARCHIVE.write_bytes(b"not a zip file")
+    assert unpack_kernels() == 0
