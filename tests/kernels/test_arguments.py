@@ -99,12 +99,13 @@ def test_a_camera_or_gate_that_was_left_empty(box, name, text):
         launch(box, NEXT_EVENT, model=model)
 
 
-def test_an_offset_of_another_kind_is_refused_where_none_is_needed(box):
+def test_an_offset_or_gradients_of_another_kind_are_refused_where_none_are_needed(box):
     model = sk.Model(device="cpu", mesh=box, surfaces=sk.make_surfaces(box, 0.5), scale=2.0**50, **structs())
-    for offset in (wp.zeros(1, dtype=wp.vec4, device="cpu"), wp.zeros(1, dtype=wp.int64, device="cpu"), 3):
-        data = dataclasses.replace(sk.make_data(model), offset=offset)
-        with pytest.raises(sk.ArgumentError, match=r"data\.offset"):
-            launch(box, NEXT_EVENT, model=model, data=data)
+    for name, other in (("offset", wp.int64), ("gradients", wp.float32)):
+        for value in (wp.zeros(1, dtype=wp.vec4, device="cpu"), wp.zeros(1, dtype=other, device="cpu"), 3):
+            data = dataclasses.replace(sk.make_data(model), **{name: value})
+            with pytest.raises(sk.ArgumentError, match=rf"data\.{name}"):
+                launch(box, NEXT_EVENT, model=model, data=data)
 
 
 def test_records_without_room_for_them(box):
