@@ -3,11 +3,16 @@
 import numpy as np
 import warp as wp
 
+# From this size on [bytes], NumPy asks Linux for pages of 2 MiB.
+_LARGE = 1 << 22
+
 
 def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
-    """`wp.zeros`, on the CPU in large pages: for 4 MiB and more, NumPy asks Linux for pages of 2 MiB, so that a core
-    need not look up the page of each voxel that it adds to. `dtype`: int64 or vec4."""
-    if wp.get_device(device).is_cuda:
+    """`wp.zeros`, on the CPU in large pages, so that a core need not look up the page of each voxel that it adds to.
+
+    `dtype`: int64 or vec4.
+    """
+    if wp.get_device(device).is_cuda or size * wp.types.type_size_in_bytes(dtype) < _LARGE:
         return wp.zeros(size, dtype=dtype, device=device)
     memory = np.zeros((size, 4), np.float32) if dtype is wp.vec4 else np.zeros(size, np.int64)
     return wp.array(memory, dtype=dtype, device="cpu", copy=False)
