@@ -185,7 +185,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
-    water_at = spec.water.at
+    water_at, tracks = spec.water.at, spec.grid is not None
     view_of = spec.lens.view
     has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)
@@ -209,7 +209,13 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             on_surface = s.hit.face >= 0
         here = water_at(medium, layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
-        at_surface = guiding.surface_probability * wp.min(2.0 * here.extinction * wp.length(s.x), 1.0)
+        extinction = float(0.0)
+        if wp.static(tracks):
+            if on_surface:  # elsewhere nobody asks for it, and no cell is looked up
+                extinction = water_at(medium, layers, s.x).extinction
+        else:
+            extinction = here.extinction
+        at_surface = guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
         to_lens_chance = wp.where(on_surface, at_surface, guiding.probability)
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_direction(s.u, medium.axis_threshold)
