@@ -179,13 +179,31 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
     return wp.clamp(bound / wp.max(probability, 1.0e-6), 0.0, 1.0 / (1.0 + vessel))
 
 
+@functools.cache
+def _make_extinction_at(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(here, wanted, medium, layers, x) -> float``: the extinction at x, where the water is `here`;
+    of a grid only if it is wanted, since a cell must be looked up for it."""
+    tracks, water_at = spec.grid is not None, spec.water.at
+
+    @wp.func
+    def extinction_at(here: Medium, wanted: bool, medium: Medium, layers: Layers, x: wp.vec3) -> float:
+        extinction = float(0.0)
+        if wp.static(not tracks):
+            extinction = here.extinction
+        elif wanted:
+            extinction = water_at(medium, layers, x).extinction
+        return extinction
+
+    return extinction_at
+
+
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
     phase_pdf = spec.phase.pdf
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
-    water_at, tracks = spec.water.at, spec.grid is not None
+    water_at, extinction_at = spec.water.at, _make_extinction_at(spec)
     view_of = spec.lens.view
     has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)
@@ -209,12 +227,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             on_surface = s.hit.face >= 0
         here = water_at(medium, layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
-        extinction = float(0.0)
-        if wp.static(tracks):
-            if on_surface:  # elsewhere nobody asks for it, and no cell is looked up
-                extinction = water_at(medium, layers, s.x).extinction
-        else:
-            extinction = here.extinction
+        extinction = extinction_at(here, on_surface, medium, layers, s.x)
         at_surface = guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
         to_lens_chance = wp.where(on_surface, at_surface, guiding.probability)
         met = s.surface_count + wp.where(on_surface, 1, 0)
