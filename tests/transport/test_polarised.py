@@ -230,7 +230,9 @@ def test_estimators_agree_between_walls_that_reflect(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("port", [{"shape": "flat", "distance": 0.1}, {"shape": "dome", "radius": 0.3, "offset": [0.0, 0.0, 0.05]}])
+@pytest.mark.parametrize(
+    "port", [{"shape": "flat", "distance": 0.1}, {"shape": "dome", "radius": 0.3, "offset": [0.0, 0.0, 0.05]}]
+)
 def test_estimators_agree_behind_ports(port, device):
     agree(polarised(camera={"port": port, "aperture_diameter": 0.1}, laser={"port": "camera"}), device)
 
