@@ -203,3 +203,38 @@ def test_grids_that_cannot_be_are_refused(change, text):
     with pytest.raises(sk.ArgumentError) as caught:
         sk.make_grid(**{"extinction": ones, "albedo": ones, "size": (1.0, 1.0, 1.0), **change}, device="cpu")
     assert str(caught.value).startswith(text)
+
+
+def test_blocks_divide_the_cells():
+    """Place of a block: that of its cells."""
+    turn = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    grid = sk.make_grid(
+        np.ones((4, 6, 2)),
+        np.ones((4, 6, 2)),
+        size=(2.0, 3.0, 1.0),
+        centre=(0.5, 0.2, 1.0),
+        rotation=turn,
+        device="cpu",
+    )
+    blocks = sk.make_blocks(grid, (2, 3, 1), [1.0])
+    x = np.array([0.3, -0.4, 1.1])
+    cells, found = (np.array(g.turn).reshape(3, 3) @ x + np.array(g.shift) for g in (grid, blocks.grid))
+    np.testing.assert_allclose(found, cells / [2.0, 2.0, 2.0], rtol=1e-5)
+    assert (blocks.count, tuple(blocks.grid.size)) == (6, (2, 3, 1))
+    for shape, scale, words in (
+        ((3, 3, 1), [1.0], "does not divide 4"),
+        ((2, 3), [1.0], "3 are needed"),
+        ((2, 3, 0), [1.0], r"blocks\[2\] = 0"),
+        ((2, 3, 1), [], "kinds of derivatives by block"),
+        ((2, 3, 1), [0.0], r"scale\[0\]"),
+    ):
+        with pytest.raises(sk.ArgumentError, match=words):
+            sk.make_blocks(grid, shape, scale)
+    for spec in (
+        sk.TransportSpec(blocks=("absorption",)),
+        sk.TransportSpec(grid=sk.REGULAR_TRACKING, blocks=("anisotropy",)),
+        sk.TransportSpec(grid=sk.REGULAR_TRACKING, blocks=("absorption", "absorption")),
+        sk.TransportSpec(grid=sk.REGULAR_TRACKING, blocks=("absorption",), bounded=True, reflecting=True),
+    ):
+        with pytest.raises(sk.ArgumentError, match=r"spec\.blocks"):
+            sk.make_transport_kernel(spec)
