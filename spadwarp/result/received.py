@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
 __all__ = ["CHANNELS", "Channel", "degree_of_polarisation", "polarisation_summary", "received"]
+__all__ += ["received_by_pixel"]
 
 Channel = Literal["I", "co", "cross"]
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -45,27 +46,45 @@ def received(result: Result, channel: Channel) -> Result:
             f"channel = {channel!r}: the result has none; simulate with camera.polarisation = 'analyser' or 'stokes'",
             source=None if result.scene.source is None else str(result.scene.source),
         )
-    provenance = {**result.provenance, "channel": channel}
-    stored = result.channel_tallies
+    tallies, unit = _tallies(result, channel)
+    stored, moments = result.channel_tallies, None
+    if stored is not None and stored.second_moment is not None and channel in stored.names:
+        moments = stored.second_moment[:, stored.names.index(channel)].copy()
+    return replace(
+        result,
+        scene=_behind_analyser(result.scene),
+        tallies=tallies,
+        unit=unit,
+        second_moment=moments,
+        batch_size=0 if moments is None else result.batch_size,
+        batch_moments={},
+        channel_tallies=None,
+        derivative_tallies=None,
+        provenance={**result.provenance, "channel": channel},
+    )
+
+
+def received_by_pixel(result: Result, channel: Channel, row: int, column: int) -> Floats:
+    """What `received` has in one pixel, by component: fraction of the emitted photons, float64 `[3, T]`."""
+    tallies, unit = _tallies(result, channel, (slice(None), row, column))
+    return tallies * (result.tally_value[row, column] * unit / result.unit)
+
+
+def _tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tuple[NDArray[np.int64], float]:
+    """Tallies of co- or cross-polarised light, or a part of them, and their unit."""
+    stored, camera = result.channel_tallies, result.scene.camera
     assert stored is not None
-    common: dict[str, Any] = {"channel_tallies": None, "derivative_tallies": None, "batch_moments": {}}
-    common |= {"scene": _behind_analyser(result.scene), "provenance": provenance}
     if channel in stored.names:
         k = stored.names.index(channel)
-        moments = None if stored.second_moment is None else stored.second_moment[:, k].copy()
-        tallies = np.maximum(stored.tallies[k], 0)
-        return replace(result, tallies=tallies, unit=stored.units[k], second_moment=moments, **common)
-    camera = result.scene.camera
+        return np.maximum(stored.tallies[(k, *at)], 0), stored.units[k]
     leak, angle = 1.0 / camera.extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
     sign = 1.0 if channel == "co" else -1.0
-    shares = {"Q": sign * (1.0 - leak) * math.cos(angle), "U": sign * (1.0 - leak) * math.sin(angle)}
-    light = (1.0 + leak) * result.tallies
-    for name, share in shares.items():
+    light = (1.0 + leak) * result.tallies[at]
+    for name, share in {"Q": math.cos(angle), "U": math.sin(angle)}.items():
         k = stored.names.index(name)
-        light += share * (stored.units[k] / result.unit) * stored.tallies[k]
+        light += sign * (1.0 - leak) * share * (stored.units[k] / result.unit) * stored.tallies[(k, *at)]
     # Halves of a unit are kept.
-    tallies = np.rint(np.maximum(light, 0.0)).astype(np.int64)
-    return replace(result, tallies=tallies, unit=0.5 * result.unit, second_moment=None, batch_size=0, **common)
+    return np.rint(np.maximum(light, 0.0)).astype(np.int64), 0.5 * result.unit
 
 
 def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
@@ -77,19 +96,11 @@ def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
 
     Raises `ConfigError` where the result was simulated without channels.
     """
-    axes = (0, 3) if gated else 0
-    sums = {name: values.sum(axis=axes) for name, values in result.channels.items()}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if "Q" in sums:
-            polarised = np.sqrt(sums["Q"] ** 2 + sums["U"] ** 2 + sums["V"] ** 2)
-            return np.minimum(polarised / sums["I"], 1.0)
-        if "co" in sums:
-            leak = 1.0 / result.scene.camera.extinction_ratio
-            both = sums["co"] + sums["cross"]
-            return np.clip((sums["co"] - sums["cross"]) / both * ((1.0 + leak) / (1.0 - leak)), -1.0, 1.0)
-    raise ConfigError(
-        "the degree of polarisation needs channels; simulate with camera.polarisation = 'analyser' or 'stokes'"
-    )
+    if not result.channels:
+        raise ConfigError(
+            "the degree of polarisation needs channels; simulate with camera.polarisation = 'analyser' or 'stokes'"
+        )
+    return _degree(_sums(result, (0, 3) if gated else (0,)), 1.0 / result.scene.camera.extinction_ratio)
 
 
 def polarisation_summary(result: Result) -> dict[str, Any]:
@@ -99,15 +110,29 @@ def polarisation_summary(result: Result) -> dict[str, Any]:
         return {"channel": result.provenance["channel"]}
     if not result.channels:
         return {}
-    # In a scan each pixel has photons of its own.
-    share = result.unit / result.photons / result.tally_value
-    light = {name: float((values.sum(axis=(0, 3)) * share).sum()) for name, values in result.channels.items()}
-    if "Q" in light:
-        degree = math.hypot(light["Q"], light["U"], light["V"]) / light["I"] if light["I"] else None
-    else:
-        both, leak = light["co"] + light["cross"], 1.0 / result.scene.camera.extinction_ratio
-        degree = (light["co"] - light["cross"]) / both * (1.0 + leak) / (1.0 - leak) if both and leak < 1.0 else None
-    return {"channels": light, "degree_of_polarisation": degree}
+    sums = _sums(result, (0, 1, 2, 3))
+    degree = float(_degree(sums, 1.0 / result.scene.camera.extinction_ratio))
+    light = {name: float(sums[name]) / result.photons for name in result.channels}
+    return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
+
+
+def _sums(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
+    """Channel → its light, times the photons."""
+    stored = result.channel_tallies
+    assert stored is not None
+    sums = {"I": result.tallies.sum(axis=axes, dtype=np.float64) * result.unit}
+    for name, tallies, unit in zip(stored.names, stored.tallies, stored.units, strict=True):
+        sums[name] = tallies.sum(axis=axes, dtype=np.float64) * unit
+    return sums
+
+
+def _degree(sums: dict[str, Floats], leak: float) -> Floats:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if "Q" in sums:
+            return np.minimum(np.sqrt(sums["Q"] ** 2 + sums["U"] ** 2 + sums["V"] ** 2) / sums["I"], 1.0)
+        ratio = (sums["co"] - sums["cross"]) / (sums["co"] + sums["cross"])
+        degree: Floats = np.clip(ratio * np.divide(1.0 + leak, 1.0 - leak), -1.0, 1.0)
+        return degree
 
 
 def _behind_analyser(scene: Scene) -> Scene:

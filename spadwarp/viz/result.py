@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.frames import Method
-from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation, received
+from spadwarp.result import COMPONENTS, Result, degree_of_polarisation
 from spadwarp.result.batch_moments import pixel_standard_error
+from spadwarp.result.received import received_by_pixel
 from spadwarp.scene import Medium
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
@@ -134,7 +135,6 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     order = order[intensity.ravel()[order] > 0]
     group = "on the target" if on_target else "of those with a return"
     handles: dict[str, Any] = {}
-    channels = {name: received(result, name) for name in CHANNEL_NAMES} if result.channels else {}
     for axis, name, index in zip(
         figure.subplots(2, 1), ("Brightest", "Median"), (-1, (len(order) - 1) // 2), strict=True
     ):
@@ -145,7 +145,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
         else:
             row, column = divmod(int(order[index]), intensity.shape[1])
             axis.set_title(f"{name} pixel {group}: row {row}, column {column}")
-            _plot_pixel(result, axis, row, column, channels)
+            _plot_pixel(result, axis, row, column)
             handles |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
     if handles:
         columns = 5 if width > 5.0 else 2
@@ -153,7 +153,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     return figure
 
 
-def _plot_pixel(result: Result, axis: Axes, row: int, column: int, channels: Mapping[Channel, Result]) -> None:
+def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     """Components of one pixel over time of flight, and over the range along its line of sight; of polarised light also
     what each channel has of all of them.
 
@@ -182,11 +182,11 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int, channels: Map
             np.maximum(values, 0.01 * bottom), time[own], baseline=None, label=label, color=colour,
             linewidth=1.4 if ballistic else 0.9, zorder=3 if ballistic else 2,
         )  # fmt: skip
-    for (channel, part), line in zip(channels.items(), ("--", ":"), strict=False):
-        seen = part.tallies[:, row, column].sum(axis=0) * (part.tally_value[row, column] * per_pulse)
+    for (channel, label), line in zip(CHANNEL_NAMES.items(), ("--", ":") if result.channels else (), strict=False):
+        seen = received_by_pixel(result, channel, row, column).sum(axis=0) * per_pulse
         axis.stairs(
             np.maximum(merged_means(seen, edges), 0.01 * bottom), time[edges], baseline=None,
-            label=CHANNEL_NAMES[channel], color=PURPLE, linewidth=1.1, linestyle=line, zorder=4,
+            label=label, color=PURPLE, linewidth=1.1, linestyle=line, zorder=4,
         )  # fmt: skip
     arrival_line(axis, 1e9 * float(result.true_path()[row, column]) / result.pulse_speed, time)
     axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
