@@ -102,13 +102,8 @@ def test_single_scatter_is_the_quadrature(estimator, laser, device, tmp_path):
     assert np.abs(expected.sum(axis=(0, 1, 2))[1:] / expected[..., 0].sum()).max() > 0.3
 
 
+FAR = 2.0**14  # the camera's distance from the slab, which is 1 m thick [m]
 APERTURE = 100.0
-
-
-def far(table):
-    """The camera's distance from the slab, which is 1 m thick [m]; less where light bounces off a ground, from which
-    its next flight is kept away by a part of the coordinates."""
-    return 2.0**12 if table.ground else 2.0**14
 
 
 def atmosphere(table, mu, phi_deg, estimator="next_event"):
@@ -118,21 +113,17 @@ def atmosphere(table, mu, phi_deg, estimator="next_event"):
     light leaves for the camera at one zenith angle; its azimuth is that of −x, and the image's y is the φ̂ of the
     tables, so that their Q and U are −Q and −U of the image.
     """
-    distance = far(table)
     across, beam = math.radians(phi_deg) - math.pi, math.sqrt(1.0 - table.mu0**2)
     direction = np.array([beam * math.cos(across), beam * math.sin(across), table.mu0])
-    entry = np.array([distance * math.sqrt(1.0 - mu * mu), 0.0, distance * mu])
+    entry = np.array([FAR * math.sqrt(1.0 - mu * mu), 0.0, FAR * mu])
     empty = {"absorption": 1e-12, "scattering": 0.0}
     layers = [
-        {"start": distance * mu, "absorption": 0.0, "scattering": table.optical_depth},
-        {"start": distance * mu + 1.0, **empty},
+        {"start": FAR * mu, "absorption": 0.0, "scattering": table.optical_depth},
+        {"start": FAR * mu + 1.0, **empty},
     ]
-    ground = {
-        **PLATE,
-        "size": [1e4, 1e4],
-        "translation": [entry[0], 0.0, distance * mu + 1.0],
-        "reflectance": table.ground,
-    }
+    # Below the slab, since light that bounces off a face is kept away from it by a part of the coordinates.
+    low = [entry[0], 0.0, FAR * mu + 1.1]
+    ground = {**PLATE, "size": [1e4, 1e4], "translation": low, "reflectance": table.ground}
     water = {"phase_function": "rayleigh", "scattering_matrix": "rayleigh", "depolarisation_ratio": 0.0}
     start = (entry - 0.5 * direction).tolist()
     return spadwarp.Scene.from_dict(
@@ -147,14 +138,14 @@ def atmosphere(table, mu, phi_deg, estimator="next_event"):
                 "pinhole": True,
                 "polarisation": "stokes",
             },
-            "gate": {"start_ns": (distance - 2e3) / 0.299792458, "bin_width_ps": 4e6 / 0.299792458, "bins": 1},
+            "gate": {"start_ns": (FAR - 2e3) / 0.299792458, "bin_width_ps": 4e6 / 0.299792458, "bins": 1},
             "targets": [ground] if table.ground else [],
             "transport": {
                 "estimator": estimator,
                 "axis_threshold": 1.0,
                 "max_collisions": 200,
                 "weight_cutoff": 0.0,
-                "max_path": 2.0 * distance,
+                "max_path": 2.0 * FAR,
             },
         }
     )
@@ -165,11 +156,13 @@ def check_atmosphere(table, row, photons, device):
     _face, mu, phi, *expected = row
     result = spadwarp.simulate(atmosphere(table, mu, phi), photons=photons, device=device, uncertainty=True)
     # The lens has the part A µ/R² sr of the radiant intensity µ L/(π µ0) of the slab, for a flux of π.
-    per_radiance = math.pi * (APERTURE / 2.0) ** 2 * (mu / far(table)) ** 2 / (math.pi * table.mu0)
+    per_radiance = math.pi * (APERTURE / 2.0) ** 2 * (mu / FAR) ** 2 / (math.pi * table.mu0)
+    errors = []
     for channel, sign, value in zip("IQU", (1.0, -1.0, -1.0), expected, strict=True):
         found, error = (float(one[channel].sum()) / per_radiance for one in (result.channels, result.channel_errors))
         assert abs(sign * found - value) < 4.0 * error + table.digits, f"{channel}: {sign * found} is not {value}"
-    return error / expected[0]
+        errors.append(error / expected[0])
+    return max(errors)
 
 
 CASES = [(table, row) for table in TABLES for row in table.rows if row[0] == UPPER]
@@ -181,11 +174,13 @@ def test_rayleigh_atmosphere_is_that_of_the_tables(case, device):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:ballistic")  # hardly any light passes a slab twice without scattering
 @pytest.mark.parametrize("case", range(len(CASES)))
 def test_rayleigh_atmospheres_to_a_thousandth(case, device):
+    """On a GPU; to two thousandths on a CPU. At the horizon one photon in fifty tells anything."""
     table, row = CASES[case]
-    # At the horizon one photon in fifty tells anything.
-    assert check_atmosphere(table, row, 40_000_000 if row[1] <= 0.02 else 4_000_000, device) < 1.1e-3
+    photons = (40_000_000 if row[1] <= 0.02 else 5_000_000) // (4 if device == "cpu" else 1)
+    assert check_atmosphere(table, row, photons, device) < (2.2e-3 if device == "cpu" else 1.1e-3)
 
 
 def sampled(one, device, photons, seeds):
