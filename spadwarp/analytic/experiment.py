@@ -165,7 +165,10 @@ def plan(
     else:
         span = target_span(scene, device)
     if check_choice("channel", channel, CHANNELS) != "I" and not scene.camera.channels:
-        raise ConfigError(f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'")
+        raise ConfigError(
+            f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'",
+            source=None if scene.source is None else str(scene.source),
+        )
     question = Question(
         depth_error, time, margin, method, full_power, eye_distance, eye_exposure, seed, device, channel
     )

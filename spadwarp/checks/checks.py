@@ -11,6 +11,7 @@ from spadwarp.checks.medium import check_medium
 from spadwarp.checks.message import CheckMessage
 from spadwarp.checks.optics import check_focus, check_ports, check_scan
 from spadwarp.checks.plausible import check_plausible
+from spadwarp.checks.polarisation import check_polarisation
 from spadwarp.checks.spectrum import check_spectrum
 from spadwarp.checks.statistics import check_statistics
 from spadwarp.checks.survey import Survey
@@ -34,6 +35,7 @@ _CHECKS = (
     check_daylight,
     check_medium,
     check_grid,
+    check_polarisation,
     check_statistics,
 )
 
@@ -42,7 +44,7 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """Everything worth knowing about a scene, warnings first; occlusion is not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
-    for the table of a phase function and the instrument response of the detector.
+    for the tables of a phase function and a scattering matrix and the instrument response of the detector.
     """
     survey = Survey(as_scene(scene), mesh)
     _check_response(survey.scene)

@@ -175,7 +175,7 @@ ChannelName = Annotated[
     Channel,
     typer.Option(
         "--channel",
-        help="Which light of a result with an analyser counts: I (all of it, without the analyser), co or cross.",
+        help="Which light counts where the camera has an analyser: I (all of it, without the analyser), co or cross.",
     ),
 ]
 

@@ -33,7 +33,8 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
         return place
     known = examples(kind)
     if place.name not in known:
-        close = difflib.get_close_matches(place.name, known, n=1)
+        named = f"{place.name}.toml"
+        close = [named] if os.path.exists(named) else difflib.get_close_matches(place.name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
         raise FileError(f"{place}: neither a file nor one of the {kind} that come with spadwarp; {hint}")
     return known[place.name]

@@ -300,6 +300,9 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     Raises `FileError` if the file cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "scenes")
+    if path.is_dir():
+        run = path / "scene.toml"
+        raise FileError(f"{path}: a directory, not a scene" + (f"; that of its run is {run}" if run.is_file() else ""))
     if path.suffix.lower() in (*MESH_ENDINGS, ".h5", ".hdf5") and path.is_file():
         raise FileError(f"{path}: not a scene{used(path)}")
     tables = read_toml(path)

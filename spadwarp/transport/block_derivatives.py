@@ -84,7 +84,7 @@ def check_blocks(scene: Scene, names: Sequence[str], blocks: Sequence[int] | Non
             raise ConfigError("blocks go with derivatives by medium.grid.absorption, .scattering or .extinction")
         return BlockParameters()
     if scene.medium.grid is None:
-        raise config_error(scene, f"derivatives: {names[0]}, but the scene has no medium.grid")
+        raise config_error(scene, f"derivatives: {names[0]}, but the scene has no medium.grid; ask for medium.absorption and others")
     if scene.polarised:
         raise config_error(scene, f"derivatives: {names[0]} goes without polarised light; simulate the scene without")
     if scene.domain.reflecting:
@@ -138,10 +138,10 @@ def _check_kinds(scene: Scene, asked: BlockParameters, cells: GridCells) -> None
     if len(set(asked.kinds)) < len(asked.kinds):
         raise ConfigError(f"derivatives: medium.grid.{asked.kinds[0]} is named twice")
     if len(asked.names) > sk.MOST_BLOCK_DERIVATIVES:
-        counts = " x ".join(map(str, asked.shape))
+        way_out = "fewer blocks" + (", or one coefficient a run, with the same seed" if len(asked.kinds) > 1 else "")
         raise ArgumentError(
-            f"blocks: {len(asked.kinds)} coefficients of {counts} blocks are {len(asked.names)} derivatives; one run "
-            f"takes {sk.MOST_BLOCK_DERIVATIVES}: fewer blocks, or one coefficient a run, with the same seed"
+            f"blocks = {list(asked.shape)} of {', '.join(asked.kinds)} are {len(asked.names)} derivatives; one run "
+            f"takes {sk.MOST_BLOCK_DERIVATIVES}: {way_out}"
         )
 
 

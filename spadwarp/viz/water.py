@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from spadwarp.mesh import TriangleMesh, build_mesh
@@ -20,6 +22,8 @@ __all__ = ["draw_slice", "draw_water"]
 Floats = NDArray[np.float64]
 
 _STEPS = 400  # of the longer side
+# Without cells the densest water may be everywhere: lines and the targets must show on it.
+_PALE = LinearSegmentedColormap.from_list("pale water", matplotlib.colormaps[BOUND_MAP](np.linspace(0.0, 0.16, 64)))
 
 
 @paper()
@@ -57,8 +61,9 @@ def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int)
     if scene.medium.grid is not None:  # but the densest cells
         top = max(top, float(np.percentile(grid_cells(scene.medium).extinction, 99.5)))
     image = axis.imshow(
-        _extinction(scene, points), extent=(0.0, depth, half, -half), cmap=BOUND_MAP, vmin=0.0, vmax=top, aspect="equal"
-    )
+        _extinction(scene, points), extent=(0.0, depth, half, -half), vmin=0.0, vmax=top, aspect="equal",
+        cmap=_PALE if scene.medium.grid is None else BOUND_MAP,
+    )  # fmt: skip
     camera, laser = scene.camera, scene.beam
     tangent = 0.5 * camera.pixel_tangent * (camera.width, camera.height)[across]
     axis.plot([0.0, depth], [0.0, depth * tangent], color=BLUE, lw=0.8)

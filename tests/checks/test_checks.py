@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from spadwarp.checks import CheckMessage, check, summary
+from spadwarp.errors import ConfigError
 from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene, load_scene
 from spadwarp.units import SPEED_OF_LIGHT
@@ -296,3 +297,17 @@ def test_the_light_at_the_target_and_in_a_pixel():
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_scenes_that_come_with_the_package_are_plausible(path):
     assert not [str(one) for one in check(load_scene(path)) if "plausible" in one.text]
+
+
+def test_polarised_light_that_is_not_recorded_and_fields_that_are_not_used_are_noted(tmp_path: Path) -> None:
+    polarised = {"medium.scattering_matrix": "voss_fry", "transport.axis_threshold": 1.0}
+    one = BASE.with_overrides({**polarised, "laser.polarisation": "right_circular", "laser.polarisation_angle_deg": 30})
+    messages = check(one, plate(5.0))
+    assert "no channels" in find(messages, "camera.polarisation", "note").text
+    assert "'linear'" in find(messages, "laser.polarisation_angle_deg", "note").text
+
+    table = tmp_path / "matrix.csv"
+    table.write_text("angle_deg,m12,m22,m33,m34,m44\n0,0,1,1,0,1\n170,0,1,-1,0,-1\n")
+    changed = {"medium.scattering_matrix": "tabulated", "medium.matrix_table": str(table)}
+    with pytest.raises(ConfigError, match=r"matrix\.csv: angle_deg goes from 0 to 170"):
+        check(one.with_overrides(changed), plate(5.0))
