@@ -20,13 +20,14 @@ def check_polarisation(survey: Survey) -> Iterator[CheckMessage]:
         yield note("laser.polarisation", "the camera measures polarisation, but the laser's light is not polarised")
     medium, camera, laser = scene.medium, scene.camera, scene.laser
     rayleigh = "rayleigh" in (medium.scattering_matrix, medium.phase_function)
+    measured, cameras = camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"
     scaled = medium.scattering_matrix == "scaled_rayleigh"
     for section, model, field, used, needed in (
         ("laser", Laser, "polarisation_angle_deg", laser.polarisation == "linear", "polarisation = 'linear'"),
         ("medium", Medium, "depolarisation_ratio", rayleigh, "scattering_matrix or phase_function = 'rayleigh'"),
         ("medium", Medium, "largest_polarisation", scaled, "scattering_matrix = 'scaled_rayleigh'"),
-        ("camera", Camera, "analyser_angle_deg", camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"),
-        ("camera", Camera, "extinction_ratio", camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"),
+        ("camera", Camera, "analyser_angle_deg", measured, cameras),
+        ("camera", Camera, "extinction_ratio", measured, cameras),
     ):
         value = getattr(getattr(scene, section), field)
         if not used and value != model.model_fields[field].default:

@@ -12,6 +12,7 @@ import typer
 from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
 from spadwarp.cli._tables import new_table
+from spadwarp.errors import FileError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -65,7 +66,7 @@ def bench(
       spadwarp bench --compare before.json after.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark import CASES, load_report
+    from spadwarp.benchmark import CASES, history, load_report
 
     if list_cases:
         for case in CASES.values():
@@ -73,7 +74,11 @@ def bench(
         say(f"{'scaling':<20}  how cost and memory grow with photons, faces and bins")
         return
     kept = _kept_results(cases)
-    before = None if compare is None or compare.is_dir() else load_report(compare)
+    before = None
+    if compare is not None and compare.is_dir():
+        history(compare)  # one without reports is known before cases are measured
+    elif compare is not None:
+        before = load_report(compare)
     outputs = opt.check_outputs(json=json_path, inputs=(compare, kept), overwrite=overwrite)
     if kept is not None:
         summary = _show_kept(load_report(kept), quiet)
@@ -81,7 +86,11 @@ def bench(
         summary = _measure(cases, outputs, quiet, device=device, photons=photons, repeats=repeats)
     slower = []
     if compare is not None:
-        slower = _compare(summary, compare, before, quiet)
+        try:
+            slower = _compare(summary, compare, before, quiet)
+        except FileError:  # no report of such a device: what was measured is kept
+            outputs.write_json(summary)
+            raise
     outputs.write_json(summary)
     checks = {row["case"]: row["check"] for row in summary["results"]}
     missed = [case for case, check in checks.items() if check is not None and not check["passed"]]

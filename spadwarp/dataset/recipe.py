@@ -199,6 +199,13 @@ class Recipe(Table):
             raise ValueError("plume.probability > 0 does not go with layers or a grid in scene.medium")
         if self.plume.probability > 0 and "daylight" in self.scene:
             raise ValueError("plume.probability > 0 does not go with scene.daylight, which takes one water")
+        camera = self.scene.get("camera")
+        polarisation = camera.get("polarisation", "none") if isinstance(camera, Mapping) else "none"
+        if self.monte_carlo.channel != "I" and polarisation == "none" and "camera.polarisation" not in self.vary:
+            raise ValueError(
+                f"monte_carlo.channel = {self.monte_carlo.channel!r} needs scene.camera.polarisation = 'analyser' or "
+                "'stokes'"
+            )
         for field in self.vary:
             if field in ("camera.width", "camera.height") or field.split(".")[0] in ("gate", "targets"):
                 raise ValueError(f"vary.{field} cannot vary")

@@ -42,8 +42,11 @@ def received(result: Result, channel: Channel) -> Result:
     if check_choice("channel", channel, CHANNELS) == "I":
         return result
     if not result.channels:
+        problem = "the result has none; simulate with camera.polarisation = 'analyser' or 'stokes'"
+        if own := result.provenance.get("channel"):
+            problem = f"the result holds {own!r} alone; take that of the run"
         raise ConfigError(
-            f"channel = {channel!r}: the result has none; simulate with camera.polarisation = 'analyser' or 'stokes'",
+            f"channel = {channel!r}: {problem}",
             source=None if result.scene.source is None else str(result.scene.source),
         )
     tallies, unit = _tallies(result, channel)

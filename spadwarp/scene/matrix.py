@@ -41,8 +41,8 @@ def check_polarisation(medium: Medium, transport: Transport, targets: Sequence[T
     """Raises `ValueError` for sections of a scene that do not go with polarised light."""
     if transport.axis_threshold < 1.0:
         raise ValueError(
-            f"transport.axis_threshold = {transport.axis_threshold} does not go with polarised light: set it to 1, which "
-            "takes directions without the near-axis rule"
+            f"transport.axis_threshold = {transport.axis_threshold} does not go with polarised light: set it to 1, "
+            "for directions without the near-axis rule"
         )
     if medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
         raise ValueError(

@@ -84,7 +84,8 @@ def check_blocks(scene: Scene, names: Sequence[str], blocks: Sequence[int] | Non
             raise ConfigError("blocks go with derivatives by medium.grid.absorption, .scattering or .extinction")
         return BlockParameters()
     if scene.medium.grid is None:
-        raise config_error(scene, f"derivatives: {names[0]}, but the scene has no medium.grid; ask for medium.absorption and others")
+        water = "medium.absorption and medium.scattering are those of its water"
+        raise config_error(scene, f"derivatives: {names[0]}, but the scene has no medium.grid; {water}")
     if scene.polarised:
         raise config_error(scene, f"derivatives: {names[0]} goes without polarised light; simulate the scene without")
     if scene.domain.reflecting:

@@ -152,9 +152,7 @@ def _resolve(scene: Scene, name: Any, known: dict[str, Parameter]) -> Parameter:
         meant = ", ".join(one.name for one in ends)
         raise ConfigError(f"derivatives: {name!r} is one of {len(ends)} parameters of the scene; give one of {meant}")
     names = derivative_names(scene) or tuple(known)
-    raise config_error(
-        scene, f"derivatives: {shown(name)} is not one of {', '.join(names)}{suggestion(name, names)}"
-    )
+    raise config_error(scene, f"derivatives: {shown(name)} is not one of {', '.join(names)}{suggestion(name, names)}")
 
 
 def derivative_units(scene: Scene, names: Sequence[str], scale: float) -> tuple[float, ...]:

@@ -131,7 +131,8 @@ def read_matrix_table(path: str | os.PathLike[str]) -> Callable[[Floats], Floats
     if (at := np.flatnonzero(np.diff(angles) <= 0.0)).size:
         raise ConfigError(f"angle_deg = {angles[at[0] + 1]:g} follows {angles[at[0]]:g}: not ascending", source=source)
     if angles[0] != 0.0 or angles[-1] != 180.0:
-        raise ConfigError(f"angle_deg goes from {angles[0]:g} to {angles[-1]:g}, not from 0 to 180; add rows at both ends", source=source)
+        text = f"angle_deg goes from {angles[0]:g} to {angles[-1]:g}, not from 0 to 180; add the rows that are missing"
+        raise ConfigError(text, source=source)
     m12, m22, m33, m34, m44 = elements.T
     # No negative eigenvalue of the coherency matrix (Hovenier & van der Mee 1996).
     for left, right, words in (

@@ -161,7 +161,10 @@ def test_recipes_take_a_channel_of_traced_scenes_only():
     recipe = spadwarp.dataset.load_recipe("small")
     with pytest.raises(ConfigError, match=r"channel = 'cross' needs share = 1"):
         recipe.with_overrides({"monte_carlo.channel": "cross"})
-    assert isinstance(recipe.with_overrides({"monte_carlo.share": 1.0, "monte_carlo.channel": "cross"}), Recipe)
+    traced = {"monte_carlo.share": 1.0, "monte_carlo.channel": "cross"}
+    with pytest.raises(ConfigError, match=r"channel = 'cross' needs scene\.camera\.polarisation"):
+        recipe.with_overrides(traced)
+    assert isinstance(recipe.with_overrides({**traced, "scene.camera.polarisation": "stokes"}), Recipe)
 
 
 def test_data_sets_and_denoisers_take_a_channel(analysed, tmp_path):
