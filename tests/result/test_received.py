@@ -9,7 +9,7 @@ import spadwarp
 from helpers.cli import DEVICE, run, tables
 from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
-from spadwarp.dataset import Recipe, iterate_dataset
+from spadwarp.dataset import iterate_dataset
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result import COMPONENTS, degree_of_polarisation, received
 
@@ -164,7 +164,8 @@ def test_recipes_take_a_channel_of_traced_scenes_only():
     traced = {"monte_carlo.share": 1.0, "monte_carlo.channel": "cross"}
     with pytest.raises(ConfigError, match=r"channel = 'cross' needs scene\.camera\.polarisation"):
         recipe.with_overrides(traced)
-    assert isinstance(recipe.with_overrides({**traced, "scene.camera.polarisation": "stokes"}), Recipe)
+    polarised = {"scene.camera.polarisation": "stokes", "scene.medium.scattering_matrix": "voss_fry"}
+    assert recipe.with_overrides({**traced, **polarised, "scene.transport.axis_threshold": 1.0})
 
 
 def test_data_sets_and_denoisers_take_a_channel(analysed, tmp_path):
