@@ -96,10 +96,20 @@ def devices() -> list[dict[str, Any]]:
 
 
 def processor_name(device: wp.Device | None = None) -> str:
-    """The name of a device's processor; by default the CPU's."""
+    """The name of a device's processor; by default the CPU's, or its architecture where the system has no more."""
     if device is not None and device.is_cuda:
         return device.name
-    return platform.processor() or platform.machine()
+    return _cpu_model() or platform.processor() or platform.machine()
+
+
+@functools.cache
+def _cpu_model() -> str:
+    """As Linux has it, which gives Python the architecture alone; empty elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
 
 
 @functools.cache

@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from statistics import median
 from types import ModuleType, SimpleNamespace
 
@@ -65,15 +64,6 @@ def captured_output() -> Iterator[SimpleNamespace]:
             output.text = file.read().decode(errors="replace")
 
 
-def processor() -> str:
-    """Name of the CPU, where the system reports it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), "CPU")
-
-
 def compare(
     case: str, theirs: Callable[[], float | None], *, name: str, unit: str, work: int, args: argparse.Namespace
 ) -> float:
@@ -90,7 +80,7 @@ def compare(
         Our absorbed fraction of the light.
     """
     from spadwarp.benchmark import CASES, TransportRun
-    from spadwarp.device import core_count, pick_device
+    from spadwarp.device import core_count, pick_device, processor_name
     from spadwarp_kernels import LEDGER_UNIT
 
     device = pick_device(args.device)
@@ -116,7 +106,7 @@ def compare(
     else:
         # Other processes on the machine stretch the wall clock's time, but not the processor's.
         clocks = {"": wall, " of processor time": cpu}
-        print(f"{'':<12} median of {args.repeats} runs in turn on {core_count()} core(s) of {processor()}")
+        print(f"{'':<12} median of {args.repeats} runs in turn on {core_count()} core(s) of {processor_name()}")
     for clock, seconds_of in clocks.items():
         them, us = work / median(seconds_of[name]), args.photons / median(seconds_of["spadwarp"])
         print(f"{name:<12} {them:.4g} {unit}/s{clock}")

@@ -10,6 +10,7 @@ import os
 import platform
 import secrets
 import zipfile
+import zlib
 from pathlib import Path
 
 import warp as wp
@@ -23,6 +24,9 @@ TARGET = "x86-64-v3"
 FEATURES = ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe")
 """These instructions by their names in /proc/cpuinfo."""
 
+# An archive that is damaged, or a cache that cannot be written: kernels are then compiled as without it.
+_UNUSABLE = (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile, zlib.error)
+
 
 def unpack_kernels() -> int:
     """Puts the compiled kernels of this package into Warp's kernel cache, where they are not there already.
@@ -31,12 +35,12 @@ def unpack_kernels() -> int:
 
     Returns:
         The number of modules added: 0 where the package has none for this version of Warp, system and processor, and
-        where the cache cannot be written.
+        where it is damaged or the cache cannot be written.
     """
     if not ARCHIVE.exists():
         return 0
     wp.init()
-    with contextlib.suppress(OSError, RuntimeError, zipfile.BadZipFile), zipfile.ZipFile(ARCHIVE) as archive:
+    with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
         if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= _processor_features():
             # The end of this key is what Warp adds to the names of objects for the processor at hand.
             ending = "cpu" + wp.get_cpu_kernel_cache_key().rpartition("-")[2]

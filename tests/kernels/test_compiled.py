@@ -59,3 +59,8 @@ def test_none_and_a_damaged_archive_are_no_failure(archive):
     assert unpack_kernels() == 0
     compiled.ARCHIVE.write_bytes(b"not a zip file")
     assert unpack_kernels() == 0
+    for manifest in ({}, {compiled.MANIFEST: "not JSON"}):
+        with zipfile.ZipFile(compiled.ARCHIVE, "w") as file:
+            for name, text in manifest.items():
+                file.writestr(name, text)
+        assert unpack_kernels() == 0

@@ -6,6 +6,7 @@ of eight numbers: the components of the planes, then the lower and the upper cor
 
 import warp as wp
 
+from spadwarp_kernels.arguments import check_integer
 from spadwarp_kernels.math.memory import zeros
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
@@ -13,6 +14,9 @@ WIDENING = wp.constant(4.0e-7)
 
 # Faces of a block on the CPU.
 LANES = wp.constant(8)
+
+# Slots on the CPU, so that the index of a number stays below 2^31.
+_MOST_SLOTS = (2**31 - 1) // 144 * 8
 
 
 @wp.func_native("""
@@ -127,7 +131,12 @@ def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) ->
 
 
 def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
-    """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks]."""
+    """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks].
+
+    Raises `ArgumentError` for more of them than a CPU's indices reach.
+    """
+    if not mesh.device.is_cuda:
+        check_integer("faces of the mesh, in slots,", order.size, 0, _MOST_SLOTS)
     faces = zeros(face_vectors(order.size, mesh.device), wp.vec4, mesh.device)
     set_faces(mesh, extent, order, faces)
     return faces
