@@ -172,9 +172,12 @@ def test_kept_files_are_compared_and_a_slower_case_fails_the_command(staircase, 
     assert "same" in run("bench", fast, "--compare", tmp_path / "fast.json").output
     run("bench", fast, "water", "--compare", slow, code=2)
     # Nothing to compare with: what was measured is written all the same.
-    (tmp_path / "empty").mkdir()
-    result = run("bench", fast, "--compare", tmp_path / "empty", "--json", tmp_path / "kept.json", code=1)
-    assert "holds no report" in result.output and load_report(tmp_path / "kept.json")["results"]
+    others = report([staircase])
+    others["provenance"]["device_name"] = "another"
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "a.json").write_text(json.dumps(others))
+    result = run("bench", fast, "--compare", tmp_path / "others", "--json", tmp_path / "kept.json", code=1)
+    assert "no report of staircase_5m" in result.output and load_report(tmp_path / "kept.json")["results"]
 
 
 def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
