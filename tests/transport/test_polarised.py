@@ -189,7 +189,7 @@ def sampled(one, device, photons, seeds):
     return np.array(rows)
 
 
-def agree(one, device, photons=(60_000, 30_000), seeds=32):
+def agree(one, device, photons=(30_000, 15_000), seeds=32):
     """Whether analog and guided have the same channels, and next_event and guided in water clear at the lens."""
     clear = clear_at_the_lens(one)
     for other, where, count in zip(("analog", "next_event"), (one, clear), photons, strict=True):
