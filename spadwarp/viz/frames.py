@@ -17,6 +17,7 @@ from spadwarp.frames import METHODS, first_photon_probabilities
 from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
+from spadwarp.viz.result import channel_text
 from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, PROBABILITY_MAP, paper, save, spaced
 
 if TYPE_CHECKING:
@@ -30,13 +31,15 @@ __all__ = ["analytic_figure", "draw_analytic", "draw_recording", "frame_figure",
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthMaps:
-    """What is known of a frame beside its counts: the scene, and `[H, W]` [m] depth by an estimator, truth, bound."""
+    """What is known of a frame beside its counts: the scene, and `[H, W]` [m] depth by an estimator, truth, bound; the
+    channel of polarised light, "I" for all light."""
 
     scene: Scene
     method: str
     depth: NDArray[Any]
     truth: NDArray[Any]
     bound: NDArray[Any]
+    channel: str = "I"
 
     @property
     def arrival(self) -> NDArray[np.float64]:
@@ -55,6 +58,7 @@ def draw_recording(recording: Recording, result: Result, path: str | Path, *, wi
         depth=recording.depth[method].astype(np.float32),  # as in the file
         truth=result.truth.depth,
         bound=recording.bound_depth,
+        channel=result.provenance.get("channel", "I"),
     )
     return save(frame_figure(recording.first, maps=maps, width=width), path)
 
@@ -65,7 +69,8 @@ def stored_frame_figure(file: FramesFile, number: int, width: float = PAGE) -> F
     maps = None
     if method is not None:
         depth, bound = file.depth(method, number), file.bound_depth()
-        maps = DepthMaps(scene=file.scene, method=method, depth=depth, truth=file.truth_depth, bound=bound)
+        truth, channel = file.truth_depth, file.channel
+        maps = DepthMaps(scene=file.scene, method=method, depth=depth, truth=truth, bound=bound, channel=channel)
     return frame_figure(frame, maps=maps, width=width)
 
 
@@ -97,6 +102,7 @@ def frame_figure(frames: Frames, number: int = 0, *, maps: DepthMaps | None = No
     panels.figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     which = "all frames added up" if frames.summed else f"frame {frames.first_frame + number + 1}"
     mode = "" if maps is None else f", {maps.scene.detector.mode.replace('_', '-')}"
+    mode += "" if maps is None else channel_text(maps.channel)
     noise = noise_caption(frames.monte_carlo_noise)
     panels.caption(f"{which}: {spaced(frames.pulses)} pulses{mode}; seed {frames.seed}{noise}")
     return panels.figure

@@ -245,13 +245,13 @@ def _caption(result: Result) -> str:
         mantissa, power = photons.split("e+")
         photons = f"{'' if mantissa == '1' else mantissa + ' × '}$10^{{{int(power)}}}$"
     partial = ", interrupted" if result.partial else ""
-    return f"{photons} photons{partial}{channel_text(result)}; {water}; seed {result.seed}"
+    return f"{photons} photons{partial}{channel_text(result.provenance.get('channel'))}; {water}; seed {result.seed}"
 
 
-def channel_text(result: Result) -> str:
-    """What a caption says of the channel that a result holds alone, if any."""
-    channel = result.provenance.get("channel")
-    return "" if channel is None else f", {CHANNEL_NAMES[channel]} light"
+def channel_text(channel: str | None) -> str:
+    """What a caption says of light of one channel alone; nothing of all light."""
+    names = {str(key): name for key, name in CHANNEL_NAMES.items()}
+    return f", {names[channel]} light" if channel in names else ""
 
 
 def _phase_text(medium: Medium) -> str:

@@ -128,7 +128,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         title=_name(scene),
         caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
         + (", interrupted" if result.partial else "")
-        + channel_text(result)
+        + channel_text(result.provenance.get("channel"))
         + "; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
