@@ -282,6 +282,7 @@ def test_kept_results_can_be_read():
         assert load_report(path)["results"]
 
 
+@pytest.mark.slow
 def test_the_history_is_drawn(staircase, tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(report([staircase, timed(staircase, 0.1, case="water")])))
     (tmp_path / "b.json").write_text(json.dumps(report([timed(staircase, 0.1, 0.2)])))

@@ -49,6 +49,7 @@ def test_gradients_of_a_loss_point_to_the_truth():
         assert (moved["medium.scattering"].grad > 0) == (factor > 1)
 
 
+@pytest.mark.slow
 def test_blocks_of_a_grid(tmp_path):
     """Means of blocks move the cells; gradients are the derivatives by block, beside that of a target."""
     cells = np.linspace(0.5, 1.5, 4 * 2 * 4).reshape(4, 2, 4)

@@ -95,6 +95,7 @@ def test_counts_depth_and_bounds_of_a_channel(analysed):
     assert np.isfinite(spadwarp.crlb(received(analysed, "cross"), pulses=1000, device="cpu")).any()
 
 
+@pytest.mark.slow
 def test_channels_on_the_command_line(analysed, tmp_path):
     place = analysed.save(tmp_path / "result.h5")
     outcome = run("info", place)
@@ -118,6 +119,7 @@ def test_a_page_of_a_channel_names_it(analysed, tmp_path):
     assert "cross-polarised light" in page.read_text()
 
 
+@pytest.mark.slow
 def test_plan_compares_the_channels(tmp_path):
     file = tmp_path / "scene.toml"
     file.write_text(polarised().to_toml())

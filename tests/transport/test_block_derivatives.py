@@ -121,6 +121,7 @@ def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp
         assert (error < 0.02 * np.abs(expected).max()).all()
 
 
+@pytest.mark.slow
 def test_central_differences_in_a_plume(tmp_path, device):
     """Multiple scattering in cells that differ, by delta tracking: independent runs with one block changed."""
     generator = np.random.default_rng(3)
