@@ -59,7 +59,7 @@ _READ_ME = (
     "squared tally. "
     "derivatives/tallies, where they were asked for: [parameter, component, height, width, bin], signed; times "
     "derivatives/unit over photons it is the derivative of the fraction with respect to the parameter. "
-    "channels/tallies, of a camera that tells polarisation: the same for each channel, the fraction that it gets. "
+    "channels/tallies, of a camera that records polarisation: the same for each channel, the fraction that it gets. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
     "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
     "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "

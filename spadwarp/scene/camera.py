@@ -68,7 +68,7 @@ class Camera(Section):
     rotation_deg: Vector = (0.0, 0.0, 0.0)
     """rotations from the world's axes about x, then the new y, then the new z [°]"""
     polarisation: Literal["none", "analyser", "stokes"] = "none"
-    """what it tells of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
+    """what it records of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
     analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
     """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
     extinction_ratio: Annotated[
