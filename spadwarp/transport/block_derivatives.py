@@ -20,9 +20,7 @@ from spadwarp.transport.placement import config_error
 if TYPE_CHECKING:
     from spadwarp.scene.grid_cells import GridCells
 
-__all__ = ["COEFFICIENTS", "BlockParameters", "block_parameters", "block_scales", "check_blocks", "is_of_grid"]
-
-COEFFICIENTS = ("absorption", "scattering", "extinction")
+__all__ = ["BlockParameters", "block_parameters", "block_scales", "check_blocks", "is_of_grid"]
 
 _NAME = re.compile(r"medium\.grid\.(\w+)(?:\[(\d+),(\d+),(\d+)\])?")
 
@@ -34,7 +32,7 @@ class BlockParameters:
     """Coefficients of a grid's cells, block by block.
 
     Attributes:
-        kinds: Each one of COEFFICIENTS.
+        kinds: Each one of `spadwarp_kernels.BLOCK_DERIVATIVES`.
         shape: Number of blocks along the edges of the box.
     """
 
@@ -126,8 +124,8 @@ def _check_kinds(scene: Scene, asked: BlockParameters, cells: GridCells) -> None
     import spadwarp_kernels as sk
 
     for kind in asked.kinds:
-        if kind not in COEFFICIENTS:
-            names = ", ".join(f"medium.grid.{one}" for one in COEFFICIENTS)
+        if kind not in sk.BLOCK_DERIVATIVES:
+            names = ", ".join(f"medium.grid.{one}" for one in sk.BLOCK_DERIVATIVES)
             raise config_error(scene, f"derivatives: medium.grid.{kind} is not one of {names}")
         values = {"scattering": cells.scattering, "extinction": cells.extinction}.get(kind)
         if values is not None and (empty := int((values <= 0.0).sum())):
@@ -136,8 +134,8 @@ def _check_kinds(scene: Scene, asked: BlockParameters, cells: GridCells) -> None
                 f"derivatives: medium.grid.{kind} is 0 in {empty} of {values.size} cells, where light that is "
                 "scattered has no slope; give the medium a little of it, or ask for medium.grid.absorption",
             )
-    if len(set(asked.kinds)) < len(asked.kinds):
-        raise ConfigError(f"derivatives: medium.grid.{asked.kinds[0]} is named twice")
+        if asked.kinds.count(kind) > 1:
+            raise ConfigError(f"derivatives: medium.grid.{kind} is named twice")
     if len(asked.names) > sk.MOST_BLOCK_DERIVATIVES:
         way_out = "fewer blocks" + (", or one coefficient a run, with the same seed" if len(asked.kinds) > 1 else "")
         raise ArgumentError(

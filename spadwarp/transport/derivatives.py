@@ -13,7 +13,6 @@ from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import shown, suggestion
 from spadwarp.scene import Scene
 from spadwarp.transport.block_derivatives import (
-    COEFFICIENTS,
     block_parameters,
     block_scales,
     check_blocks,
@@ -95,8 +94,10 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
 def derivative_names(scene: Scene) -> tuple[str, ...]:
     """Names of all parameters of a scene by which its histogram can be differentiated; those of a grid's cells without
     the block."""
+    import spadwarp_kernels as sk
+
     found = [name for name, one in _parameters(scene).items() if not one.problem]
-    for kind in COEFFICIENTS if scene.medium.grid is not None else ():
+    for kind in sk.BLOCK_DERIVATIVES if scene.medium.grid is not None else ():
         try:
             check_blocks(scene, [f"medium.grid.{kind}"], None)
         except ConfigError:
