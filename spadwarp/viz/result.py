@@ -182,13 +182,14 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
             np.maximum(values, 0.01 * bottom), time[own], baseline=None, label=label, color=colour,
             linewidth=1.4 if ballistic else 0.9, zorder=3 if ballistic else 2,
         )  # fmt: skip
-    # Light of the target is the same in both: the second lies over the first and lets it through.
-    channel_styles = ((PURPLE, "-", 1.6), ("black", (0, (1, 1.5)), 1.1)) if result.channels else ()
-    for (channel, label), (colour, line, linewidth) in zip(CHANNEL_NAMES.items(), channel_styles, strict=False):
+    # Light of the water is nearly all co-polarised, and light of the target half: a wide line below the components, and
+    # a dotted one above them, hide neither each other nor them.
+    channel_styles = ((PURPLE, "-", 3.0, 1.5), ("black", (0, (1, 1.5)), 1.1, 4)) if result.channels else ()
+    for (channel, label), (colour, line, linewidth, zorder) in zip(CHANNEL_NAMES.items(), channel_styles, strict=False):
         seen = received_by_pixel(result, channel, row, column).sum(axis=0) * per_pulse
         axis.stairs(
             np.maximum(merged_means(seen, edges), 0.01 * bottom), time[edges], baseline=None,
-            label=label, color=colour, linewidth=linewidth, linestyle=line, zorder=4,
+            label=label, color=colour, linewidth=linewidth, linestyle=line, zorder=zorder,
         )  # fmt: skip
     arrival_line(axis, 1e9 * float(result.true_path()[row, column]) / result.pulse_speed, time)
     axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
