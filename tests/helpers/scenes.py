@@ -1,5 +1,10 @@
 """Small scenes that the tests share."""
 
+import math
+
+import numpy as np
+
+from reference.single_scatter import Lidar
 from spadwarp.scene import Scene
 
 WATER = {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.8, "group_index": 1.0}
@@ -19,3 +24,24 @@ def scene(**sections):
     for name, fields in sections.items():
         tables[name] = {**tables.get(name, {}), **fields} if isinstance(fields, dict) else fields
     return Scene.from_dict(tables)
+
+
+def single_scatter_case(field_of_view, half_angle):
+    """Sections of a scene without targets where light is scattered once, and the lidar of its quadrature [degree]."""
+    lidar = Lidar(
+        pixels=4,
+        field_of_view=math.radians(field_of_view),
+        half_angle=math.radians(half_angle),
+        anisotropy=0.6,
+        edges=np.linspace(3.0, 7.0, 5),
+    )
+    aperture = 2 * math.sqrt(1e-4 / math.pi)
+    sections = {
+        "medium": {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.6, "group_index": 1.0},
+        "laser": {"half_angle_deg": half_angle, "position": [-0.1, 0.0, 0.0]},
+        "camera": {"width": 4, "height": 4, "horizontal_fov_deg": field_of_view, "aperture_diameter": aperture},
+        "gate": {"start_ns": 3.0 / 0.299792458, "bin_width_ps": 1e3 / 0.299792458, "bins": 4},
+        "targets": [],
+        "transport": {"estimator": "guided", "max_collisions": 1, "axis_threshold": 1.0},
+    }
+    return lidar, sections

@@ -1,7 +1,5 @@
 """Derivatives of the histogram by the water and the targets: closed forms, identities, agreement of the estimators."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,7 +7,7 @@ from scipy import stats
 import spadwarp
 from helpers.cli import run
 from helpers.estimators import clear_at_the_lens
-from helpers.scenes import PLATE, scene
+from helpers.scenes import PLATE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.single_scatter import Lidar, single_scatter
 from spadwarp.result import COMPONENTS
@@ -60,15 +58,7 @@ def test_clear_opticsin_closed_form(device):
     assert by_reflectance == pytest.approx(h / PLATE["reflectance"], rel=1e-5)
 
 
-LIDAR = Lidar(pixels=4, field_of_view=math.radians(10.0), anisotropy=0.6, edges=np.linspace(3.0, 7.0, 5))
-ONCE = {
-    "medium": {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.6, "group_index": 1.0},
-    "laser": {"half_angle_deg": 2.5, "position": [-0.1, 0.0, 0.0]},
-    "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 10.0, "aperture_diameter": 2 * math.sqrt(1e-4 / math.pi)},
-    "gate": {"start_ns": 3.0 / 0.299792458, "bin_width_ps": 1e3 / 0.299792458, "bins": 4},
-    "targets": [],
-    "transport": {"estimator": "guided", "max_collisions": 1, "axis_threshold": 1.0},
-}
+LIDAR, ONCE = single_scatter_case(10.0, 2.5)
 
 
 def test_single_scatter_in_closed_form(device):

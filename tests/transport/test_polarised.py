@@ -7,11 +7,11 @@ import pytest
 
 import spadwarp
 from helpers.estimators import clear_at_the_lens
-from helpers.scenes import PLATE, scene
+from helpers.scenes import PLATE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.polarised_lidar import linear, stokes_factor
 from reference.rayleigh_tables import TABLES, UPPER
-from reference.single_scatter import Lidar, single_scatter
+from reference.single_scatter import single_scatter
 from reference.stokes import block_matrix
 from spadwarp.errors import ConfigError
 
@@ -49,16 +49,7 @@ def test_the_intensity_keeps_its_bits_where_nothing_polarises(estimator, device)
     assert not q[0].any() and np.abs(q).sum() > 0.0
 
 
-LIDAR = Lidar(pixels=4, field_of_view=math.radians(30.0), half_angle=math.radians(12.0), anisotropy=0.6,
-              edges=np.linspace(3.0, 7.0, 5))  # fmt: skip
-ONCE = {
-    "medium": {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.6, "group_index": 1.0},
-    "laser": {"half_angle_deg": 12.0, "position": [-0.1, 0.0, 0.0]},
-    "camera": {"width": 4, "height": 4, "horizontal_fov_deg": 30.0, "aperture_diameter": 2 * math.sqrt(1e-4 / math.pi)},
-    "gate": {"start_ns": 3.0 / 0.299792458, "bin_width_ps": 1e3 / 0.299792458, "bins": 4},
-    "targets": [],
-    "transport": {"estimator": "guided", "max_collisions": 1, "axis_threshold": 1.0},
-}
+LIDAR, ONCE = single_scatter_case(30.0, 12.0)
 
 
 def spread_matrix(cosine):
