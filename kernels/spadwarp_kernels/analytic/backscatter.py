@@ -3,13 +3,13 @@
 Rates are in detections per pulse and second, in float64.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from spadwarp_kernels.arguments import check_array, check_integer, check_number
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 
 from .lidar import Lidar
@@ -47,7 +47,7 @@ class SingleScatter(NamedTuple):
     rate: wp.Function
 
 
-@functools.cache
+@made_once
 def make_single_scatter(optics: Optics) -> SingleScatter:
     """The functions for a camera and a laser with these optics."""
     Sight = optics.sight
@@ -112,7 +112,7 @@ single_scatter_rate = make_single_scatter(IN_WATER).rate
 """That of a camera and a laser in the water, `sight` being the unit line of sight."""
 
 
-@functools.cache
+@made_once
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
     see, point, light_at, whole_path = optics.see, optics.point, optics.light, optics.whole_path
     range_of_path, illuminated, from_lens, along = (
@@ -176,7 +176,7 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
     return table_kernel
 
 
-@functools.cache
+@made_once
 def make_background_rate(optics: Optics) -> wp.Function:
     """The Warp function of the rate of dark counts and backscatter for these optics."""
     Sight = optics.sight

@@ -3,13 +3,13 @@
 Rays are traced by the functions of the ports, in float32: lengths are right to 1e-7 of themselves.
 """
 
-import functools
 from typing import NamedTuple
 
 import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.port.kinds import FLAT_PORT, PortKind
 from spadwarp_kernels.port.port import Passage, Port
 
@@ -110,7 +110,7 @@ class _Camera(NamedTuple):
     receive: wp.Function
 
 
-@functools.cache
+@made_once
 def _make_camera(kind: PortKind | None) -> _Camera:
     """The functions of a camera behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
@@ -193,7 +193,7 @@ def _intensity(lidar: Lidar, u: wp.vec3d) -> wp.float64:
     return TWO / (PI * lidar.tan2) * wp.exp(-TWO * tan2 / lidar.tan2) / (along * along * along)
 
 
-@functools.cache
+@made_once
 def _make_beam(kind: PortKind | None) -> _Beam:
     """The functions of a laser behind a kind of port, or in the water."""
     if kind is None:
@@ -276,7 +276,7 @@ def _straight_range(laser: wp.vec3d, sight: Sight, path: wp.float64) -> wp.float
     return (path * path - wp.length_sq(y)) / (TWO * (path + wp.dot(sight.u, y)))
 
 
-@functools.cache
+@made_once
 def _make_range_of_path(kind: PortKind | None) -> wp.Function:
     """`Optics.range_of_path` for a laser behind a kind of port, or in the water."""
     has_port = kind is not None
@@ -309,7 +309,7 @@ def _make_range_of_path(kind: PortKind | None) -> wp.Function:
     return range_of_path
 
 
-@functools.cache
+@made_once
 def _make_illuminated(kind: PortKind | None, light: wp.Function) -> wp.Function:
     """`Optics.illuminated` for a laser behind a kind of port, or in the water."""
     has_port = kind is not None
@@ -361,7 +361,7 @@ def _make_illuminated(kind: PortKind | None, light: wp.Function) -> wp.Function:
     return illuminated
 
 
-@functools.cache
+@made_once
 def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None) -> Optics:
     """The optics of a camera and a laser behind kinds of ports; None: in the water.
 

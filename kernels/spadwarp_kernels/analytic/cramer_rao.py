@@ -4,13 +4,13 @@ One thread a pixel, float64. The model is eq 8 of *A Simulation Method for Under
 Sensors 24, 3886 (2024): a Gaussian pulse on dark counts, ambient light and backscatter, as rates per pulse.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_number
 from spadwarp_kernels.math.float64 import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 
 from .backscatter import check_phase, make_background_rate, spectral_lines
@@ -68,7 +68,7 @@ def _gauss_legendre(node: int) -> wp.vec2d:
     return wp.vec2d(x, w)
 
 
-@functools.cache
+@made_once
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
     Sight, see = optics.sight, optics.see
     background_rate = make_background_rate(optics)

@@ -1,12 +1,12 @@
 """Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead."""
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_number, check_seed, check_vector
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_ANALYTIC, random_block, u01, u01_open
 
@@ -67,7 +67,7 @@ def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
     return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
 
 
-@functools.cache
+@made_once
 def make_depth_of_path(optics: Optics) -> wp.Function:
     """The Warp function ``(laser, ports, view, path)`` -> planar depth at which light has gone a path; 0 if there is
     none."""
@@ -88,7 +88,7 @@ def make_depth_of_path(optics: Optics) -> wp.Function:
     return depth_at
 
 
-@functools.cache
+@made_once
 def _make_kernel(optics: Optics) -> wp.Kernel:
     depth_at = make_depth_of_path(optics)
 

@@ -4,7 +4,6 @@ The same draw as in `analytic`, μ + N(0, σ*²) or a background photon instead,
 their pixels that reports background, with the number of recorded photons beside the depth.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_vector,
 )
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
 from spadwarp_kernels.random.quantiles import count_quantile
@@ -57,7 +57,7 @@ class FrameCoding:
     intensity_step: float
 
 
-@functools.cache
+@made_once
 def _make_kernel(optics: Optics) -> wp.Kernel:
     depth_at = make_depth_of_path(optics)
 

@@ -4,13 +4,13 @@ Equation numbers are those of *A Simulation Method for Underwater SPAD Depth Ima
 Times are from the emission of the pulse; everything in float64.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from spadwarp_kernels.arguments import check_array
 from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 
 from .lidar import Lidar
@@ -85,7 +85,7 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
     return lidar.axis
 
 
-@functools.cache
+@made_once
 def make_radiometric_signal(optics: Optics) -> wp.Function:
     """The Warp function ``(lidar, sight, distance, normal, reflectance)`` -> signal detections per pulse, `distance`
     being the range."""
@@ -163,7 +163,7 @@ radiometric_signal = make_radiometric_signal(IN_WATER)
 """That of a camera and a laser in the water, `sight` being the unit line of sight."""
 
 
-@functools.cache
+@made_once
 def _make_kernel(optics: Optics) -> wp.Kernel:
     see, point, light_at, whole_path = optics.see, optics.point, optics.light, optics.whole_path
     radiometric = make_radiometric_signal(optics)

@@ -9,11 +9,11 @@ A thread keeps them in `Blocks.memory`: in the first half of its rows those of t
 the contribution that is scored, until it is added or, behind a surface, forgotten.
 """
 
-import functools
 from typing import NamedTuple
 
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.grid import first_place, grid_cell, grid_line, next_place
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
@@ -39,7 +39,7 @@ class BlockScores(NamedTuple):
     copy: wp.Function
 
 
-@functools.cache
+@made_once
 def make_block_scores(spec: TransportSpec) -> BlockScores | None:
     """Of a spec with blocks."""
     if not spec.blocks:
@@ -100,7 +100,7 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
     return turn
 
 
-@functools.cache
+@made_once
 def make_begin_history(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(derivatives) -> Scores`` of a photon that has met nothing; of blocks too."""
     kinds = len(spec.blocks)
@@ -116,7 +116,7 @@ def make_begin_history(spec: TransportSpec) -> wp.Function:
     return begin_history
 
 
-@functools.cache
+@made_once
 def make_fly_history(spec: TransportSpec) -> wp.Function:
     """The Warp function of `make_flight_scores`, for a flight of the photon itself: of blocks too."""
     flight_scores, by_block = make_flight_scores(spec), make_block_scores(spec)

@@ -1,9 +1,8 @@
 """Scores of a photon that enters the aperture itself."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
@@ -19,7 +18,7 @@ def _to_lens(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
     return -x[2] / u[2]
 
 
-@functools.cache
+@made_once
 def make_to_lens(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, x, u) -> float``: the way in water of a photon at x whose flight along u leads to
     the lens [m]."""
@@ -34,7 +33,7 @@ def make_to_lens(spec: TransportSpec) -> wp.Function:
     return to_port
 
 
-@functools.cache
+@made_once
 def make_crossing_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, camera, layers, derivatives) -> Scores`` of a photon whose flight leads to the lens."""
     flight_scores, to_lens = make_flight_scores(spec), make_to_lens(spec)

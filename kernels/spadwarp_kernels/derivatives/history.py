@@ -5,10 +5,9 @@ light times score: -L for absorption, n/b - L for scattering (L the path in the 
 of d ln p/dg over the scatterings, and one over the reflectance for each bounce.
 """
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
 from spadwarp_kernels.medium.layers import Layers, boundary_ahead, layer_index
 from spadwarp_kernels.medium.water import Medium
@@ -37,7 +36,7 @@ def _unchanged(
     return scores
 
 
-@functools.cache
+@made_once
 def make_flight_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, derivatives, layers, x, u, length) -> Scores`` after a way in the water."""
     if not spec.derivatives:
@@ -74,7 +73,7 @@ def make_flight_scores(spec: TransportSpec) -> wp.Function:
     return flight_scores
 
 
-@functools.cache
+@made_once
 def make_event_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, derivatives, medium, layers, surfaces, face, normal, x, u, v) -> Scores`` after an
     event at x that has turned light from u to v, on a face or (-1) in the water."""

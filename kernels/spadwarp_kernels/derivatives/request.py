@@ -1,10 +1,9 @@
 """Scores of a next event: from what was asked for and the point that it has come to."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -15,7 +14,7 @@ from spadwarp_kernels.tally.tally import Scores
 from .history import make_event_scores, make_flight_scores
 
 
-@functools.cache
+@made_once
 def make_turn_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, x, u, v, slot, derivatives, medium, layers, surfaces) -> Scores`` after an event at
     x that turns light from u to v, on the face of a slot of the mesh's tree or (-1) in the water."""
@@ -45,7 +44,7 @@ def make_turn_scores(spec: TransportSpec) -> wp.Function:
     return turn_scores
 
 
-@functools.cache
+@made_once
 def make_request_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, x, u, slot, point, end, derivatives, medium, layers, surfaces) -> Scores`` of light
     that goes from x along u to the point that is scored, scatters there, and leaves the water at the end.

@@ -4,13 +4,13 @@ Times are fractional bins from the start of the first bin: bin k covers [k, k + 
 Histograms are rows `[pixel, bin]` of int32, int64, float32 or float64; one thread a pixel.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 
 from .rates import RATES
@@ -46,7 +46,7 @@ def _parabola_vertex(left: float, centre: float, right: float) -> float:
     return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
 
 
-@cache
+@made_once
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def peak(
@@ -90,7 +90,7 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     return peak
 
 
-@cache
+@made_once
 def _matched_kernel(dtype: Any) -> wp.Kernel:
     @wp.func
     def score_of(
@@ -144,7 +144,7 @@ def _matched_kernel(dtype: Any) -> wp.Kernel:
     return matched
 
 
-@cache
+@made_once
 def _likelihood_kernel(dtype: Any) -> wp.Kernel:
     @wp.func
     def profile_likelihood(

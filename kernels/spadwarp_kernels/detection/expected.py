@@ -4,7 +4,6 @@
 ready.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from spadwarp_kernels.arguments import (
     check_seed,
 )
 from spadwarp_kernels.math.float64 import expm1, log1p
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 from spadwarp_kernels.random.binomial import PURPOSE_DARK_COUNTS, uniforms
 
@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False})
 _ONE = wp.constant(wp.uint32(1))
 
 
-@cache
+@made_once
 def _response_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def respond(
@@ -105,7 +105,7 @@ def _crosstalk_kernel(
         hazard[pixel, k] = hazard[pixel, k] + probability * light
 
 
-@cache
+@made_once
 def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def law(first_pixel: int, hazard: wp.array2d(dtype=dtype), probability: wp.array2d(dtype=dtype)):

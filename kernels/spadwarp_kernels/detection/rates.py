@@ -1,11 +1,11 @@
 """Rows of counts, tallies or rates: what they may be."""
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
 from spadwarp_kernels.arguments import check_array
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.pixels import launch_pixels
 
 wp.set_module_options({"enable_backward": False})
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
 
 
-@cache
+@made_once
 def _invalid_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):

@@ -1,11 +1,10 @@
 """What a photon adds to a pixel by a next event: from where it scatters, or from a sampled point of its flight."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.math.bits import from_bits
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
@@ -107,7 +106,7 @@ class ScoredPoint:
     path: float
 
 
-@functools.cache
+@made_once
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
@@ -163,7 +162,7 @@ def takes_collisions(spec: TransportSpec) -> bool:
     return spec.water.profile is not None and spec.water.profile.draw is None
 
 
-@functools.cache
+@made_once
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
     scored."""
@@ -227,7 +226,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     return flight_point
 
 
-@functools.cache
+@made_once
 def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, medium, layers, surfaces) -> float``: density [1/sr] of what the water or the
     face of the request scatters at x into the direction v."""
@@ -261,7 +260,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     return scattering_density
 
 
-@functools.cache
+@made_once
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored`` of next events.
 

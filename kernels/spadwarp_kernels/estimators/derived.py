@@ -1,12 +1,11 @@
 """Contributions with their scores: what an estimator brings, for a spec with derivatives or of polarised light."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.crossing import make_crossing_scores, make_to_lens
 from spadwarp_kernels.derivatives.request import make_request_scores
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -26,7 +25,7 @@ from spadwarp_kernels.tally.tally import Contribution
 from .contribution import Request, Scored
 
 
-@functools.cache
+@made_once
 def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Function | None:
     """The Warp function ``(s, camera, gate, limits, layers, derivatives, polarisation) -> Contribution``:
     `Estimator.cross`, with scores."""
@@ -65,7 +64,7 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
     return derived_cross
 
 
-@functools.cache
+@made_once
 def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Function | None:
     """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation)
     -> Scored``: `Estimator.score`, with scores."""

@@ -3,10 +3,9 @@
 After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joint distance-angle sampling).
 """
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.medium.layers import Layers, Profile
 from spadwarp_kernels.medium.water import Medium
@@ -63,7 +62,7 @@ def lens_about(camera: Camera, p: wp.vec2, xi1: float, xi2: float) -> LensSample
     return sample
 
 
-@functools.cache
+@made_once
 def make_sample_lens(port: PortKind | None) -> wp.Function:
     """`sample_lens` for a lens behind a port: it is where the flight's line, refracted, passes the lens."""
     if port is None:
@@ -121,7 +120,7 @@ def _chord_slope(d: float, along: float, r: float) -> float:
     return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
 
 
-@functools.cache
+@made_once
 def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Profile | None = None) -> wp.Function:
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
     profile ``(..., layers, begin_point)``, the latter where the interval begins. With a profile that draws nothing xi

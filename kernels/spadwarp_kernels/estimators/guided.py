@@ -4,11 +4,10 @@ After Buras & Mayer 2011 (directions towards the detector), Kulla & Fajardo 2012
 al. 2013 (joint distance-angle sampling).
 """
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
@@ -128,7 +127,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     return request_flight, make_event_request(spec, flights=True)
 
 
-@functools.cache
+@made_once
 def make_sample_angle(phase: PhaseFunction) -> wp.Function:
     """The Warp function ``(word, to_lens, directed, here, medium, guiding) -> float``: t = 1 - cos(theta) from the axis
     of the lobe towards the lens, of other directed light (back into the view), or of what the water scatters."""
@@ -179,7 +178,7 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
     return wp.clamp(bound / wp.max(probability, 1.0e-6), 0.0, 1.0 / (1.0 + vessel))
 
 
-@functools.cache
+@made_once
 def _make_extinction_at(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(here, wanted, medium, layers, x) -> float``: the extinction at x, where the water is `here`;
     of a grid only if it is wanted, since a cell must be looked up for it."""

@@ -1,9 +1,8 @@
 """The way of light from a point that is scored to a point of the lens, in water alone or through a port."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.sensor.camera import Camera
 
@@ -65,7 +64,7 @@ def _value_behind_port(camera: Camera, extinction: float, weight: float, scatter
     return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
 
 
-@functools.cache
+@made_once
 def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
     scattering, link) -> float``, the fraction of the photon that arrives."""
@@ -93,7 +92,7 @@ def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
     return o
 
 
-@functools.cache
+@made_once
 def make_apparent_lens(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
     if spec.port is None:
@@ -121,7 +120,7 @@ def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
     return -wp.normalize(x)
 
 
-@functools.cache
+@made_once
 def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
     and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""

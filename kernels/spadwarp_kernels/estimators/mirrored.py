@@ -1,12 +1,11 @@
 """Next events by way of the faces of the domain: the light of an event that reaches the lens after reflections."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.derivatives.history import make_flight_scores
 from spadwarp_kernels.derivatives.request import make_turn_scores
 from spadwarp_kernels.intersect.box import segment_meets_box
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.boundary import (
     face_index,
     flipped,
@@ -72,7 +71,7 @@ def _no_origin(limits: Limits) -> wp.vec3:
     return wp.vec3(0.0)
 
 
-@functools.cache
+@made_once
 def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(x, v, length, reflections, scores, medium, layers, limits, surfaces, derivatives, seed) ->
     Way`` of the light that leaves x along v, in the domain's axes, and is reflected so many times within that
@@ -129,7 +128,7 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return way_of
 
 
-@functools.cache
+@made_once
 def make_leaving_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, v, derivatives, medium, layers, surfaces) -> Scores`` of light that the event of a
     request sends along v."""
@@ -144,7 +143,7 @@ def make_leaving_scores(spec: TransportSpec) -> wp.Function:
     return leaving_scores
 
 
-@functools.cache
+@made_once
 def make_image_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, length, reflections, end, inside, camera, limits, surfaces, polarisation) ->
     vec4`` of light that the event of a request sends along v, in the domain's axes from x on, and that is reflected so
@@ -188,7 +187,7 @@ def make_image_stokes(spec: TransportSpec) -> wp.Function:
     return image_stokes
 
 
-@functools.cache
+@made_once
 def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
     polarisation) -> Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked
@@ -291,7 +290,7 @@ class MirroredScores:
     shadow_queries: int
 
 
-@functools.cache
+@made_once
 def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
     polarisation, tally, gradients, ledger, pending_add, thread, scale) -> MirroredScores`` that scores an event by way

@@ -1,10 +1,9 @@
 """A warp's queue of requests, so that its 32 lanes score together what each of them asks for; CUDA alone."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_scores, queue_size, queue_vector
 
 from .contribution import Request
@@ -13,7 +12,7 @@ from .contribution import Request
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
 
 
-@functools.cache
+@made_once
 def make_queue(
     flights: bool, used: bool, derivatives: int = 0, polarised: bool = False
 ) -> tuple[wp.Function, wp.Function]:

@@ -1,9 +1,8 @@
 """The Stokes vector of a photon that enters the aperture itself."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.sensor.camera import Camera
@@ -11,7 +10,7 @@ from spadwarp_kernels.sensor.camera import Camera
 from .receiver import make_leave_water, make_receive
 
 
-@functools.cache
+@made_once
 def make_crossing_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, camera) -> vec4`` of a photon whose flight leads to the lens, see `make_receive`."""
     has_port, leave_water, receive = spec.port is not None, make_leave_water(spec), make_receive(spec)

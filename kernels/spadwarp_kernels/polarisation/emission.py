@@ -1,9 +1,8 @@
 """The Stokes vector of a photon that enters the water."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.source.laser import Laser, beam_frame
 from spadwarp_kernels.source.scan import Scan
@@ -13,7 +12,7 @@ from .request import Polarisation
 from .stokes import stokes_from, transport_stokes, turn_stokes
 
 
-@functools.cache
+@made_once
 def make_first_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(polarisation, laser, scan, target, emitted, x, u) -> vec4`` of a photon that was emitted,
     see `make_emit`, and is in the water at x on its way along u.

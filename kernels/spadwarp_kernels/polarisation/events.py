@@ -1,10 +1,9 @@
 """What events do to a Stokes vector: scattering in the water, surfaces, faces of the domain."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import one_minus_cosine
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.ggx import ggx_brdf
@@ -17,7 +16,7 @@ from .request import Polarisation
 from .stokes import table_elements, turn_stokes
 
 
-@functools.cache
+@made_once
 def make_event_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(stokes, polarisation, surfaces, slot, x, u, v) -> vec4`` of light that an event at x has
     turned from u to v, on the face of a slot of the mesh's tree or (-1) in the water.
@@ -55,7 +54,7 @@ def make_event_stokes(spec: TransportSpec) -> wp.Function:
     return event_stokes
 
 
-@functools.cache
+@made_once
 def make_reflected_stokes() -> wp.Function:
     """The Warp function ``(stokes, u, v, index) -> vec4`` of light that a smooth boundary mirrors from u to v, for the
     index behind it over that of the water."""

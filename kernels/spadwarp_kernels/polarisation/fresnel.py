@@ -5,10 +5,9 @@ scattering: light that is reflected straight back has m33 = m44 = -1 (Born & Wol
 Huffman 1983, section 2.7).
 """
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.port.port import Port
 
@@ -65,7 +64,7 @@ def window_elements(n: wp.vec4, q: wp.vec4) -> Elements:
     return m
 
 
-@functools.cache
+@made_once
 def make_port_elements(port: PortKind | None) -> wp.Function | None:
     """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u; None without a port."""
     if port is None:

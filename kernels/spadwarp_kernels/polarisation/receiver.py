@@ -1,9 +1,8 @@
 """What a receiver takes of the light that comes to the lens."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.tally.tally import Contribution
@@ -13,7 +12,7 @@ from .request import Polarisation
 from .stokes import transport_stokes, turn_stokes
 
 
-@functools.cache
+@made_once
 def make_leave_water(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, stokes, x, u, inside) -> vec4`` of light at x in the water along u that arrives at
     the lens along `inside`: what a port does to it."""
@@ -29,7 +28,7 @@ def make_leave_water(spec: TransportSpec) -> wp.Function:
     return leave_water
 
 
-@functools.cache
+@made_once
 def make_receive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(stokes, u) -> vec4`` of light that arrives at the lens along u: with respect to the image's
     x, to which the lens turns all light by the smallest rotation to the optical axis."""
@@ -44,7 +43,7 @@ def make_receive(spec: TransportSpec) -> wp.Function:
     return receive
 
 
-@functools.cache
+@made_once
 def make_add_channels(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(contribution, polarisation, stokes) -> Contribution``: its value times I, and what the
     channels take, over that, as scores."""

@@ -1,9 +1,8 @@
 """The ledger: where the weight of the photons went, in integers that add up exactly, and counters."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.limits import EXIT_FACES
 
 # Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63, and a cut-off of 2e-4 is 839 units.
@@ -96,7 +95,7 @@ def slot_of_core(first_id: wp.uint64) -> int:
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
 
 
-@functools.cache
+@made_once
 def make_ledger_slot(cuda: bool) -> wp.Function:
     """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
 

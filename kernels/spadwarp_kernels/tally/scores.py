@@ -4,13 +4,13 @@ The derivative of a contribution is the contribution times its score, the deriva
 has met: flights, scatterings, bounces (the score function or likelihood ratio method; Glynn 1990).
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
 
 from spadwarp_kernels.arguments import ArgumentError, check_choice, check_device, check_integer, check_number
+from spadwarp_kernels.math.once import made_once
 
 from .blocks import Blocks, block_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
@@ -83,7 +83,7 @@ def make_derivatives(
     return derivatives
 
 
-@functools.cache
+@made_once
 def make_deposit(count: int, kinds: int = 0) -> wp.Function:
     """The Warp function ``(tally, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
     `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many

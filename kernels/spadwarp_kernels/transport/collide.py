@@ -1,9 +1,8 @@
 """Stage collide: the end of a flight, in the water, on a surface or at a limit."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.boundary import face_index
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import (
@@ -41,7 +40,7 @@ class Collision:
     mirror: int
 
 
-@functools.cache
+@made_once
 def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
     has_mesh, reflecting = spec.mesh, spec.reflecting
@@ -97,7 +96,7 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     return collide
 
 
-@functools.cache
+@made_once
 def make_arrives(flights: bool) -> wp.Function:
     """The Warp function ``s -> bool``: whether the photon is at the end of its flight, and free to collide.
 

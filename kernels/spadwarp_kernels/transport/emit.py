@@ -1,9 +1,8 @@
 """Stage emit: where a photon starts."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.lanes import exchange
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, reweigh
@@ -31,7 +30,7 @@ class Start:
     weight: Weight
 
 
-@functools.cache
+@made_once
 def make_enter(port: PortKind | None) -> wp.Function:
     """The Warp function ``(laser, emitted, s, ledger, thread) -> Start`` of a photon that a laser has emitted,
     behind a port or in the water."""
@@ -64,7 +63,7 @@ def _no_passage(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
     return Passage()
 
 
-@functools.cache
+@made_once
 def make_emit(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(laser, scan, seed, id) -> spatial_vector``: start position [m], then unit direction."""
     confocal = spec.confocal
@@ -81,7 +80,7 @@ def make_emit(spec: TransportSpec) -> wp.Function:
     return emit
 
 
-@functools.cache
+@made_once
 def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(laser, scan, seed, id, entry) -> spatial_vector`` of a photon: on CUDA the one that a lane
     of the warp has put at an entry, see `exchange`."""
@@ -96,7 +95,7 @@ def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
     return take_emitted
 
 
-@functools.cache
+@made_once
 def make_first_photon(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(first_id, offset) -> uint64``: the id of a launch's first photon."""
     stepped = spec.stepped

@@ -1,9 +1,8 @@
 """Stage finish: the account of a photon whose history has ended, and of a thread."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.records import Records
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight
@@ -24,7 +23,7 @@ from spadwarp_kernels.tally.ledger import (
 )
 
 
-@functools.cache
+@made_once
 def make_finish(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, out, ledger, thread) -> Weight``: writes the photon's record, and the ledger entry that
     takes the rest of its weight."""
@@ -50,7 +49,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
     return finish
 
 
-@functools.cache
+@made_once
 def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     """The Warp function ``(s, tally, ledger, thread)``: adds what a thread has summed up to the ledger, and with `adds`
     to the tally what `add_pending` has left."""

@@ -1,9 +1,8 @@
 """Stage flight: how far the photon flies before it collides."""
 
-import functools
-
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -22,7 +21,7 @@ from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 
 
-@functools.cache
+@made_once
 def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, gate, limits, keys, id) -> Flight``."""
     plans = plan_flight is not None

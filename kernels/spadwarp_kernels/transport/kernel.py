@@ -10,8 +10,6 @@ function made for the spec: it takes the state of the photon and returns a small
 state.
 """
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_history
@@ -22,6 +20,7 @@ from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, step_leaf, step_node
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
@@ -85,7 +84,7 @@ WALKING_LANES = 8
 START_LANES = 3
 
 
-@functools.cache
+@made_once
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 

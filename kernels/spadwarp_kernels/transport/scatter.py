@@ -1,12 +1,11 @@
 """Stage scatter: the photon's weight after an event, the end of its history, or its new direction."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.history import make_event_scores
 from spadwarp_kernels.estimators.estimator import Direction
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
 from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
 from spadwarp_kernels.medium.layers import Layers
@@ -60,7 +59,7 @@ class Scattering:
     stokes: wp.vec4
 
 
-@functools.cache
+@made_once
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
@@ -81,7 +80,7 @@ def make_survive(spec: TransportSpec) -> wp.Function:
     return survive
 
 
-@functools.cache
+@made_once
 def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``.
 
@@ -124,7 +123,7 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     return turn
 
 
-@functools.cache
+@made_once
 def make_flies(flies_on: bool) -> wp.Function:
     """The Warp function ``reason -> bool``: whether there is a flight after an event.
 
@@ -138,7 +137,7 @@ def make_flies(flies_on: bool) -> wp.Function:
     return flies
 
 
-@functools.cache
+@made_once
 def make_terminate(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(new, collisions, limits, keys, id, ledger, thread) -> Scattering``: the end of a history for
     its analog weight or its events."""
@@ -171,7 +170,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
     return terminate
 
 
-@functools.cache
+@made_once
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, limits, keys, id, ledger, thread) -> Scattering`` of a photon that a face of the domain
     reflects; what is not reflected leaves by the face.
@@ -214,7 +213,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     return bounce
 
 
-@functools.cache
+@made_once
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation, keys,
     id, ledger, thread) -> Scattering``.

@@ -1,12 +1,11 @@
 """Stage traverse: rays against the target."""
 
-import functools
-
 import warp as wp
 
 from spadwarp_kernels.estimators.contribution import Scored
 from spadwarp_kernels.intersect.box import segment_meets_box
 from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SHADOW_RAY, PhotonState
 from spadwarp_kernels.sensor.camera import Camera
@@ -24,7 +23,7 @@ class Ray:
     length: float
 
 
-@functools.cache
+@made_once
 def make_aim(spec: TransportSpec, scores: bool) -> wp.Function:
     """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
 
@@ -50,7 +49,7 @@ def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d(dtype=float), x:
     return True
 
 
-@functools.cache
+@made_once
 def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(found, camera, surfaces) -> Scored``: whether a shadow ray is needed; by brute force it is
     traced here."""
@@ -77,7 +76,7 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return look
 
 
-@functools.cache
+@made_once
 def make_begin_walk(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU and with
     Warp's own queries."""
