@@ -5,7 +5,7 @@ import warp as wp
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.math.bits import from_bits
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
+from spadwarp_kernels.math.rotations import one_minus_cosine, set_apart, snap_direction
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
@@ -271,6 +271,10 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of = make_link(spec)
+    # As compiled for CUDA without polarisation: one operation that divides and takes the difference of directions, or
+    # two.
+    in_water = spec.port is None
+    divides, rounds = polarised and in_water and not spec.mesh, polarised and spec.mesh and spec.brute_force
 
     @wp.func
     def score(
@@ -303,7 +307,12 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             view = scan.view[request.target]
         link = link_to(camera, found.origin, found.lens)
         pixel = image_of(camera, view, request.target, link.image, found.lens)
-        scattering = scattering_density(request, found.origin, link.to_lens, medium, layers, surfaces)
+        toward = link.to_lens
+        if wp.static(divides):
+            toward = set_apart(found.lens - found.origin) / link.water
+        if wp.static(rounds):
+            toward = set_apart(toward)
+        scattering = scattering_density(request, found.origin, toward, medium, layers, surfaces)
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
             extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
@@ -311,8 +320,10 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             found.contribution.value = value_of(camera, extinction, weight, scattering, link)
             found.contribution.index = tally_index(camera, gate, pixel, path + link.path, component)
         if wp.static(polarised):
+            found.inside = set_apart(found.lens) - set_apart(link.image)
             found.to_lens = link.to_lens
-            found.inside = found.lens - link.image
+            if wp.static(in_water):
+                found.to_lens = wp.normalize(found.inside)
         found.lens = link.end
         return found
 

@@ -4,7 +4,15 @@ from .bits import bits_of, from_bits
 from .float64 import expm1, log1p, normal_cdf, one_minus_exp
 from .memory import zeros
 from .once import made_once
-from .rotations import cos_sin_turn, cotangent, one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
+from .rotations import (
+    cos_sin_turn,
+    cotangent,
+    one_minus_cosine,
+    orthonormal_basis,
+    rotate_direction,
+    set_apart,
+    snap_direction,
+)
 
 __all__ = [
     "bits_of",
@@ -19,6 +27,7 @@ __all__ = [
     "one_minus_exp",
     "orthonormal_basis",
     "rotate_direction",
+    "set_apart",
     "snap_direction",
     "zeros",
 ]

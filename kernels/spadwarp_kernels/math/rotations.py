@@ -33,6 +33,24 @@ def cotangent(angle: float) -> float:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // 0 in a launch along one axis, which the compiler does not know.
+    const unsigned none = threadIdx.y;
+    for (int i = 0; i < 3; ++i) v[i] = __uint_as_float(__float_as_uint(v[i]) ^ none);
+#endif
+    return v;
+""")
+def set_apart(v: wp.vec3) -> wp.vec3:
+    """The same vector, of which a compiler for CUDA does not know that it is the same.
+
+    What is computed from it shares no products with the rest of a kernel. Whether a product and a sum become one
+    operation, which rounds once, depends on who else needs the product: without this, more work in one place would
+    change the last bits of another.
+    """
+    ...
+
+
 @wp.func
 def orthonormal_basis(n: wp.vec3):
     """Two unit vectors that complete the unit vector n to a right-handed basis (Duff et al. 2017)."""

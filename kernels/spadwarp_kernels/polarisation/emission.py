@@ -3,6 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.math.rotations import set_apart
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.source.laser import Laser, beam_frame
 from spadwarp_kernels.source.scan import Scan
@@ -37,11 +38,13 @@ def make_first_stokes(spec: TransportSpec) -> wp.Function:
         axis = laser.axis
         if wp.static(confocal):
             axis = scan.axis[target]
+        axis = set_apart(axis)
         right, _down = beam_frame(axis)
-        heading = wp.spatial_bottom(emitted)
+        heading = set_apart(wp.spatial_bottom(emitted))
         stokes = transport_stokes(stokes_from(polarisation.laser, right, axis), axis, heading)
         if wp.static(has_port):
-            stokes = turn_stokes(stokes, heading, u, elements(laser.port, x, u))
+            leaving = set_apart(u)
+            stokes = turn_stokes(stokes, heading, leaving, elements(laser.port, set_apart(x), leaving))
         return stokes
 
     return first_stokes

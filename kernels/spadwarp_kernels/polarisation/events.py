@@ -4,7 +4,7 @@ import warp as wp
 
 from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine
+from spadwarp_kernels.math.rotations import one_minus_cosine, set_apart
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.ggx import ggx_brdf
 from spadwarp_kernels.surface.lambert import lambert_brdf
@@ -45,11 +45,12 @@ def make_event_stokes(spec: TransportSpec) -> wp.Function:
     def event_stokes(
         stokes: wp.vec4, polarisation: Polarisation, surfaces: Surfaces, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3
     ) -> wp.vec4:
+        before, after = set_apart(u), set_apart(v)
         if wp.static(has_mesh):
             if slot >= 0:
-                return surface_stokes(stokes, polarisation, surfaces, slot, x, u, v)
-        m = table_elements(polarisation.first, polarisation.last, one_minus_cosine(u, v))
-        return turn_stokes(stokes, u, v, m)
+                return surface_stokes(stokes, polarisation, surfaces, slot, set_apart(x), before, after)
+        m = table_elements(polarisation.first, polarisation.last, one_minus_cosine(before, after))
+        return turn_stokes(stokes, before, after, m)
 
     return event_stokes
 
@@ -61,7 +62,8 @@ def make_reflected_stokes() -> wp.Function:
 
     @wp.func
     def reflected_stokes(stokes: wp.vec4, u: wp.vec3, v: wp.vec3, index: float) -> wp.vec4:
-        cosine = wp.sqrt(0.5 * wp.max(1.0 - wp.dot(u, v), 0.0))
-        return turn_stokes(stokes, u, v, fresnel_elements(wp.min(cosine, 1.0), index))
+        before, after = set_apart(u), set_apart(v)
+        cosine = wp.sqrt(0.5 * wp.max(1.0 - wp.dot(before, after), 0.0))
+        return turn_stokes(stokes, before, after, fresnel_elements(wp.min(cosine, 1.0), index))
 
     return reflected_stokes

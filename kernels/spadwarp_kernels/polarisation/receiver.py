@@ -3,6 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.math.rotations import set_apart
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.tally.tally import Contribution
@@ -22,7 +23,8 @@ def make_leave_water(spec: TransportSpec) -> wp.Function:
     @wp.func
     def leave_water(camera: Camera, stokes: wp.vec4, x: wp.vec3, u: wp.vec3, inside: wp.vec3) -> wp.vec4:
         if wp.static(has_port):
-            return turn_stokes(stokes, u, inside, elements(camera.port, x, u))
+            before = set_apart(u)
+            return turn_stokes(stokes, before, set_apart(inside), elements(camera.port, set_apart(x), before))
         return stokes
 
     return leave_water
@@ -38,7 +40,7 @@ def make_receive(spec: TransportSpec) -> wp.Function:
     def receive(stokes: wp.vec4, u: wp.vec3) -> wp.vec4:
         if wp.static(channels == 0):
             return stokes
-        return transport_stokes(stokes, u, wp.vec3(0.0, 0.0, -1.0))
+        return transport_stokes(stokes, set_apart(u), wp.vec3(0.0, 0.0, -1.0))
 
     return receive
 
