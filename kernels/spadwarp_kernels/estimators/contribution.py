@@ -99,11 +99,13 @@ class Scored:
 
 @wp.struct
 class ScoredPoint:
-    """The point of a request: where it is [m], the photon's weight there, and the path up to it [m]."""
+    """The point of a request: where it is [m], the photon's weight there, and the path up to it [m]; with
+    `takes_collisions` the length of the flight up to there that the weight does not account for yet [m]."""
 
     x: wp.vec3
     weight: float
     path: float
+    ahead: float
 
 
 @made_once
@@ -209,8 +211,8 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
             if scores_collision(request.first):
                 weight *= there.extinction * about
             else:
-                passed = water_extinction(medium, layers, request.x, request.u, flight.s, seed)
-                weight *= 0.75 * there.extinction * wp.exp(-passed * flight.s)
+                weight *= 0.75 * there.extinction
+                point.ahead = flight.s
                 flight.density = wp.where(from_angle > 0.0, flight.density, 0.0)
         elif wp.static(has_profile):
             before = float(0.0)
@@ -267,7 +269,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     `flights`: whether requests may ask for a point of a flight.
     """
     confocal, reflecting, merged, polarised = spec.confocal, spec.reflecting, spec.merged, spec.polarised
-    water_extinction = spec.water.extinction
+    water_extinction, collides = spec.water.extinction, flights and takes_collisions(spec)
     image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of = make_link(spec)
@@ -291,6 +293,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         found.origin = request.x
         weight = float(request.weight)
         path = float(request.path)
+        ahead = float(0.0)
         found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
         if wp.static(flights):
             if wp.static(reflecting):
@@ -302,6 +305,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 found.origin = point.x
                 weight = point.weight
                 path = point.path
+                ahead = point.ahead
         view = camera.view
         if wp.static(confocal):
             view = scan.view[request.target]
@@ -315,7 +319,19 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         scattering = scattering_density(request, found.origin, toward, medium, layers, surfaces)
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
-            extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
+            if wp.static(collides):
+                # The flight up to the point and the way to the lens by one loop: the code is long.
+                extinction = float(0.0)
+                while ahead >= 0.0:
+                    begin = wp.where(ahead > 0.0, request.x, found.origin)
+                    u = wp.where(ahead > 0.0, request.u, link.to_lens)
+                    length = wp.where(ahead > 0.0, ahead, link.water)
+                    extinction = water_extinction(medium, layers, begin, u, length, seed)
+                    weight *= wp.where(ahead > 0.0, wp.exp(-extinction * ahead), 1.0)
+                    seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
+                    ahead = wp.where(ahead > 0.0, 0.0, -1.0)
+            else:
+                extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
             component = wp.where(wp.static(merged), BALLISTIC, request.component)
             found.contribution.value = value_of(camera, extinction, weight, scattering, link)
             found.contribution.index = tally_index(camera, gate, pixel, path + link.path, component)
