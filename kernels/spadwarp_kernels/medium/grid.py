@@ -180,10 +180,10 @@ def grid_cell(grid: Grid, x: wp.vec3) -> int:
 def cell_on_line(grid: Grid, p: wp.vec3, d: wp.vec3, t: float) -> int:
     """Index of the cell at p + t d, in cells, of a line within the box; the nearest one for what rounding puts beside
     it."""
-    i = wp.clamp(int(p[0] + t * d[0]), 0, grid.size[0] - 1)
-    j = wp.clamp(int(p[1] + t * d[1]), 0, grid.size[1] - 1)
-    k = wp.clamp(int(p[2] + t * d[2]), 0, grid.size[2] - 1)
-    return (i * grid.size[1] + j) * grid.size[2] + k
+    i = wp.min(int(p[0] + t * d[0]), grid.size[0] - 1)
+    j = wp.min(int(p[1] + t * d[1]), grid.size[1] - 1)
+    k = wp.min(int(p[2] + t * d[2]), grid.size[2] - 1)
+    return wp.max((i * grid.size[1] + j) * grid.size[2] + k, 0)
 
 
 @wp.struct

@@ -7,8 +7,9 @@ al. 2014) estimates what a flight lets through from the mean extinction of the b
 
 import warp as wp
 
+from spadwarp_kernels.math.memory import load_float, load_vec2
 from spadwarp_kernels.random.philox import u01, u01_open
-from spadwarp_kernels.random.splitmix import splitmix
+from spadwarp_kernels.random.splitmix import begin_sequence, step_sequence, sequence_word
 
 from .grid import (
     block_line,
@@ -112,10 +113,10 @@ def grid_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     water = medium
     cell = grid_cell(layers.grid, x)
     if cell >= 0:
-        water.extinction = layers.grid.extinction[cell]
-        water.albedo = layers.grid.albedo[cell]
+        water.extinction = load_float(layers.grid.extinction, cell)
+        water.albedo = load_float(layers.grid.albedo, cell)
         if layers.grid.anisotropy.shape[0] > 0:
-            water.anisotropy = layers.grid.anisotropy[cell]
+            water.anisotropy = load_float(layers.grid.anisotropy, cell)
     return water
 
 
@@ -142,23 +143,24 @@ def delta_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: 
         return _over(rest, medium.extinction)
     rest -= before
     place = first_block(grid, line)
-    number = int(0)
+    majorant = load_float(grid.block_majorant, place.block)
+    random = begin_sequence(seed)
     while place.t < line.end:
         # First through the blocks, then the collision: the lanes of a warp do either together.
-        majorant = float(grid.block_majorant[place.block])
         while majorant * (place.stop - place.t) < rest and place.stop < line.end:
             rest -= majorant * (place.stop - place.t)
             place = next_block(grid, line, place)
-            majorant = grid.block_majorant[place.block]
+            majorant = load_float(grid.block_majorant, place.block)
         kept = majorant * (place.stop - place.t)
         if kept < rest:
             return line.end + _over(rest - kept, medium.extinction)
-        place.t = wp.min(place.t + _over(rest, majorant), place.stop)
-        number += 1
-        words = splitmix(seed, number)
-        if u01(words[0]) * majorant < grid.extinction[cell_on_line(grid, line.p, line.d, place.t)]:
+        place.t = wp.min(place.t + rest / wp.max(majorant, 1.0e-30), place.stop)
+        random = step_sequence(random)
+        extinction = load_float(grid.extinction, cell_on_line(grid, line.p, line.d, place.t))
+        if u01(sequence_word(random)) * majorant < extinction:
             return place.t
-        rest = -wp.log(u01_open(words[1]))
+        random = step_sequence(random)
+        rest = -wp.log(u01_open(sequence_word(random)))
     return line.end + _over(rest, medium.extinction)
 
 
@@ -172,27 +174,27 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
         return medium.extinction
     depth = medium.extinction * (length - (line.end - line.begin))
     part = float(1.0)
-    number = int(1)
-    rest = -wp.log(u01_open(splitmix(seed, number)[1]))
+    random = step_sequence(begin_sequence(seed))
+    rest = -wp.log(u01_open(sequence_word(random)))
     place = first_block(grid, line)
+    control = load_vec2(grid.block_control, place.block)
     while place.t < line.end:
-        control = grid.block_control[place.block]
         while control[1] * (place.stop - place.t) < rest and place.stop < line.end:
             rest -= control[1] * (place.stop - place.t)
             depth += control[0] * (place.stop - place.t)
             place = next_block(grid, line, place)
-            control = grid.block_control[place.block]
-        t = wp.min(place.t + _over(rest, control[1]), place.stop)
+            control = load_vec2(grid.block_control, place.block)
         if control[1] * (place.stop - place.t) < rest:
-            t = place.stop
+            depth += control[0] * (place.stop - place.t)
+            break
+        inverse = 1.0 / wp.max(control[1], 1.0e-30)
+        t = wp.min(place.t + rest * inverse, place.stop)
         depth += control[0] * (t - place.t)
-        hit = t < line.end
         place.t = t
-        if hit:
-            number += 1
-            extinction = grid.extinction[cell_on_line(grid, line.p, line.d, t)]
-            part *= wp.max(1.0 - (extinction - control[0]) / wp.max(control[1], 1.0e-30), 0.0)
-            rest = -wp.log(u01_open(splitmix(seed, number)[1]))
+        extinction = load_float(grid.extinction, cell_on_line(grid, line.p, line.d, t))
+        part *= wp.max(1.0 - (extinction - control[0]) * inverse, 0.0)
+        random = step_sequence(random)
+        rest = -wp.log(u01_open(sequence_word(random)))
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 

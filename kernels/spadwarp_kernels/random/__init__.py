@@ -25,11 +25,12 @@ from .philox import (
     u01_tail,
 )
 from .quantiles import count_quantile
-from .splitmix import join_words, splitmix
+from .splitmix import begin_sequence, join_words, sequence_word, step_sequence
 
 __all__ = [
     "DensityTables",
     "RoundKeys",
+    "begin_sequence",
     "binomial",
     "count_quantile",
     "fold",
@@ -40,7 +41,8 @@ __all__ = [
     "random_block",
     "random_block_keyed",
     "round_keys",
-    "splitmix",
+    "sequence_word",
+    "step_sequence",
     "table_cumulative",
     "table_density",
     "table_sample",
