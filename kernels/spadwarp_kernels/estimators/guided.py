@@ -43,7 +43,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
     request_flight, request_event = make_requests(spec)
     return Estimator(
-        max_registers=(96, 72),
+        max_registers=(80, 72) if spec.grid is not None else (96, 72),
         plan_flight=make_plan_flight(spec),
         request_flight=request_flight,
         request_event=request_event,
