@@ -9,7 +9,7 @@ import warp as wp
 
 from spadwarp_kernels.math.memory import load_float, load_vec2
 from spadwarp_kernels.random.philox import u01, u01_open
-from spadwarp_kernels.random.splitmix import begin_sequence, step_sequence, sequence_word
+from spadwarp_kernels.random.splitmix import begin_sequence, sequence_word, step_sequence
 
 from .grid import (
     block_line,
