@@ -112,10 +112,11 @@ def atmosphere(table, mu, phi_deg, estimator="next_event"):
     across, beam = math.radians(phi_deg) - math.pi, math.sqrt(1.0 - table.mu0**2)
     direction = np.array([beam * math.cos(across), beam * math.sin(across), table.mu0])
     entry = np.array([FAR * math.sqrt(1.0 - mu * mu), 0.0, FAR * mu])
-    empty = {"absorption": 1e-12, "scattering": 0.0}
+    # Of albedo 1 too: so far off, float32 has points every 2 mm, and an event in the slab's last one counts as below.
+    empty = {"absorption": 0.0, "scattering": 1e-12}
     layers = [
-        {"start": FAR * mu, "absorption": 0.0, "scattering": table.optical_depth},
-        {"start": FAR * mu + 1.0, **empty},
+        {**empty, "start": FAR * mu, "scattering": table.optical_depth},
+        {**empty, "start": FAR * mu + 1.0},
     ]
     # Below the slab, since light that bounces off a face is kept away from it by a part of the coordinates.
     low = [entry[0], 0.0, FAR * mu + 1.1]
@@ -175,8 +176,8 @@ def test_rayleigh_atmosphere_is_that_of_the_tables(case, device):
 def test_rayleigh_atmospheres_to_a_thousandth(case, device):
     """On a GPU; to two thousandths on a CPU. At the horizon one photon in fifty tells anything."""
     table, row = CASES[case]
-    photons = (40_000_000 if row[1] <= 0.02 else 5_000_000) // (4 if device == "cpu" else 1)
-    assert check_atmosphere(table, row, photons, device) < (2.2e-3 if device == "cpu" else 1.1e-3)
+    photons = (60_000_000 if row[1] <= 0.02 else 10_000_000) // (5 if device == "cpu" else 1)
+    assert check_atmosphere(table, row, photons, device) <= (2.2e-3 if device == "cpu" else 1e-3)
 
 
 def sampled(one, device, photons, seeds):
