@@ -29,11 +29,11 @@ LOG_DENSITY_LIMIT = 4.0
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
-POOLED = 6
+POOLED = 9
 """Number of depths among the features of histograms: see `spadwarp.denoise.histogram_features`."""
 
-SCORED = 3
-"""Windows whose log-likelihood of each of these depths is among the features."""
+SCORED = 4
+"""Volumes whose log-likelihood of each of these depths is among the features: of three windows, and beliefs."""
 
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""

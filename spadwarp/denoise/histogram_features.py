@@ -1,8 +1,8 @@
 """Features of histograms: candidates for the depth of each pixel, their log-likelihoods, and the shape of the return.
 
 A single pixel with one photon among twenty of the background says little; nine pixels, or 225, say more. Pooling blurs
-sharp edges, so depth is estimated over windows of several sizes and by semi-global matching, and a network chooses. The
-log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows how late the light
+sharp edges, so depth is estimated over windows of several sizes, by belief propagation and by total variation, and a
+network chooses. The log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows how late the light
 arrives that water scattered forward.
 """
 
@@ -14,8 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spadwarp.denoise.belief_propagation import JUMPS, beliefs
 from spadwarp.denoise.frames import POOLED, SCORED
-from spadwarp.denoise.semi_global import aggregate, usual_jump
+from spadwarp.denoise.total_variation import total_variation
 
 __all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
 __all__ += ["log_likelihood", "pooled", "toeplitz"]
@@ -38,6 +39,7 @@ SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2
 FEATURES = SEEN + POOLED
 """Number of channels that `extract_features` gives."""
 
+_SMOOTHED, _STEPS = 0.75, 120  # strength and steps of the total variation among the depths
 _UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
 _MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
 
@@ -58,10 +60,11 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
 
     Returns:
         `[B, FEATURES, H, W]`. `POOLED` depths over the gate: of the highest score of the pixel, of its highest score
-        elsewhere, of semi-global matching, and of the highest scores over `WINDOWS`. Then `SCORED` times `POOLED`
-        scores at these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to
-        `MOST`: of the pixel, of 3 × 3 and of 7 × 7 pixels. Then the excess over the background between `EDGES` around
-        the last depth, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in 7 × 7. Last,
+        elsewhere, of belief propagation with the usual penalty, of the highest scores over `WINDOWS`, of belief
+        propagation with the other `JUMPS`, and the total variation of the first. Then `SCORED` times `POOLED` scores at
+        these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to `MOST`: of the
+        pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around
+        the depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in 7 × 7. Last,
         beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
     """
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
@@ -72,22 +75,25 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
     background = background.mean(dim=(1, 2))  # scores are sums over pixels: these have one template
     narrow = toeplitz(response, bins)
     score = torch.bmm(above.flatten(1, 2), _template(above, background, narrow)).view_as(counts)
-    found = [highest(score), _elsewhere(score, response), highest(aggregate(score, jump=usual_jump(score)))]
-    cubes = [score, *(pooled(score, side) * side**2 for side in WINDOWS[:-1])]
-    found += [highest(cube) for cube in cubes[1:]]
+    usual, *connected = _connected(score)
+    cubes = [score, *(pooled(score, side) * side**2 for side in WINDOWS[:-1]), usual]
+    found = [highest(score), _elsewhere(score, response), *(highest(cube) for cube in (usual, *cubes[1:-1]))]
     delays = torch.arange(bins, device=counts.device)
     tail = torch.exp(-delays / (TAIL * bins))
     distance = delays[:, None] - delays
     late = torch.where(distance >= 0, tail[distance.clamp_min(0)], 0.0) / tail.sum()
     wide = torch.bmm(above.flatten(1, 2), _template(above, background, late @ narrow)).view_as(counts)
     found.append(highest(pooled(wide, WINDOWS[-1])))
-    del wide, score
+    del wide
+    anchor, peak = found[-1], score.amax(dim=-1).clamp(0.0, MOST)
+    weight = peak / peak.mean(dim=(1, 2), keepdim=True).clamp_min(1e-9)
+    found += [*connected, total_variation(found[0], weight, strength=_SMOOTHED, iterations=_STEPS, isotropic=False)]
     places = torch.stack(found, dim=-1)
     near = [_near(cube, places) for cube in cubes]
     tops = [cube.amax(dim=-1, keepdim=True) for cube in cubes]
     scores = [0.1 * (one - top).clamp_min(-MOST) for one, top in zip(near, tops, strict=True)]
     peaks = [0.1 * top.clamp(0.0, MOST) for top in tops]
-    shares = _shape(above, background, found[-1])
+    shares = _shape(above, background, anchor)
     places = places * (merged * bins / given)  # the last of merged bins may reach beyond the gate
     return torch.cat([places, *scores, *peaks, *shares, 0.1 * near[0]], dim=-1).movedim(-1, 1)
 
@@ -105,6 +111,15 @@ def _template(above: Tensor, background: Tensor, response: Tensor) -> Tensor:
     signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(0.05)
     floor = _UNIFORM_SHARE * signal[:, None] / above.shape[-1]
     return torch.log1p(signal[:, None, None] / (background + floor)[:, :, None] * response)
+
+
+def _connected(score: Tensor) -> list[Tensor]:
+    """Beliefs with the usual penalty `[B, H, W, T]`, and depths over the gate with the other `JUMPS`."""
+    jumps = [torch.full((len(score), 1, 1, 1), jump, device=score.device) for jump in JUMPS]
+    if score.is_cuda:  # all at once: many small steps
+        usual, *others = beliefs(score.repeat(len(JUMPS), 1, 1, 1), torch.cat(jumps)).chunk(len(JUMPS))
+        return [usual, *map(highest, others)]
+    return [beliefs(score, jumps[0]), *(highest(beliefs(score, jump)) for jump in jumps[1:])]
 
 
 def _elsewhere(score: Tensor, response: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.histogram_inputs import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
-from spadwarp.denoise.total_variation import STRENGTHS, total_variation
 from spadwarp.errors import ArgumentError
 
 __all__ = ["CLASSICAL", "TUNINGS", "Classical", "classical_depth"]
@@ -26,7 +25,7 @@ TUNINGS: dict[str, tuple[Any, ...]] = {
     "likelihood": (1,),
     "pooled": (3, 5, 7, 11, 15),
     "semi-global": (5.0, 10.0, 20.0, 40.0),
-    "total-variation": STRENGTHS,
+    "total-variation": (0.5, 1.0, 2.0, 4.0),
 }
 """What is tuned: sides of the window [pixels], penalties of a jump [nats], strengths."""
 
@@ -62,6 +61,7 @@ def classical_depth(
     torch = require_torch()
     from spadwarp.denoise.histogram_features import highest, log_likelihood, pooled
     from spadwarp.denoise.semi_global import aggregate, usual_jump
+    from spadwarp.denoise.total_variation import total_variation
 
     found = []
     with torch.inference_mode():
@@ -72,10 +72,10 @@ def classical_depth(
             elif method == "semi-global":
                 jump = usual_jump(score)
                 score = aggregate(score, jump=jump if tuning is None else torch.full_like(jump, tuning))
-            depth = highest(score)[0].cpu().numpy()
+            depth = highest(score)
             if method == "total-variation":
-                weight = score.amax(dim=-1)[0].clamp(0.0, 20.0)
-                share = (weight / weight.mean().clamp_min(1e-9)).cpu().numpy()
-                depth = total_variation(depth, share, strength=float(tuning or 1.0))
-            found.append(depth)
+                weight = score.amax(dim=-1).clamp(0.0, 20.0)
+                weight /= weight.mean().clamp_min(1e-9)
+                depth = total_variation(depth, weight, strength=float(tuning or 1.0))
+            found.append(depth[0].cpu().numpy())
     return np.stack(found).astype(np.float32)

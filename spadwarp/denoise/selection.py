@@ -18,12 +18,12 @@ from spadwarp.denoise.histogram_features import MOST, SEEN
 __all__ = ["CHOICES", "Selection", "selected"]
 
 CHOICES = 1 + 2 + POOLED + 1
-"""Candidates: the network's answer, its medians over 3 × 3 and 5 × 5 pixels, the pooled depths among the features, and
-the median of semi-global matching over 3 × 3 pixels."""
+"""Candidates: the network's answer, its medians over 3 × 3 and 5 × 5 pixels, the depths among the features, and the
+median of belief propagation over 3 × 3 pixels."""
 
 _CLOSE = 0.01  # a candidate this near to a pooled depth has its score [gate widths]
 _SPREAD = 0.004  # candidates this near to the one chosen count, too [gate widths]
-_OF_CHOICE = 18  # what is known of a candidate
+_OF_CHOICE = 19  # what is known of a candidate
 _OF_PIXEL = 2 * SCORED + (SEEN - POOLED - SCORED * POOLED - SCORED) + 3 + 2  # and of its pixel
 
 

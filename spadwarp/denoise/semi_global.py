@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["SLOPE", "aggregate", "usual_jump"]
+__all__ = ["SLOPE", "aggregate", "messages", "usual_jump"]
 
 SLOPE = 1.0
 """Penalty of the next bin [nats]."""
@@ -32,27 +32,25 @@ def aggregate(score: Tensor, *, jump: Tensor, slope: float = SLOPE) -> Tensor:
         jump: Penalty of any other depth `[B, 1, 1, 1]` [nats].
         slope: Penalty of the next bin [nats].
     """
-    turned = score.transpose(1, 2)
-    parts = [
-        _both_ways(lines.flatten(0, 1), slope, jump.expand(-1, lines.shape[1], 1, 1).flatten(0, 1)[:, 0]).view(
-            lines.shape
-        )
-        for lines in (score, turned)
-    ]
-    return parts[0] + parts[1].transpose(1, 2)
+    rows = messages(score, slope=slope, jump=jump)
+    columns = messages(score.transpose(1, 2), slope=slope, jump=jump).transpose(1, 2)
+    return (rows + columns).add_(score, alpha=4.0)
 
 
-def _both_ways(lines: Tensor, slope: float, jump: Tensor) -> Tensor:
-    """Sum over the two directions along lines `[N, L, T]`, each with its jump `[N, 1]`."""
+def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
+    """What the pixels of a row before and behind each tell it of its depth, the sum of both, `[B, H, W, T]`.
+
+    Arguments are those of `aggregate`. The best depth has 0 in each of the two.
+    """
+    lines = score.flatten(0, 1)
+    most = jump.expand(-1, score.shape[1], 1, 1).flatten(0, 1)[:, 0]
     pair = torch.stack([lines, lines.flip(1)])
-    total = torch.empty_like(pair)
-    state = pair[:, :, 0]
-    total[:, :, 0] = state
+    told = torch.zeros_like(pair)
     for place in range(1, lines.shape[1]):
-        best = state.amax(dim=-1, keepdim=True)
-        kept = torch.maximum(state, best - jump)
-        kept[..., 1:] = torch.maximum(kept[..., 1:], state[..., :-1] - slope)
-        kept[..., :-1] = torch.maximum(kept[..., :-1], state[..., 1:] - slope)
-        state = kept.sub_(best).add_(pair[:, :, place])
-        total[:, :, place] = state
-    return total[0] + total[1].flip(1)
+        known = pair[:, :, place - 1] + told[:, :, place - 1]
+        best = known.amax(dim=-1, keepdim=True)
+        kept = torch.maximum(known, best - most)
+        kept[..., 1:] = torch.maximum(kept[..., 1:], known[..., :-1] - slope)
+        kept[..., :-1] = torch.maximum(kept[..., :-1], known[..., 1:] - slope)
+        torch.sub(kept, best, out=told[:, :, place])
+    return (told[0] + told[1].flip(1)).view_as(score)

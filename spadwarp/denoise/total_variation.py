@@ -6,42 +6,44 @@ Rudin, Osher & Fatemi, Physica D 60, 259 (1992), with the L1 norm of Chan & Esed
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor
 
-__all__ = ["STRENGTHS", "total_variation"]
-
-STRENGTHS = (0.5, 1.0, 2.0, 4.0)
-"""Values of λ that are tried."""
+__all__ = ["total_variation"]
 
 
 def total_variation(
-    depth: NDArray[np.float32], weight: NDArray[np.float32], *, strength: float = 1.0, iterations: int = 300
-) -> NDArray[np.float32]:
-    """The smoothed map `[H, W]`.
+    depth: Tensor, weight: Tensor, *, strength: float = 1.0, iterations: int = 300, isotropic: bool = True
+) -> Tensor:
+    """The smoothed maps `[B, H, W]`.
 
     Args:
-        depth: d₀ `[H, W]`, any unit; finite.
-        weight: w of each pixel `[H, W]`, ≥ 0; 0 where nothing was reported.
+        depth: d₀ `[B, H, W]`, over the gate; finite.
+        weight: w of each pixel `[B, H, W]`, ≥ 0; 0 where nothing was reported.
         strength: λ.
         iterations: Primal-dual steps.
+        isotropic: Whether TV is the length of the gradient, else the sum of its two parts, which commutes with
+            reflections of the image.
     """
-    low, high = float(depth.min()), float(depth.max())
-    scale = max(high - low, 1e-12)
-    data = ((depth - low) / scale).astype(np.float64)
-    found, ahead = data.copy(), data.copy()
-    flow = np.zeros((2, *depth.shape))
+    found, ahead = depth.clone(), depth.clone()
+    down, right = torch.zeros_like(depth), torch.zeros_like(depth)
     step = 0.35
+    far = step * weight
     for _ in range(iterations):
-        flow[0, :-1] += step * np.diff(ahead, axis=0)
-        flow[1, :, :-1] += step * np.diff(ahead, axis=1)
-        flow /= np.maximum(1.0, np.hypot(*flow) / strength)
-        back = flow.sum(axis=0)
-        back[1:] -= flow[0, :-1]
-        back[:, 1:] -= flow[1, :, :-1]
-        moved = found + step * back
-        apart = moved - data
-        new = data + np.sign(apart) * np.maximum(np.abs(apart) - step * weight, 0.0)
+        down[:, :-1] += step * ahead.diff(dim=1)
+        right[:, :, :-1] += step * ahead.diff(dim=2)
+        if isotropic:
+            length = torch.hypot(down, right).div_(strength).clamp_min_(1.0)
+            down /= length
+            right /= length
+        else:
+            down.clamp_(-strength, strength)
+            right.clamp_(-strength, strength)
+        moved = torch.add(found, down + right, alpha=step)
+        moved[:, 1:] -= step * down[:, :-1]
+        moved[:, :, 1:] -= step * right[:, :, :-1]
+        apart = moved - depth
+        new = moved - torch.maximum(torch.minimum(apart, far), -far)  # shrinks what is apart
         ahead = 2.0 * new - found
         found = new
-    return (low + scale * found).astype(np.float32)
+    return found
