@@ -68,24 +68,17 @@ class DepthFrames:
         start, stop = self.gate
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
-    def network_input(
-        self, *, histograms: bool = False, fills: bool = False, gates: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float32]:
+    def network_input(self, *, histograms: bool = False, fills: bool = False) -> NDArray[np.float32]:
         """Channels for a network, `[N, 3, H, W]`, and with `histograms` also their features.
 
-        `spadwarp.denoise.networks` describes the channels. `gates`: (start, stop) of each frame `[N, 2]` [m], narrower
-        than `gate`; depths beyond `MARGIN` around it count as not reported. `fills`: for networks that do not see which
-        pixels reported: missing ones get the nearest depth where those around them report nearly as often as elsewhere.
+        `spadwarp.denoise.networks` describes the channels. `fills`: for networks that do not see which pixels reported:
+        missing ones get the nearest depth where those around them report nearly as often as elsewhere.
         """
-        if gates is None:
-            gates = np.tile(np.asarray(self.gate, np.float64), (len(self.depth), 1))
-        start, width = gates[:, 0, None, None], (gates[:, 1] - gates[:, 0])[:, None, None]
-        scaled = ((self.depth - start) / width).astype(np.float32)
+        scaled = self.scaled
         if fills:
             for depth, level in zip(scaled, self.density, strict=True):
                 depth[:] = depth[_fill_source(depth, level)]
-        with np.errstate(invalid="ignore"):
-            reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
+        reported = ~np.isnan(scaled)
         limit = LOG_DENSITY_LIMIT
         log_density = np.log(np.clip(self.density, math.exp(-limit), math.exp(limit)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
@@ -93,7 +86,8 @@ class DepthFrames:
         if not histograms:
             return frame
         assert self.features is not None
-        pooled = (self.features[:, :POOLED] - start[:, None]) / width[:, None] - 0.5
+        start, stop = self.gate
+        pooled = (self.features[:, :POOLED] - start) / (stop - start) - 0.5
         return np.concatenate([frame, pooled, self.features[:, POOLED:]], axis=1, dtype=np.float32)
 
 

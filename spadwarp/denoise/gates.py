@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["bins_of_target", "gate_of_target"]
+from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["bins_of_target", "gates_of_target", "narrowed_input"]
 
 _BINS = 20  # into which a gate is divided
 _NEAR = 0.01  # part of the gate within which two depths agree
@@ -14,58 +22,84 @@ _ROUNDS = 3
 _KEPT = 0.7  # a gate is narrowed only to less than this part of its width
 
 
-def gate_of_target(
-    depth: NDArray[np.float32], density: NDArray[np.float32], gate: tuple[float, float]
-) -> tuple[float, float]:
+def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
     """The part of the gate in which depths agree with those around them more often than backscatter would.
 
     Args:
-        depth: One frame `[H, W]` [m], NaN where nothing was reported.
-        density: Of the backscatter at these depths, relative to a flat one over the gate, `[H, W]`.
-        gate: (start, stop) [m].
+        depth: Frames of depth over the gate, NaN where nothing was reported, `[N, H, W]`.
+        density: Of the backscatter at these depths, relative to a flat one over the gate, `[N, H, W]`.
 
     Returns:
-        (start, stop) [m], with a margin; the whole gate where nothing agrees, or where little would be gained.
+        Its start and its width, with a margin, in widths of the gate, each `[N]`; 0 and 1, the whole gate, where
+        nothing agrees, or where little would be gained.
     """
-    found = gate
+    start, width = depth.new_zeros(len(depth)), depth.new_ones(len(depth))
+    searched = width > 0.0
     for _ in range(_ROUNDS):
-        start, stop = found
-        scale = (stop - start) / (gate[1] - gate[0])
-        narrower = _narrowed((depth - start) / (stop - start), density * scale)
-        if narrower[1] - narrower[0] >= _KEPT:
+        frame_width = width[:, None, None]
+        low, high = _narrowed((depth - start[:, None, None]) / frame_width, density * frame_width)
+        searched = searched & (high - low < _KEPT)
+        start = start + searched * low * width
+        width = width * ((high - low - 1.0) * searched + 1.0)
+        if not (depth.is_cuda or searched.any()):  # a GPU would have to wait for the answer
             break
-        found = start + narrower[0] * (stop - start), start + narrower[1] * (stop - start)
-    return found
+    return start, width
 
 
-def _narrowed(scaled: NDArray[np.float32], density: NDArray[np.float32]) -> tuple[float, float]:
-    """(start, stop) as parts of the gate."""
-    from scipy.special import bdtrc
+def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Input of PyramidNet `[N, 3, H, W]` over the part of the gate that holds the target, and start and width of it.
 
-    with np.errstate(invalid="ignore"):
-        reported = (scaled >= 0.0) & (scaled < 1.0)
-    if reported.sum() < 50:
-        return 0.0, 1.0
-    values = np.where(reported, scaled, np.float32(np.nan))
-    agreeing = np.zeros(scaled.shape, np.uint8)
-    height, width = scaled.shape
+    Arguments are those of `gates_of_target`. Depths beyond `MARGIN` around that part count as not reported.
+    """
+    import torch
+
+    start, width = gates_of_target(depth, density)
+    scaled = (depth - start[:, None, None]) / width[:, None, None]
+    reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
+    log_density = density.log().clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
+    channels = torch.where(reported, scaled, 1.0), reported.to(scaled.dtype), torch.where(reported, log_density, 0.0)
+    return torch.stack(channels, dim=1), start, width
+
+
+def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+    """Start and stop as parts of the gate, `[N]`."""
+    import torch
+
+    reported = (scaled >= 0.0) & (scaled < 1.0)
+    values = torch.where(reported, scaled, torch.nan)
+    agreeing = torch.zeros_like(scaled, dtype=torch.uint8)
+    height, width = scaled.shape[1:]
     for down, right in [(0, 1), (0, 2), *((y, x) for y in (1, 2) for x in range(-2, 3))]:
-        one = np.s_[: height - down, max(0, -right) : width - max(0, right)]
-        other = np.s_[down:, max(0, right) : width - max(0, -right)]
-        with np.errstate(invalid="ignore"):
-            near = np.abs(values[one] - values[other]) < _NEAR
+        one = np.s_[:, : height - down, max(0, -right) : width - max(0, right)]
+        other = np.s_[:, down:, max(0, right) : width - max(0, -right)]
+        near = (values[one] - values[other]).abs_() < _NEAR
         agreeing[one] += near
         agreeing[other] += near
-    place = (scaled[reported] * _BINS).astype(np.int64)
-    observed = np.bincount(place[agreeing[reported] >= _AGREEING], minlength=_BINS)
+    share = reported.flatten(1).float().mean(dim=1)
     # Backscatter of this density, in as many pixels as report, agrees by chance.
-    chance = np.clip(2.0 * _NEAR * density[reported] * reported.mean(), 0.0, 1.0)
-    by_bin = np.bincount(place, chance, minlength=_BINS) / np.maximum(np.bincount(place, minlength=_BINS), 1)
-    expected = np.bincount(place, minlength=_BINS) * bdtrc(_AGREEING - 1, 24, by_bin)
-    significant = np.flatnonzero(observed > expected + 4.0 * np.sqrt(expected) + 6.0)
-    if len(significant) == 0:
-        return 0.0, 1.0
-    return max(0.0, (significant[0] - 1.5) / _BINS), min(1.0, (significant[-1] + 2.5) / _BINS)
+    chance = (2.0 * _NEAR * share[:, None, None] * density).clamp(0.0, 1.0)
+    rows = torch.stack([torch.ones_like(chance), chance, (agreeing >= _AGREEING).float()], dim=1).flatten(2)
+    place = torch.where(reported, scaled * _BINS, _BINS).to(torch.uint8).flatten(1)
+    pixels, by_chance, observed = _sums(rows, place).double().unbind(dim=1)
+    part = by_chance / pixels.clamp_min(1.0)
+    fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
+    expected = pixels * (1.0 - fewer)
+    significant = observed > expected + 4.0 * expected.clamp_min(0.0).sqrt() + 6.0
+    found = significant.any(dim=1) & (reported.flatten(1).sum(dim=1) >= 50)
+    first, last = significant.int().argmax(dim=1), _BINS - 1 - significant.int().flip(1).argmax(dim=1)
+    low, high = ((first - 1.5) / _BINS).clamp_min(0.0), ((last + 2.5) / _BINS).clamp_max(1.0)
+    return torch.where(found, low, 0.0), torch.where(found, high, 1.0)
+
+
+def _sums(rows: Tensor, place: Tensor) -> Tensor:
+    """Sums `[N, C, _BINS]` of rows of values `[N, C, P]` by the bin of each pixel `[N, P]`; `_BINS` is in none."""
+    import torch
+
+    if rows.is_cuda:  # where sums by index of so few bins would wait for each other
+        bins = torch.arange(_BINS, device=rows.device, dtype=torch.uint8)
+        return rows @ (place[:, None] == bins[:, None]).float().mT
+    index = place.long()[:, None].expand(-1, rows.shape[1], -1)
+    return rows.new_zeros(*rows.shape[:2], _BINS + 1).scatter_add_(2, index, rows)[..., :_BINS]
 
 
 def bins_of_target(

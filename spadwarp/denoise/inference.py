@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
 from spadwarp.denoise.frames import DepthFrames, depth_frames
-from spadwarp.denoise.gates import gate_of_target
+from spadwarp.denoise.gates import narrowed_input
 from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
@@ -108,9 +108,9 @@ def estimate(
             `spadwarp.frames.InstrumentResponse.per_bin` gives it.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
-        precision: Of the layers of PyramidNet for depth alone, "bfloat16" or "float32". Default: bfloat16 on a CPU with
-            AMX, where it takes half the time and changes depths by less than 0.1 mm in the median; float32 elsewhere.
-            "float32" gives the same depth on every processor, to rounding.
+        precision: Of the layers of PyramidNet for depth alone, "float16", "bfloat16" or "float32". Default: float16 on
+            a GPU; bfloat16 on a CPU with AMX, where it takes half the time and changes depths by less than 0.1 mm in
+            the median; float32 elsewhere. "float32" gives the same depth on every processor, to rounding.
         progress: Called with ("frames", done, total).
 
     Raises:
@@ -218,29 +218,35 @@ def estimate_frames(
     if model != "pyramid":
         precision = "float32"
     network = load_network(model, weights, str(place), precision or fast_precision(str(place)))
-    gates = np.tile(np.asarray(frames.gate, np.float64), (len(frames.depth), 1))
-    if model == "pyramid":
-        gates = np.array(
-            [gate_of_target(*pair, frames.gate) for pair in zip(frames.depth, frames.density, strict=True)]
-        )
-    inputs = frames.network_input(histograms=model == "histograms", fills=model in ("dncnn", "usdn"), gates=gates)
+    inputs = None
+    if model != "pyramid":
+        inputs = frames.network_input(histograms=model == "histograms", fills=model in ("dncnn", "usdn"))
     found = np.empty_like(frames.depth)
+    begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
     # glibc returns memory to the system after each frame, and fresh pages take as long as half the network, unless a
     # block this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
     torch.empty(31 << 20, dtype=torch.uint8)
-    for first in range(0, len(inputs), part):
+    for first in range(0, len(found), part):
         some = slice(first, first + part)
         with torch.inference_mode():
-            output = network(torch.from_numpy(inputs[some]).to(place)).float()
+            if inputs is None:
+                depth, density = (
+                    torch.from_numpy(values[some]).to(place) for values in (frames.scaled, frames.density)
+                )
+                given, start, width = narrowed_input(depth, density)
+                output = network(given).float()
+                output[:, 0].clamp_(0.0, 1.0).mul_(width[:, None, None]).add_(start[:, None, None])
+            else:
+                output = network(torch.from_numpy(inputs[some]).to(place)).float()
+                output[:, 0].clamp_(0.0, 1.0)
             output[:, 1:3].sigmoid_()
-            output = output.cpu().numpy()
-        start, width = gates[some, 0, None, None], (gates[some, 1] - gates[some, 0])[:, None, None]
-        found[some] = start + width * np.clip(output[:, 0], 0.0, 1.0)
+            output = output[:, :3].cpu().numpy()
+        found[some] = begin + extent * output[:, 0]
         if output.shape[1] > 1:
             probability[some], confidence[some] = output[:, 1], output[:, 2]
         if progress is not None:
-            progress("frames", min(first + part, len(inputs)), len(inputs))
+            progress("frames", min(first + part, len(found)), len(found))
     return Estimate(
         np.where(empty, np.float32(np.nan), found), np.where(empty, np.float32(0.0), probability), confidence
     )

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import SEEN
-from spadwarp.denoise.selection import Selection, selected
+from spadwarp.denoise.selection import Selection, selected_depth
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
 from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
@@ -26,8 +26,6 @@ CLOSE = 0.01
 """Two depths this near belong to one return, and a depth this near to the truth is right [gate widths]."""
 
 _WIDEST = 0.1  # depths this far from the first answer still count for the second [gate widths]
-
-_SELECTED_AT_ONCE = 1 << 18  # pixels whose candidates are held in memory
 
 
 class _Residual(nn.Module):
@@ -165,9 +163,7 @@ class PyramidNet(nn.Module):
                 candidates, scores = self.select(*seen)
                 extra += [candidates - delay.detach(), scores]
             else:
-                frames = max(1, _SELECTED_AT_ONCE // depth[0].numel())
-                some = zip(*(part.split(frames) for part in seen), strict=True)
-                found = torch.cat([selected(*self.select(*part)) for part in some])
+                found = selected_depth(self.select, *seen)
             found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 

@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import MOST, SEEN
 
-__all__ = ["CHOICES", "Selection", "selected"]
+__all__ = ["CHOICES", "Selection", "selected", "selected_depth"]
 
 CHOICES = 1 + 2 + POOLED + 1
 """Candidates: the network's answer, its medians over 3 × 3 and 5 × 5 pixels, the depths among the features, and the
 median of belief propagation over 3 × 3 pixels."""
 
+_REACH = 2  # pixels around a pixel that its choice depends on
+_PIXELS_AT_ONCE = 1 << 16  # of which candidates are held in memory
 _CLOSE = 0.01  # a candidate this near to a pooled depth has its score [gate widths]
 _SPREAD = 0.004  # candidates this near to the one chosen count, too [gate widths]
 _OF_CHOICE = 19  # what is known of a candidate
@@ -44,18 +46,37 @@ class Selection(nn.Module):
             self.bias[0] = 3.0
             self.last.weight.mul_(0.3)
 
-    def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, found: Tensor, logits: Tensor, features: Tensor, typical: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Candidates over the gate and their scores, each `[B, CHOICES, H, W]`.
 
         Args:
             found: The network's answer over the gate `[B, 1, H, W]`.
             logits: Its three logits `[B, 3, H, W]`.
             features: See `spadwarp.denoise.histogram_features`, with 0.5 subtracted from depths.
+            typical: Of the frames that these are parts of, `[B, 1 + SCORED, 1, 1]`; default: of these.
         """
-        candidates, of_choice, of_pixel = _evidence(found, logits, features)
+        typical = _typical(features) if typical is None else typical
+        candidates, of_choice, of_pixel = _evidence(found, logits, features, typical)
         known = self.choice(of_choice.movedim(2, -1)) + self.pixel(of_pixel.movedim(1, -1))[:, None]
         known = F.relu(known + self.kind[:, None, None])
         return candidates, self.last(F.relu(self.middle(known)))[..., 0] + self.bias[:, None, None]
+
+
+def selected_depth(selection: Selection, found: Tensor, logits: Tensor, features: Tensor) -> Tensor:
+    """`selected` of frames, strip by strip, `[B, 1, H, W]`; arguments are those of `Selection.forward`."""
+    height, width = found.shape[-2:]
+    rows = max(1, _PIXELS_AT_ONCE // width)
+    answer = torch.empty_like(found)
+    for frame in range(len(found)):
+        whole = [image[frame : frame + 1] for image in (found, logits, features)]
+        typical = _typical(whole[2])
+        for top in range(0, height, rows):
+            first, last = max(0, top - _REACH), top + rows + _REACH
+            strip = selected(*selection(*(image[:, :, first:last] for image in whole), typical))
+            answer[frame, :, top : top + rows] = strip[0, :, top - first : top - first + rows]
+    return answer
 
 
 def selected(candidates: Tensor, scores: Tensor) -> Tensor:
@@ -66,7 +87,14 @@ def selected(candidates: Tensor, scores: Tensor) -> Tensor:
     return (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
 
 
-def _evidence(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _typical(features: Tensor) -> Tensor:
+    """Medians over each frame of the second return's log-likelihood and of the highest scores, `[B, 1 + SCORED, 1, 1]`."""
+    tops = features[:, POOLED + SCORED * POOLED : POOLED + SCORED * POOLED + SCORED]
+    values = torch.cat([features[:, SEEN + 1 : SEEN + 2], tops], dim=1)
+    return values.flatten(2).median(dim=2).values[:, :, None, None]
+
+
+def _evidence(found: Tensor, logits: Tensor, features: Tensor, typical: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates `[B, K, H, W]`, what is known of each `[B, K, C, H, W]`, and of the pixel `[B, P, H, W]`."""
     depths, own = 0.5 + features[:, :POOLED], features[:, SEEN : SEEN + POOLED]
     scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
@@ -86,7 +114,7 @@ def _evidence(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, 
         parts = [torch.exp((candidates - one).abs() * (-1.0 / reach)) for one in around.split(1, dim=1)]
         return torch.stack(parts).mean(dim=0)
 
-    usual, top, mine = own[:, 1:2].flatten(1).median(dim=1).values[:, None, None, None], own[:, :1], at(own, -1.0)
+    usual, top, mine = typical[:, :1], own[:, :1], at(own, -1.0)
     apart = (candidates - found).abs()
     of_choice = [
         *(at(scores[:, window], -0.1 * MOST) for window in range(SCORED)),
@@ -98,9 +126,8 @@ def _evidence(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, 
         agreeing(first, 0.006), agreeing(_around(depths[:, :1], 5), 0.006),
         agreeing(torch.cat([first, second], dim=1), 0.006),
     ]  # fmt: skip
-    typical = tops.flatten(2).median(dim=2).values[:, :, None, None].expand_as(tops)
     rough = [20.0 * (around - one).abs().mean(dim=1, keepdim=True) for around, one in ((wide, outer), (near, inner))]
-    return candidates, torch.stack(of_choice, dim=2), torch.cat([tops, typical, rest, 0.25 * logits, *rough], dim=1)
+    return candidates, torch.stack(of_choice, dim=2), torch.cat([tops, typical[:, 1:].expand_as(tops), rest, 0.25 * logits, *rough], dim=1)
 
 
 def _around(image: Tensor, side: int) -> Tensor:

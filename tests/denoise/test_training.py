@@ -122,6 +122,18 @@ def test_a_new_selection_takes_the_answer_of_the_network():
     assert (scores.argmax(dim=1) == 0).float().mean() > 0.95
 
 
+def test_the_selection_of_strips_is_that_of_whole_frames(monkeypatch):
+    generator = torch.Generator().manual_seed(7)
+    shapes = ((2, 1, 23, 9), (2, 3, 23, 9), (2, FEATURES, 23, 9))
+    images = [torch.rand(shape, generator=generator) for shape in shapes]
+    network = selection.Selection()
+    torch.nn.init.normal_(network.last.weight)  # all candidates are chosen
+    with torch.no_grad():
+        whole = selection.selected(*network(*images))
+        monkeypatch.setattr(selection, "_PIXELS_AT_ONCE", 5 * 9)
+        assert torch.allclose(selection.selected_depth(network, *images), whole, atol=1e-6)
+
+
 def test_the_selection_is_never_the_mean_of_two_surfaces():
     candidates = torch.tensor([0.2, 0.2, 0.7, 0.7])[None, :, None, None]
     for scores, expected in (([0.0, 0.0, 0.1, 0.0], 0.7), ([0.1, 0.0, 0.0, 0.0], 0.2)):

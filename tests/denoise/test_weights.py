@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth
 from spadwarp.denoise.frames import depth_frames
-from spadwarp.denoise.gates import bins_of_target, gate_of_target
+from spadwarp.denoise.gates import bins_of_target, gates_of_target
 from spadwarp.denoise.network_files import WEIGHTS
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.io.exr import read_exr
@@ -150,12 +151,13 @@ def test_a_line_one_pixel_wide_is_kept_where_backscatter_is_rare():
 
 def test_the_gate_is_narrowed_to_where_depths_agree():
     target = evaluation_scene("spiral", "open water")
-    frames = depth_frames(noisy_depth(target, water="uniform", level=0.264, seed=1), gate=(12.0, 20.0))
-    start, stop = gate_of_target(frames.depth[0], frames.density[0], frames.gate)
-    assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
     water = evaluation_scene("nothing", "open water")
-    frames = depth_frames(noisy_depth(water, water="uniform", level=0.264, seed=1), gate=GATE)
-    assert gate_of_target(frames.depth[0], frames.density[0], GATE) == GATE
+    noisy = [noisy_depth(scene, water="uniform", level=0.264, seed=1) for scene in (target, water)]
+    frames = depth_frames(np.stack(noisy), gate=(12.0, 20.0))
+    starts, widths = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
+    start, stop = 12.0 + 8.0 * starts[0], 12.0 + 8.0 * (starts[0] + widths[0])
+    assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
+    assert (starts[1], widths[1]) == (0.0, 1.0)
 
 
 def test_the_bins_of_the_target_are_those_of_the_excess():
