@@ -34,7 +34,7 @@ def denoise(
         typer.Option(
             metavar="NAME",
             help="pyramid, histograms, dncnn, usdn; or median, gating, bm3d; for counts "
-            "also likelihood, pooled, semi-global, total-variation.",
+            "also likelihood, pooled, semi-global, total-variation, belief-propagation.",
         ),
     ] = "pyramid",
     gate: Annotated[
@@ -82,7 +82,7 @@ def denoise(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Of the layers of pyramid: float32, or bfloat16, which is the default on a CPU that has AMX.",
+            help="Of the layers of pyramid: float32, float16 (default on a GPU), bfloat16 (default on a CPU with AMX).",
         ),
     ] = None,
     overwrite: opt.Overwrite = False,

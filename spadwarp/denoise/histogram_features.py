@@ -2,8 +2,8 @@
 
 A single pixel with one photon among twenty of the background says little; nine pixels, or 225, say more. Pooling blurs
 sharp edges, so depth is estimated over windows of several sizes, by belief propagation and by total variation, and a
-network chooses. The log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows how late the light
-arrives that water scattered forward.
+network chooses. The log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows
+how late the light arrives that water scattered forward.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
         elsewhere, of belief propagation with the usual penalty, of the highest scores over `WINDOWS`, of belief
         propagation with the other `JUMPS`, and the total variation of the first. Then `SCORED` times `POOLED` scores at
         these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to `MOST`: of the
-        pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around
-        the depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in 7 × 7. Last,
-        beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
+        pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around the
+        depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in
+        7 × 7. Last, beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
     """
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
     if merged > 1:

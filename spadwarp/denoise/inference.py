@@ -96,8 +96,8 @@ def estimate(
     Args:
         depth, gate: See `apply`.
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
-            "histograms", the variant of PyramidNet that uses them; "likelihood", "pooled", "semi-global" and
-            "total-variation" are classical estimates from counts.
+            "histograms", the variant of PyramidNet that uses them; "likelihood", "pooled", "semi-global",
+            "total-variation" and "belief-propagation" are classical estimates from counts.
         profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; taken as flat if not
             given. PyramidNet and gating use it.
         counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.

@@ -1,4 +1,4 @@
-"""Classical estimates of depth from histograms: the likelihood of pixels, of pooled pixels, and of whole lines.
+"""Classical estimates of depth from histograms: the likelihood of pixels, of pooled pixels, and of whole frames.
 
 All see the same data as the network for histograms: counts, the expected background and the instrument response.
 """
@@ -16,7 +16,7 @@ from spadwarp.errors import ArgumentError
 
 __all__ = ["CLASSICAL", "TUNINGS", "Classical", "classical_depth"]
 
-Classical = Literal["likelihood", "pooled", "semi-global", "total-variation"]
+Classical = Literal["likelihood", "pooled", "semi-global", "total-variation", "belief-propagation"]
 
 CLASSICAL: tuple[Classical, ...] = get_args(Classical)
 """Classical estimates from histograms."""
@@ -26,6 +26,7 @@ TUNINGS: dict[str, tuple[Any, ...]] = {
     "pooled": (3, 5, 7, 11, 15),
     "semi-global": (5.0, 10.0, 20.0, 40.0),
     "total-variation": (0.5, 1.0, 2.0, 4.0),
+    "belief-propagation": (2.5, 4.0, 8.0, 16.0),
 }
 """What is tuned: sides of the window [pixels], penalties of a jump [nats], strengths."""
 
@@ -43,14 +44,15 @@ def classical_depth(
 
     `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`:
     `spadwarp.denoise.semi_global` on the likelihoods. `"total-variation"`: of the likelihood depth, each pixel weighted
-    by how far its likelihood stands out.
+    by how far its likelihood stands out. `"belief-propagation"`: `spadwarp.denoise.belief_propagation` on the
+    likelihoods, the strongest of these in most cases.
 
     Args:
         counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
         method: One of `CLASSICAL`.
-        tuning: See `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1.
+        tuning: See `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
         device: torch device.
 
     Raises:
@@ -59,6 +61,7 @@ def classical_depth(
     if method not in CLASSICAL:
         raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, CLASSICAL))}")
     torch = require_torch()
+    from spadwarp.denoise.belief_propagation import JUMPS, beliefs
     from spadwarp.denoise.histogram_features import highest, log_likelihood, pooled
     from spadwarp.denoise.semi_global import aggregate, usual_jump
     from spadwarp.denoise.total_variation import total_variation
@@ -72,6 +75,8 @@ def classical_depth(
             elif method == "semi-global":
                 jump = usual_jump(score)
                 score = aggregate(score, jump=jump if tuning is None else torch.full_like(jump, tuning))
+            elif method == "belief-propagation":
+                score = beliefs(score, score.new_full((1, 1, 1, 1), JUMPS[0] if tuning is None else tuning))
             depth = highest(score)
             if method == "total-variation":
                 weight = score.amax(dim=-1).clamp(0.0, 20.0)

@@ -123,7 +123,7 @@ class PyramidNet(nn.Module):
         if histograms:
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
-            self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of log-likelihoods in these logits
+            self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
             self.select = Selection()
             with torch.no_grad():
                 assert self.choose.bias is not None

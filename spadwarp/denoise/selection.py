@@ -88,7 +88,7 @@ def selected(candidates: Tensor, scores: Tensor) -> Tensor:
 
 
 def _typical(features: Tensor) -> Tensor:
-    """Medians over each frame of the second return's log-likelihood and of the highest scores, `[B, 1 + SCORED, 1, 1]`."""
+    """Medians over a frame of the second return's log-likelihood and of the highest scores, `[B, 1 + SCORED, 1, 1]`."""
     tops = features[:, POOLED + SCORED * POOLED : POOLED + SCORED * POOLED + SCORED]
     values = torch.cat([features[:, SEEN + 1 : SEEN + 2], tops], dim=1)
     return values.flatten(2).median(dim=2).values[:, :, None, None]
@@ -127,7 +127,8 @@ def _evidence(found: Tensor, logits: Tensor, features: Tensor, typical: Tensor) 
         agreeing(torch.cat([first, second], dim=1), 0.006),
     ]  # fmt: skip
     rough = [20.0 * (around - one).abs().mean(dim=1, keepdim=True) for around, one in ((wide, outer), (near, inner))]
-    return candidates, torch.stack(of_choice, dim=2), torch.cat([tops, typical[:, 1:].expand_as(tops), rest, 0.25 * logits, *rough], dim=1)
+    of_pixel = [tops, typical[:, 1:].expand_as(tops), rest, 0.25 * logits, *rough]
+    return candidates, torch.stack(of_choice, dim=2), torch.cat(of_pixel, dim=1)
 
 
 def _around(image: Tensor, side: int) -> Tensor:

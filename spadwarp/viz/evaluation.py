@@ -50,6 +50,7 @@ METHODS = {
     "pooled": ("pooled likelihood", "#882255", "<", "-"),
     "semi-global": ("semi-global matching", "#999933", ">", "-"),
     "total-variation": ("total variation", "#332288", "h", "-."),
+    "belief-propagation": ("belief propagation", "#44AA99", "p", "-"),
 }
 """Title, colour, marker and line of each method: Okabe and Ito's colours, then some of Paul Tol's muted ones."""
 

@@ -53,6 +53,7 @@ def test_kernels_import_warp_numpy_and_the_standard_library_only():
 
 # Themselves loaded when there are pictures to draw, or a network to run.
 LOADED_LATE = {
+    "denoise/belief_propagation.py",
     "denoise/histogram_features.py",
     "denoise/losses.py",
     "denoise/networks.py",
@@ -62,6 +63,7 @@ LOADED_LATE = {
     "denoise/shapes.py",
     "denoise/symmetric.py",
     "denoise/synthetic_noise.py",
+    "denoise/total_variation.py",
     "denoise/training.py",
     "denoise/training_steps.py",
     "denoise/votes.py",
