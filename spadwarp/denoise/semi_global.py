@@ -44,13 +44,16 @@ def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
     """
     lines = score.flatten(0, 1)
     most = jump.expand(-1, score.shape[1], 1, 1).flatten(0, 1)[:, 0]
-    pair = torch.stack([lines, lines.flip(1)])
-    told = torch.zeros_like(pair)
-    for place in range(1, lines.shape[1]):
-        known = pair[:, :, place - 1] + told[:, :, place - 1]
+    told, last = torch.zeros_like(lines), lines.shape[1] - 1
+    ahead = lines.new_zeros(2, len(lines), lines.shape[2])  # the message sent last, forwards and backwards
+    for place in range(last):
+        known = torch.stack([lines[:, place], lines[:, last - place]]).add_(ahead)
         best = known.amax(dim=-1, keepdim=True)
-        kept = torch.maximum(known, best - most)
-        kept[..., 1:] = torch.maximum(kept[..., 1:], known[..., :-1] - slope)
-        kept[..., :-1] = torch.maximum(kept[..., :-1], known[..., 1:] - slope)
-        torch.sub(kept, best, out=told[:, :, place])
-    return (told[0] + told[1].flip(1)).view_as(score)
+        ahead = torch.maximum(known, best - most)
+        known -= slope
+        torch.maximum(ahead[..., 1:], known[..., :-1], out=ahead[..., 1:])
+        torch.maximum(ahead[..., :-1], known[..., 1:], out=ahead[..., :-1])
+        ahead -= best
+        told[:, place + 1] += ahead[0]
+        told[:, last - place - 1] += ahead[1]
+    return told.view_as(score)
