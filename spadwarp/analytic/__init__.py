@@ -5,7 +5,7 @@ from spadwarp.analytic.exposure_proposal import PILE_UP, Exposure
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, permissible_exposure
 from spadwarp.analytic.file import AnalyticFile, save_analytic
 from spadwarp.analytic.labelled import to_xarray
-from spadwarp.analytic.model import pixel_maps
+from spadwarp.analytic.model import model_notes, pixel_maps
 from spadwarp.analytic.optics import beam_axis_fluence, scene_eye_limit
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow, budget
 from spadwarp.analytic.pilot import Pilot
@@ -31,6 +31,7 @@ __all__ = [
     "beam_axis_fluence",
     "budget",
     "eye_limit",
+    "model_notes",
     "parse_values",
     "parse_vary",
     "permissible_exposure",

@@ -11,6 +11,7 @@ information is that of α ≪ 1 per acquisition) and instrument responses that a
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.analytic.grid import grid_backscatter, passed_by_grid
 from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
+from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
 from spadwarp.scene.port_rays import laser_port
@@ -29,7 +30,7 @@ from spadwarp.scene.sight import depth_per_time, lines_of_sight
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["BackscatterTable", "Map", "pixel_maps", "response_sigma", "source_name"]
+__all__ = ["BackscatterTable", "Map", "model_notes", "pixel_maps", "response_sigma", "source_name", "warn_of_model"]
 
 Map = NDArray[np.float64]
 
@@ -39,6 +40,23 @@ class BackscatterTable(NamedTuple):
 
     paths: NDArray[np.float32]
     cumulative: NDArray[np.float32]
+
+
+def model_notes(scene: Scene) -> list[str]:
+    """What the model leaves out of a scene without refusing it; nothing for most scenes."""
+    if not scene.polarised:
+        return []
+    behind = "" if scene.camera.polarisation == "none" else ", without the camera's analyser"
+    return [
+        f"the analytic model has no polarisation: its numbers are those of unpolarised light{behind}; `simulate` and "
+        "`plan` compute polarised light"
+    ]
+
+
+def warn_of_model(scene: Scene, stacklevel: int = 3) -> None:
+    """Warns of what `model_notes` has."""
+    for text in model_notes(scene):
+        warnings.warn(text, SpadwarpWarning, stacklevel=stacklevel)
 
 
 @kernel_errors()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.analytic.model import Map, pixel_maps, response_sigma
+from spadwarp.analytic.model import Map, pixel_maps, response_sigma, warn_of_model
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import check_integer, check_real, shown
@@ -94,7 +94,8 @@ def budget(
         device: Warp device; default: the first GPU, else the CPU.
 
     Returns:
-        A row for each water and range, in this order.
+        A row for each water and range, in this order. A warning says where light is polarised, which the model leaves
+        out.
 
     Raises:
         ConfigError: A water or scene that the model does not cover.
@@ -108,6 +109,7 @@ def budget(
     reflectance = check_real("reflectance", reflectance, "[0, 1]")
     if scene.analytic.backscatter == "monte_carlo":
         raise ConfigError("analytic.backscatter = 'monte_carlo' belongs to one range; a budget takes 'single_scatter'")
+    warn_of_model(scene)
     rows: list[BudgetRow] = []
     for name, changed in _waters(scene, media):
         rows += axis_rows(changed, name, distances, reflectance, device)

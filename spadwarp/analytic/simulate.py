@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.model import Map, pixel_maps, source_name
+from spadwarp.analytic.model import Map, pixel_maps, source_name, warn_of_model
 from spadwarp.analytic.result import AnalyticResult, background_photons
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import SEED, check_integer
@@ -49,12 +49,15 @@ def simulate_analytic(
         backscatter_profile: For `backscatter = "monte_carlo"`: a `Result` of the same scene, its path, or expected
             backscatter detections per pulse and bin over the scene's gate, `[T]` for all pixels or `[H, W, T]`.
 
+    A warning says where a scene's light is polarised, which the model leaves out.
+
     Raises:
         ConfigError: A scene that the model does not cover, or whose gate holds no return.
         ArgumentError: A truth or profile of the wrong shape, or with impossible values.
     """
     scene = as_scene(scene)
     frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)
+    warn_of_model(scene)
     truth = truth_maps(scene) if truth is None else truth
     _check_truth(truth, scene)
     shape = truth.depth.shape

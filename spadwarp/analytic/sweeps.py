@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import source_name
+from spadwarp.analytic.model import source_name, warn_of_model
 from spadwarp.analytic.photon_budget import LONGEST, BudgetRow, axis_rows
 from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
@@ -83,7 +83,7 @@ def sweep(
             `DepthErrorRow` over all pixels.
         device: Warp device; default: the first GPU, else the CPU.
 
-    Where no number depends on the field, a warning says so.
+    Where no number depends on the field, or where light is polarised, which the model leaves out, a warning says so.
 
     Raises:
         ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
@@ -101,6 +101,8 @@ def sweep(
     rows: list[Any] = []
     for value in values:
         changed = scene.with_overrides({field: value})
+        if of == "budget":
+            warn_of_model(changed)
         rows.append(_central_row(changed, device) if of == "budget" else _depth_error(changed, device))
     found = Sweep(field=field, values=tuple(values), rows=tuple(rows))
     if found.is_flat:

@@ -132,7 +132,7 @@ def analytic(
     )
     written = [result.save(out / "analytic.h5", frames=frames, device=device)]
     written.append(draw_analytic(result, out / "analytic.png"))
-    summary = {"frames": frames, "seed": seed, **_summary(result)}
+    summary = {"frames": frames, "seed": seed, **_summary(result), "notes": spadwarp.analytic.model_notes(scene)}
     if not quiet:
         say(opt.rows({**_lines(summary), "written": ", ".join(path.name for path in written) + f" in {out}"}))
     outputs.write_json({**summary, "files": written})

@@ -75,7 +75,8 @@ def budget(
             say(text)
         if written:
             say(f"written: {', '.join(path.name for path in written)} in {out}")
-    outputs.write_json({"rows": [dataclasses.asdict(row) for row in found], "files": written})
+    rows = [dataclasses.asdict(row) for row in found]
+    outputs.write_json({"rows": rows, "notes": spadwarp.analytic.model_notes(scene), "files": written})
 
 
 def _numbers(text: str | None) -> list[float] | None:

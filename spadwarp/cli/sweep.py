@@ -84,7 +84,10 @@ def sweep(
             for text in table_notes(some, scene):
                 say(text)
         say(f"written: {', '.join(path.name for path in written)} in {out}")
-    outputs.write_json({"field": curves.field, "values": values, "of": of.value, "rows": found, "files": written})
+    notes = spadwarp.analytic.model_notes(scene)
+    outputs.write_json(
+        {"field": curves.field, "values": values, "of": of.value, "rows": found, "notes": notes, "files": written}
+    )
 
 
 def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:

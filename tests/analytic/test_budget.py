@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.analytic import BudgetRow, DepthErrorRow, parse_values, parse_vary, simulate_analytic, sweep
+from spadwarp.analytic import BudgetRow, DepthErrorRow, model_notes, parse_values, parse_vary, simulate_analytic, sweep
 from spadwarp.analytic.photon_budget import budget
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 
@@ -186,3 +186,25 @@ def test_bad_requests_are_named():
         budget(SCENE, reflectance=2)
     with pytest.raises(ConfigError, match="no target is in view"):
         sweep(SCENE.with_overrides({"targets": []}), vary="medium.extinction=1")
+
+
+POLARISED = SCENE.with_overrides(
+    {"laser.polarisation": "linear", "medium.scattering_matrix": "voss_fry", "camera.polarisation": "analyser"}
+)
+
+
+@pytest.mark.parametrize(
+    "simulate",
+    [
+        lambda scene: simulate_analytic(scene, frames=0),
+        lambda scene: budget(scene, ranges=[2.2]),
+        lambda scene: sweep(scene, vary=("laser.pulse_energy", [1e-9]), of="budget"),
+    ],
+    ids=["analytic", "budget", "sweep"],
+)
+def test_the_model_says_that_it_has_no_polarisation(simulate):
+    assert not model_notes(SCENE)
+    with pytest.warns(SpadwarpWarning) as caught:
+        simulate(POLARISED)
+    assert [str(one.message) for one in caught] == model_notes(POLARISED)
+    assert "without the camera's analyser" in str(caught[0].message)

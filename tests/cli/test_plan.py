@@ -23,6 +23,13 @@ def test_analytic_frames_are_those_of_python(spad_scene, tmp_path):
     assert "20 % of their pixels report background" in printed.stdout and (tmp_path / "analytic.png").is_file()
 
 
+def test_a_budget_of_polarised_light_says_what_is_left_out(spad_scene, tmp_path):
+    polarised = ("--set", "laser.polarisation=linear", "--set", "medium.scattering_matrix=voss_fry")
+    printed = run("budget", spad_scene, "--range", "1:2:2", *polarised, "--json", tmp_path / "a.json", *DEVICE)
+    (note,) = tables(tmp_path / "a.json")["notes"]
+    assert printed.stderr.count("has no polarisation") == 1 and f"warning: {note}" in printed.stderr
+
+
 @pytest.mark.slow
 def test_analytic_takes_truth_and_profile_from_files(spad_scene, done, tmp_path):
     result = spadwarp.load_result(done / "result.h5")
