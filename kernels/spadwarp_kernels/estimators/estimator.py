@@ -13,13 +13,11 @@ class FlightPlan:
     """What an estimator draws for a flight before it is traced.
 
     Attributes:
-        block: Random words of the sample.
         lens: The point of the lens that the flight is scored through [m].
         lens_weight: Its density if it were uniform, over that of the draw.
         interval: The part of the flight that is to be scored, unless a surface stands before it [m]; empty for none.
     """
 
-    block: wp.vec4ui
     lens: wp.vec3
     lens_weight: float
     interval: wp.vec2
@@ -50,7 +48,8 @@ class Estimator(NamedTuple):
             latency.
         cross: ``(s, camera, gate, limits) -> Contribution``, what the photon itself brings on the flight that ends in
             its event; needs no shadow ray.
-        plan_flight: ``(s, medium, camera, gate, limits, keys, id) -> FlightPlan``, before a flight is traced.
+        plan_flight: ``(s, block, medium, camera, gate, limits) -> FlightPlan``, before a flight is traced;
+            `block`: random words, the third and fourth for the lens.
         request_flight: ``(s) -> Request``, the score of a flight whose planned interval is not empty.
         request_event: ``(s, camera) -> Request``, the score of the event that the photon has come to.
         score: ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored``; needed with either request.

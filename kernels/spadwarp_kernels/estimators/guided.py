@@ -62,16 +62,15 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def plan_flight(
-        s: PhotonState, medium: Medium, camera: Camera, gate: Gate, limits: Limits, keys: RoundKeys, id: wp.uint64
+        s: PhotonState, block: wp.vec4ui, medium: Medium, camera: Camera, gate: Gate, limits: Limits
     ) -> FlightPlan:
         plan = FlightPlan()
-        plan.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
         if wp.static(has_phase_guide):
             # The direction was drawn for this point, see `make_direct`.
-            plan.lens = lens_point(camera, u01(plan.block[2]), u01(plan.block[3]))
+            plan.lens = lens_point(camera, u01(block[2]), u01(block[3]))
             plan.lens_weight = 1.0
         else:
-            lens = sample_lens(camera, s.x, s.u, u01(plan.block[2]), u01(plan.block[3]))
+            lens = sample_lens(camera, s.x, s.u, u01(block[2]), u01(block[3]))
             plan.lens = lens.point
             plan.lens_weight = lens.weight
         limit = limits.max_path - s.path

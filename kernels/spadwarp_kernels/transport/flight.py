@@ -8,7 +8,9 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Flight, PhotonState, is_planned
+from spadwarp_kernels.random.ahead import block_ahead, make_draw_ahead
 from spadwarp_kernels.random.philox import (
+    STREAM_FLIGHT_SAMPLE,
     STREAM_ROULETTE,
     STREAM_TRANSPORT,
     RoundKeys,
@@ -22,10 +24,16 @@ from spadwarp_kernels.sensor.gate import Gate
 
 
 @made_once
-def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Function:
-    """The Warp function ``(s, medium, layers, camera, gate, limits, keys, id) -> Flight``."""
+def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, cuda: bool) -> wp.Function:
+    """The Warp function ``(s, medium, layers, camera, gate, limits, keys, id, words) -> Flight``.
+
+    On a CPU `words`, WORDS_AHEAD of them, keep the random words of the photon's next flights. They are drawn for
+    several flights at once, so that it must be called for each flight of a photon in turn.
+    """
     plans = plan_flight is not None
     water_free_path = spec.water.free_path
+    events, draw_ahead = make_draw_ahead(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
+    last = events - 1
 
     @wp.func
     def fly(
@@ -37,15 +45,25 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Functio
         limits: Limits,
         keys: RoundKeys,
         id: wp.uint64,
+        words: wp.array(dtype=int),
     ) -> Flight:
         f = Flight()
-        f.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
+        if wp.static(cuda):
+            f.block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_TRANSPORT)
+        else:
+            k = s.collisions & last
+            if k == 0:
+                draw_ahead(words, keys, id, wp.uint32(s.collisions + 1))
+            f.block = block_ahead(words, k)
         seed = join_words(f.block[0], f.block[2])
         f.distance = water_free_path(medium, layers, s.x, s.u, u01_tail(f.block[0], f.block[2]), seed)
         f.reach = wp.min(f.distance, limits.max_path - s.path)
         if wp.static(plans):
-            plan = plan_flight(s, medium, camera, gate, limits, keys, id)
-            f.sample_block = plan.block
+            if wp.static(cuda):
+                f.sample_block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+            else:
+                f.sample_block = block_ahead(words, events + k)
+            plan = plan_flight(s, f.sample_block, medium, camera, gate, limits)
             f.lens = plan.lens
             f.lens_weight = plan.lens_weight
             f.interval = plan.interval
@@ -56,7 +74,16 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None) -> wp.Functio
     return fly
 
 
-@wp.func
-def draw_albedo(s: PhotonState, medium: Medium, keys: RoundKeys, id: wp.uint64) -> float:
-    """The albedo of the next collision, uniform in [0, medium.albedo)."""
-    return medium.albedo * u01(random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)[1])
+@made_once
+def make_draw_albedo(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, medium, keys, id) -> float``: the albedo of the next collision, that of the water or
+    uniform in [0, medium.albedo)."""
+    random_albedo = spec.random_albedo
+
+    @wp.func
+    def draw_albedo(s: PhotonState, medium: Medium, keys: RoundKeys, id: wp.uint64) -> float:
+        if wp.static(random_albedo):
+            return medium.albedo * u01(random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_ROULETTE)[1])
+        return s.albedo
+
+    return draw_albedo

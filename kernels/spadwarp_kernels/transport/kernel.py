@@ -54,6 +54,7 @@ from spadwarp_kernels.photon.state import (
 )
 from spadwarp_kernels.polarisation.emission import make_first_stokes
 from spadwarp_kernels.polarisation.request import Polarisation
+from spadwarp_kernels.random.ahead import WORDS_AHEAD
 from spadwarp_kernels.random.philox import RoundKeys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -69,7 +70,7 @@ from .checks import check_spec
 from .collide import make_arrives, make_collide
 from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
-from .flight import draw_albedo, make_fly
+from .flight import make_draw_albedo, make_fly
 from .scatter import make_flies, make_scatter
 from .traverse import make_aim, make_begin_walk, make_look
 
@@ -98,7 +99,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     cross, score = make_derived_cross(spec, estimator.cross), make_derived_score(spec, estimator.score)
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = estimator.cross is not None, request_flight is not None, estimator.score is not None
-    has_mesh, random_albedo, confocal = spec.mesh, spec.random_albedo, spec.confocal
+    has_mesh, confocal, draw_albedo = spec.mesh, spec.confocal, make_draw_albedo(spec)
     reflecting = spec.reflecting
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
@@ -108,7 +109,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     queues = scores and cuda and not has_bvh and not in_blocks  # scores of blocks stay with the thread
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
-    fly, collide = make_fly(spec, estimator.plan_flight), make_collide(spec, crosses)
+    fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
@@ -161,6 +162,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         if wp.static(has_bvh and cuda):
             stack = Stack()
             stack[0] = NO_NODE
+        words = cursor  # any array on CUDA, where it is not used
+        if wp.static(not cuda):
+            words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
         done = int(0)
         queued = int(0)
         if wp.static(queues):
@@ -172,11 +176,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             while waiting < wp.static(ray_lanes):
                 if s.stage == FLIGHT:
                     id = base + wp.uint64(s.photon)
-                    s.flight = fly(s, medium, layers, camera, gate, limits, keys, id)
+                    s.flight = fly(s, medium, layers, camera, gate, limits, keys, id, words)
                     s.hit.face = -1
                     s.stage = EVENT
-                    if wp.static(random_albedo):
-                        s.albedo = draw_albedo(s, medium, keys, id)
+                    s.albedo = draw_albedo(s, medium, keys, id)
                     if wp.static(has_bvh):
                         meets = segment_meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper)
                         s.ray = wp.where(meets, SURFACE_RAY, NO_RAY)
@@ -187,7 +190,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if hit.distance < s.flight.distance:
                                 s.hit = hit
                             s.flight = shorten(s.flight, hit.distance)
-
                 # Round 0 scores the flight, round 1 the event at its end.
                 round = int(wp.static(0 if flights else 1))
                 while round < 2:
@@ -264,9 +266,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
-                    id = base + wp.uint64(s.photon)
                     new = scatter(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
-                                  keys, id, ledger, thread)  # fmt: skip
+                                  keys, base + wp.uint64(s.photon), ledger, thread)  # fmt: skip
                     s.u = new.u
                     s.weight = new.weight
                     s.analog_weight = new.analog_weight

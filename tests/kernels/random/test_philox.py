@@ -6,6 +6,7 @@ import warp as wp
 
 from helpers.launch import Floats, launched, on_device
 from spadwarp_kernels.random import RoundKeys, philox4x32, random_block, random_block_keyed, round_keys, u01, u01_fine
+from spadwarp_kernels.random.ahead import WORDS_AHEAD, block_ahead, make_draw_ahead
 
 
 @wp.kernel(enable_backward=False)
@@ -69,3 +70,30 @@ def test_round_keys_give_the_blocks_of_their_seed(seed, device):
         for kernel, start in ((_blocks, seed), (_keyed_blocks, round_keys(seed)))
     )
     np.testing.assert_array_equal(plain, keyed)
+
+
+def _ahead(*streams):
+    events, draw_ahead = make_draw_ahead(*streams)
+
+    @wp.kernel(enable_backward=False)
+    def ahead(keys: RoundKeys, id: wp.uint64, event: wp.uint32, out: wp.array(dtype=wp.vec4ui)):
+        words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
+        draw_ahead(words, keys, id, event)
+        for lane in range(8):
+            out[lane] = block_ahead(words, lane)
+            stream = wp.uint32(wp.static(streams[0]))
+            if lane >= events:
+                stream = wp.uint32(wp.static(streams[-1]))
+            out[8 + lane] = random_block_keyed(keys, id, event + wp.uint32(lane % events), stream)
+
+    return ahead
+
+
+@pytest.mark.parametrize("streams", [(1,), (1, 2)])
+def test_words_of_events_ahead_are_those_of_each_event(streams):
+    keys = round_keys(0x9E3779B97F4A7C15)
+    for id, event in ((7, 1), (2**64 - 2, 2**32 - 3)):
+        out = wp.zeros(16, dtype=wp.vec4ui, device="cpu")
+        wp.launch(_ahead(*streams), dim=1, inputs=[keys, id, event], outputs=[out], device="cpu")
+        together, alone = out.numpy().reshape(2, 8, 4)
+        np.testing.assert_array_equal(together, alone)
