@@ -162,8 +162,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         if wp.static(has_bvh and cuda):
             stack = Stack()
             stack[0] = NO_NODE
-        words = cursor  # any array on CUDA, where it is not used
-        if wp.static(not cuda):
+        if wp.static(cuda):  # noqa: SIM108, Warp has no such choice between arrays
+            words = cursor  # any: it is not used
+        else:
             words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
         done = int(0)
         queued = int(0)
@@ -226,7 +227,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 asked.request = request_event(s, camera)
                                 push(asked.request)
                     round += 1
-
                     # ---- Scores: each lane its own or, from a queue, 32 together
                     if wp.static(scores):
                         ready = asked.request.wanted
