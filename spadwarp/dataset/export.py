@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from spadwarp.dataset.card import export_card
 from spadwarp.dataset.croissant import croissant
 from spadwarp.dataset.features import FEATURE_NAMES, histogram_features
+from spadwarp.dataset.histograms import HISTOGRAM_FIELDS
 from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.schema import Column
@@ -42,10 +43,12 @@ EXPORT_FIELDS: dict[str, tuple[str, str]] = {
     "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
     "counts": ("1", "histogram of the frame, [bin, height, width]"),
     "expected": ("1", "expected histogram before pile-up, [bin, height, width]"),
+    "polarisation": ("1", "degree of polarisation of the bins, [bin, height, width]; NaN: no light"),
 }
 """Images of an exported frame: unit and meaning."""
 
 _DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
+_OF_HISTOGRAMS = ("features", *HISTOGRAM_FIELDS)
 _ZARR_FRAMES = 16  # of a chunk
 _NUMBERS: dict[str, tuple[type, str, str]] = {
     "sample": (np.int64, "1", "id of the frame in the whole dataset"),
@@ -92,7 +95,7 @@ def export_dataset(
         out: A new folder.
         format: Of `EXPORT_FORMATS`.
         fields: Images, of `EXPORT_FIELDS`; default: noisy, clean, label, intensity, bound, and with traced scenes
-            features. Scenes that were not traced have NaN in features, counts and expected.
+            features. Scenes that were not traced have NaN in features, counts, expected and polarisation.
         frames_per_file: At most, in [1, 1000000]; Parquet and WebDataset.
         overwrite: Whether an existing `out` is replaced.
         progress: Called with ("frames", frames written, frames to write).
@@ -145,10 +148,12 @@ class _Source:
         chosen = tuple(fields) if fields else (*_DEFAULT, *(("features",) if bins else ()))
         if unknown := [name for name in chosen if name not in EXPORT_FIELDS]:
             raise ArgumentError(f"fields: {unknown[0]!r} is not one of {', '.join(map(repr, EXPORT_FIELDS))}")
-        if not bins and (lost := [name for name in chosen if name in ("features", "counts", "expected")]):
+        if not bins and (lost := [name for name in chosen if name in _OF_HISTOGRAMS]):
             raise ArgumentError(f"fields: {lost[0]!r}: no scene of {folder} was traced: it has no histograms")
+        if "polarisation" in chosen and "polarisation" not in base.histogram_fields:
+            raise ArgumentError(f"fields: 'polarisation': the camera of {folder} does not record it")
         self.fields = tuple(dict.fromkeys(chosen))
-        deep = {"normal": (3,), "features": (len(FEATURE_NAMES),), "counts": (bins,), "expected": (bins,)}
+        deep = {"normal": (3,), "features": (len(FEATURE_NAMES),), **dict.fromkeys(HISTOGRAM_FIELDS, (bins,))}
         self.columns = {
             name: Column(
                 (*deep.get(name, ()), *base.shape),
@@ -163,7 +168,7 @@ class _Source:
 
     def rows(self, split: str) -> Iterator[dict[str, Any]]:
         """The frames of a split, all columns of each."""
-        stored = tuple(name for name in self.fields if name not in ("features", "counts", "expected"))
+        stored = tuple(name for name in self.fields if name not in _OF_HISTOGRAMS)
         reader = FrameReader(self.folder, split, fields=stored)
         cubes = reader.with_fields("counts")
         for index in range(len(reader)):
@@ -279,7 +284,7 @@ def _write_zarr(source: _Source, out: Path, size: int) -> Iterator[None]:
 
 
 def _zarr_array(group: Any, name: str, column: Column, length: int) -> Any:
-    first = {"normal": "axis", "features": "feature", "counts": "bin", "expected": "bin"}
+    first = {"normal": "axis", "features": "feature", **dict.fromkeys(HISTOGRAM_FIELDS, "bin")}
     dimensions = ["frame", *([first[name]] if len(column.shape) == 3 else []), "y", "x"]
     array = group.create_array(
         name,

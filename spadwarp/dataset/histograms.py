@@ -17,7 +17,10 @@ from spadwarp.dataset.schema import HISTOGRAM_COLUMNS, PACKED, describe
 from spadwarp.errors import FileError
 from spadwarp.io.hdf5_file import Hdf5File
 
-__all__ = ["HistogramFile", "HistogramWriter"]
+__all__ = ["HISTOGRAM_FIELDS", "HistogramFile", "HistogramWriter"]
+
+HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
+"""Cubes of a frame; methods of `HistogramFile` have these names."""
 
 _COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
 _KINDS = {"scene": np.int32, "gate_start": np.float64, "bin_width": np.float64, "sample": np.int64}
@@ -29,6 +32,7 @@ class HistogramWriter:
     def __init__(self, file: Any, scenes: int, *, counts: str) -> None:
         self._file, self._scenes, self._counts = file, scenes, counts
         self._expected: Any = None
+        self._polarisation: Any = None
         self._numbers: dict[str, list[Any]] = {name: [] for name in _KINDS}
         self._events: list[tuple[NDArray[np.uint32], NDArray[np.int32]]] = []
 
@@ -42,6 +46,10 @@ class HistogramWriter:
             self._chunk = (1, rows, width, bins)
             self._expected = self._create("expected", (self._scenes, height, width, bins), np.float16)
         self._expected[len(self._numbers["scene"])] = histograms.expected
+        if histograms.polarisation is not None:
+            if self._polarisation is None:  # NaN in scenes without
+                self._polarisation = self._create("polarisation", self._expected.shape, np.float16, fillvalue=np.nan)
+            self._polarisation[len(self._numbers["scene"])] = histograms.polarisation
         for name, value in (("scene", rendered.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
             self._numbers[name].append(value)
         self._numbers["sample"].extend(samples)
@@ -58,8 +66,8 @@ class HistogramWriter:
             self._write_counts()
         describe(self._file, HISTOGRAM_COLUMNS)
 
-    def _create(self, name: str, shape: tuple[int, ...], kind: Any) -> Any:
-        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **PACKED)
+    def _create(self, name: str, shape: tuple[int, ...], kind: Any, **choices: Any) -> Any:
+        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **PACKED, **choices)
 
     def _write_counts(self) -> None:
         indices, counts = zip(*self._events, strict=True)
@@ -81,7 +89,8 @@ class HistogramWriter:
 
 
 class HistogramFile:
-    """The histograms of an open file, by scene index and by sample id."""
+    """The histograms of an open file, by scene index and by sample id; `fields`: which of `HISTOGRAM_FIELDS` it may
+    hold."""
 
     def __init__(self, file: Hdf5File, shape: tuple[int, int]) -> None:
         self._scenes, self._samples = (
@@ -91,6 +100,10 @@ class HistogramFile:
         scenes, samples = len(file.stored("scene", np.int32, (None,))), len(file.stored("sample", np.int64, (None,)))
         self._expected = file.stored("expected", np.float16, (scenes, *shape, None))
         self.shape: tuple[int, ...] = self._expected.shape[1:]
+        self._polarisation = None
+        self.fields = HISTOGRAM_FIELDS if "polarisation" in file else HISTOGRAM_FIELDS[:-1]
+        if "polarisation" in file:
+            self._polarisation = file.stored("polarisation", np.float16, self._expected.shape)
         self._counts = file.stored("counts", _COUNTS, (samples, *self.shape)) if "counts" in file else None
         self._starts: NDArray[np.int64] | None = None
         if "event_start" in file:
@@ -105,6 +118,11 @@ class HistogramFile:
         """Expected counts of a frame `[H, W, T]`; None for a scene that was not traced."""
         row = self._scenes.get(scene)
         return None if row is None else self._expected[row].astype(np.float32)
+
+    def polarisation(self, scene: int) -> NDArray[np.float32] | None:
+        """Degree of polarisation `[H, W, T]`; None for a scene that was not traced, or without polarised light."""
+        row = self._scenes.get(scene)
+        return None if row is None or self._polarisation is None else self._polarisation[row].astype(np.float32)
 
     def counts(self, sample: int) -> NDArray[np.float32] | None:
         """Counts `[H, W, T]` of a frame; None where there are none."""

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.dataset.histograms import HISTOGRAM_FIELDS, HistogramFile
 from spadwarp.dataset.manifest import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shard_file import ShardFile, frame_count
@@ -22,7 +23,7 @@ from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
-FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", "counts", "expected")
+FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", *HISTOGRAM_FIELDS)
 """Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
 
 
@@ -36,6 +37,8 @@ class FrameReader:
     - `bound`: Cramér–Rao bound of the depth [m], NaN for no estimate.
     - `normal`: `[3, H, W]`, unit vectors towards the camera. `albedo`: Lambertian reflectance.
     - `counts`: histograms of the frame `[T, H, W]`; `expected`: their expectation. Of traced scenes only.
+    - `polarisation`: degree of polarisation of each bin as both channels of the camera find it, without the noise of
+      counts, NaN where no light arrives, `[T, H, W]`. Of traced scenes whose camera records polarisation.
     - `prior`: density [1/m] with which the water alone reports the depth in `noisy`; NaN where `noisy` is.
 
     And numbers: `sample`, `scene`, `target` (int64), `backscatter_fraction`, `attenuation_lengths`, `distance`
@@ -153,11 +156,21 @@ class FrameReader:
     @property
     def histogram_bins(self) -> int:
         """Bins of the histograms of traced scenes; 0 where no scene was traced."""
+        histograms = self._histograms()
+        return 0 if histograms is None else histograms.shape[-1]
+
+    @property
+    def histogram_fields(self) -> tuple[str, ...]:
+        """Those of `FIELDS` that frames of traced scenes have besides; none where no scene was traced."""
+        histograms = self._histograms()
+        return () if histograms is None else histograms.fields
+
+    def _histograms(self) -> HistogramFile | None:
+        """Of the first shard that has some."""
         for number, name in enumerate(self.shards):
             if name.replace("frames-", "histograms-") in self.manifest["files"]:
-                histograms = self._shard(number).histograms
-                return 0 if histograms is None else histograms.shape[-1]
-        return 0
+                return self._shard(number).histograms
+        return None
 
     def _row(self, frame: int) -> tuple[ShardFile, int]:
         """The shard of a frame, and the frame's row in it."""

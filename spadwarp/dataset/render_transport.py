@@ -15,7 +15,7 @@ from spadwarp.dataset.rendered import (
 )
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.frames import Frames, crlb, detect
-from spadwarp.result import received
+from spadwarp.result import degree_of_polarisation, received
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import simulate
@@ -32,6 +32,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
     if result.partial:
         raise KeyboardInterrupt
+    polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
     result = received(result, plan.recipe.monte_carlo.channel)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.component("backscatter")
@@ -53,7 +54,9 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
         frames=_stored(plan, scene, frames, device=device),
         histograms=Histograms(
-            expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16), counts=frames.counts
+            expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
+            counts=frames.counts,
+            polarisation=polarisation,
         ),
     )
 

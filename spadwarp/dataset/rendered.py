@@ -48,10 +48,12 @@ class Histograms:
     Attributes:
         expected: Expected counts of a frame before pile-up, float16 `[H, W, T]`.
         counts: Of the frames, int32 `[K, H, W, T]`.
+        polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
     """
 
     expected: NDArray[np.float16]
     counts: NDArray[np.int32]
+    polarisation: NDArray[np.float16] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,6 +49,7 @@ FRAME_COLUMNS: dict[str, tuple[str, str]] = {
 HISTOGRAM_COLUMNS: dict[str, tuple[str, str]] = {
     "scene": ("1", "index into scenes.h5"),
     "expected": ("1", "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"),
+    "polarisation": ("1", "degree of polarisation of each bin's light, by both channels; NaN where none arrives"),
     "gate_start": ("s", "start of bin 0 after the pulse left the laser"),
     "bin_width": ("s", "width of a bin"),
     "sample": ("1", "id of the frame in the whole dataset"),

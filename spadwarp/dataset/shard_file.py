@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.histograms import HistogramFile
+from spadwarp.dataset.histograms import HISTOGRAM_FIELDS, HistogramFile
 from spadwarp.dataset.rendered import PROFILE_BINS
 from spadwarp.dataset.schema import FORMAT_VERSION, scene_columns
 from spadwarp.errors import FileError, SpadwarpError
@@ -142,7 +142,7 @@ class ShardFile:
 
     def _image(self, name: str, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
         image: NDArray[Any]
-        if name in ("counts", "expected"):
+        if name in HISTOGRAM_FIELDS:
             return np.moveaxis(self._histogram(name, row)[window], -1, 0)
         if name == "noisy":
             image = self._noisy(row, window)
@@ -163,7 +163,7 @@ class ShardFile:
         cube = None
         if self.histograms is not None:
             number = int(self.columns["sample" if name == "counts" else "scene"][row])
-            cube = self.histograms.counts(number) if name == "counts" else self.histograms.expected(number)
+            cube = getattr(self.histograms, name)(number)
         if cube is None:
             raise FileError(f"{self.frames.path}: frame {int(self.columns['sample'][row])} has no {name!r}")
         return cube

@@ -29,6 +29,7 @@ from spadwarp.dataset import (
     load_recipe,
     verify_dataset,
 )
+from spadwarp.dataset.histograms import HISTOGRAM_FIELDS
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT
@@ -159,7 +160,7 @@ def test_parts_make_one_dataset(tmp_path):
 
 def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     torch = pytest.importorskip("torch")
-    images = [name for name in FIELDS if name not in ("counts", "expected")]
+    images = [name for name in FIELDS if name not in HISTOGRAM_FIELDS]
     plain = FrameReader(folder, "train", fields=images)
     tensors = SpadDataset(folder, "train", fields=images)
     assert len(plain) == len(tensors) == 6

@@ -1,6 +1,7 @@
 """Channels of polarised light on their way to counts, depth, plans and pages."""
 
 import dataclasses
+import tarfile
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import spadwarp
 from helpers.cli import DEVICE, run, tables
 from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
-from spadwarp.dataset import iterate_dataset
+from spadwarp.dataset import export_dataset, iterate_dataset
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result import COMPONENTS, degree_of_polarisation, received
 
@@ -195,6 +196,13 @@ def test_data_sets_and_denoisers_take_a_channel(analysed, tmp_path):
     light = {}
     for name in ("I", "cross"):
         make(recipe(**changes, **{"monte_carlo.channel": name, "exposure.signal_photons": None}), tmp_path / name)
-        items = iterate_dataset(tmp_path / name, "test", fields=("expected",))
-        light[name] = sum(item["expected"].sum(dtype=np.float64) for item in items)
-    assert 0.3 < light["cross"] / light["I"] < 0.51
+        items = list(iterate_dataset(tmp_path / name, "test", fields=("expected", "polarisation")))
+        light[name] = np.array([item["expected"] for item in items], np.float64)
+        part = np.array([item["polarisation"] for item in items])  # [frames, T, H, W]
+    assert 0.3 < light["cross"].sum() / light["I"].sum() < 0.51
+    assert part.shape == light["I"].shape and np.nanmin(part) >= -1.0 and 0.5 < np.nanmedian(part) <= 1.0
+    across = np.where(np.isnan(part), 0.5, 0.5 * (1.0 - part)) * light["I"]
+    assert across.sum() == pytest.approx(light["cross"].sum(), rel=0.05)
+    out = export_dataset(tmp_path / "cross", tmp_path / "tar", "webdataset", fields=("noisy", "polarisation"))
+    with tarfile.open(next(out.glob("test-*.tar"))) as file:
+        assert any(name.endswith(".polarisation.npy") for name in file.getnames())
