@@ -10,8 +10,18 @@ import warp as wp
     __sincosf(6.2831853f * (xi - 0.5f), &s, &c);
     return wp::vec2(c, s);
 #else
-    const float phi = 6.2831853f * (xi - 0.5f);
-    return wp::vec2(wp::cos(phi), wp::sin(phi));
+    // Both at once, and without a branch on the quadrant: the polynomials and the bits of the C library's cosf and sinf
+    // (ARM's optimized routines, in glibc since 2.28) for each multiple of 2^-25.
+    const double phi = 6.2831853f * (xi - 0.5f);
+    const int quarter = static_cast<int>(phi * 0x1.45F306DC9C883p-1 + (phi < 0.0 ? -0.5 : 0.5));
+    const double x = phi - quarter * 0x1.921FB54442D18p0, x2 = x * x, x3 = x * x2, x4 = x2 * x2;
+    const double s = x + x3 * -0x1.555545995a603p-3
+        + x3 * x2 * (0x1.1107605230bc4p-7 + x2 * -0x1.994eb3774cf24p-13);
+    const double c = 1.0 + x2 * -0x1.ffffffd0c621cp-2 + x4 * 0x1.55553e1068f19p-5
+        + x4 * x2 * (-0x1.6c087e89a359dp-10 + x2 * 0x1.99343027bf8c3p-16);
+    const bool odd = quarter & 1;
+    const double sign = quarter & 2 ? -1.0 : 1.0;
+    return wp::vec2(static_cast<float>(sign * (odd ? -s : c)), static_cast<float>(sign * (odd ? c : s)));
 #endif
 """)
 def cos_sin_turn(xi: float) -> wp.vec2:

@@ -13,6 +13,7 @@ from spadwarp_kernels import (
     snap_direction,
     u01,
 )
+from spadwarp_kernels.math import cos_sin_turn
 
 
 @wp.kernel(enable_backward=False)
@@ -111,3 +112,20 @@ def test_one_minus_cosine_keeps_small_angles():
     # Rounding the vectors themselves moves the angle by 6e-8: 1e-4 of 1e-3 rad.
     assert np.abs(relative[angle > 1e-3]).max() < 5e-4
     assert t.max() <= 2.0
+
+
+@wp.kernel(enable_backward=False)
+def _turns(xi: Floats, out: wp.array(dtype=wp.vec2)):
+    i = wp.tid()
+    out[i] = cos_sin_turn(xi[i])
+
+
+def test_turns_are_rounded_cosines_and_sines_on_a_cpu():
+    xi = (np.arange(1 << 20, dtype=np.float32) + np.float32(0.5)) / np.float32(1 << 20)
+    xi = np.concatenate([xi, np.arange(9, dtype=np.float32)[:-1] / 8])
+    out = wp.zeros(xi.size, dtype=wp.vec2, device="cpu")
+    wp.launch(_turns, dim=xi.size, inputs=[wp.array(xi, device="cpu")], outputs=[out], device="cpu")
+    angle = (np.float32(6.2831853) * (xi - np.float32(0.5))).astype(np.float64)
+    exact = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    error = np.abs(out.numpy() - exact) / np.spacing(np.abs(exact).astype(np.float32))
+    assert error.max() < 0.57
