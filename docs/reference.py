@@ -262,9 +262,9 @@ def dataset() -> str:
         "[configs/datasets/small.toml](../../configs/datasets/small.toml), 64 × 48 pixels.",
         "## frames-NNNNN.h5\n\nOne row a frame.\n\n" + table(FRAME_COLUMNS),
         "## scenes-NNNNN.h5 and scenes.h5\n\nOne row a scene.\n\n" + table(scenes),
-        "## histograms-NNNNN.h5\n\nOf traced scenes: `scene`, `expected`, `gate_start` and `bin_width` have a row "
-        "a scene, `sample` and the counts a row a frame. Counts are stored as cubes (`counts`), or event by event.\n\n"
-        + table(HISTOGRAM_COLUMNS),
+        "## histograms-NNNNN.h5\n\nOf traced scenes: `scene`, `expected`, `polarisation`, `gate_start` and `bin_width` "
+        "have a row a scene, `sample` and the counts a row a frame. Counts are stored as cubes "
+        "(`counts`), or event by event.\n\n" + table(HISTOGRAM_COLUMNS),
     ]
     return "\n\n".join(parts) + "\n"
 
