@@ -20,7 +20,7 @@ from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pair_depths, ref
 from spadwarp_kernels.intersect.triangle import LANES, face_vectors, pack_faces, set_faces
 from spadwarp_kernels.intersect.wide import empty_wide, pack_wide, refit_wide
 from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.visibility import near_depth_map
+from spadwarp_kernels.sensor.visibility import near_depth_map, update_near_depth
 
 
 @wp.struct
@@ -180,19 +180,20 @@ def make_surfaces(
     return surfaces
 
 
-def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
+def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
     """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `public_tree` the
-    mesh's own.
+    mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
 
     Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
     from each other, surfaces made from a new `wp.Mesh` are faster.
 
     Args:
-        surfaces: From `make_surfaces` of this mesh, with an `extent` that holds its points and without a camera.
+        surfaces: From `make_surfaces` of this mesh, with an `extent` that holds its points.
         mesh: The mesh, whose `points` have changed in place.
+        camera: That of the surfaces, if they were made with one.
 
     Raises:
-        ArgumentError: Surfaces of another mesh, or with a map of what the camera cannot miss.
+        ArgumentError: Surfaces of another mesh, made with a camera and updated without one, or the other way round.
     """
     check_struct("surfaces", surfaces, Surfaces)
     check_kind("mesh", mesh, wp.Mesh)
@@ -201,8 +202,9 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
     for name in ("near_depth", "nodes", "faces", "order", "depth", "levels"):
         if getattr(surfaces, name) is None:
             raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
-    if surfaces.near_depth.size:
-        raise ArgumentError("surfaces know what the camera cannot miss; for moving points, make them without camera")
+    if (surfaces.near_depth.size > 0) != (camera is not None):
+        made = "with" if surfaces.near_depth.size else "without"
+        raise ArgumentError(f"surfaces were made {made} a camera; update_surfaces needs the same")
     check_faces("surfaces", surfaces, mesh.indices.size // 3, mesh.device)
     tree = (mesh, surfaces.extent, surfaces.nodes, surfaces.faces, surfaces.order)
     if not surfaces.nodes.size:
@@ -215,6 +217,8 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh) -> None:
         refit_bvh(*tree, surfaces.depth, surfaces.levels)
     else:
         refit_wide(*tree)
+    if camera is not None:
+        update_near_depth(surfaces.near_depth, mesh, camera)
 
 
 def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:

@@ -33,29 +33,38 @@ ESTIMATORS = ("guided", "next_event")
 _ROULETTE_BELOW = 0.1
 
 
-@wp.kernel(enable_backward=False)
-def _light_kernel(tally: wp.array(dtype=wp.int64), factor: wp.float64, light: wp.array2d(dtype=float)):
-    """Detections per pulse. Launch: (pixels, bins of the tally)."""
-    pixel, k = wp.tid()
-    light[pixel, k] = float(wp.float64(tally[pixel * light.shape[1] + k]) * factor)
+# Bins that a thread computes: what they need of the tally overlaps.
+_RUN = wp.constant(4)
+_Run = wp.types.vector(length=4, dtype=float)
 
 
 @wp.kernel(enable_backward=False)
-def _response_kernel(
-    light: wp.array2d(dtype=float),
+def _rates_kernel(
+    tally: wp.array2d(dtype=wp.int64),
+    factor: wp.float64,
     dark: float,
     taps: wp.array(dtype=float),
     lowest: int,
     # Out:
     rates: wp.array2d(dtype=float),
 ):
-    """Expected detections per pulse of one camera: light blurred by the response. Launch: (pixels, bins)."""
-    pixel, k = wp.tid()
-    start = k * (light.shape[1] / rates.shape[1]) + lowest
-    total = float(dark)
-    for t in range(wp.max(0, -start), wp.min(taps.shape[0], light.shape[1] - start)):
-        total += taps[t] * light[pixel, start + t]
-    rates[pixel, k] = total
+    """Expected detections per pulse of one camera: light of the tally, blurred by the response.
+
+    `taps` has zeros for the _RUN - 1 bins before and after the response. Launch: (pixels, runs of bins).
+    """
+    pixel, run = wp.tid()
+    parts = tally.shape[1] / rates.shape[1]
+    first = run * _RUN
+    start = first * parts + lowest
+    after = parts * (_RUN - 1)
+    total = _Run(dark)
+    for s in range(wp.max(0, -start), wp.min(taps.shape[0] - after, tally.shape[1] - start)):
+        light = float(wp.float64(tally[pixel, start + s]) * factor)
+        for r in range(wp.static(_RUN)):
+            total[r] += taps[s + after - parts * r] * light
+    for r in range(wp.static(_RUN)):
+        if first + r < rates.shape[1]:
+            rates[pixel, first + r] = total[r]
 
 
 @wp.kernel(enable_backward=False)
@@ -70,12 +79,10 @@ class _Lane:
     Attributes:
         stream: None for the device's current one.
         data: Its tally and cursor; the ledger and the offset are those of all lanes.
-        light: Detections per pulse, `[pixels, bins of the tally]`.
     """
 
     stream: wp.Stream | None
     data: Data
-    light: wp.array
 
 
 class SpadTracer(WorldCameras):
@@ -94,7 +101,7 @@ class SpadTracer(WorldCameras):
         photons: Of a step and camera, 1 ... 2^26.
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
-        lanes: Cameras that a GPU traces side by side, each with memory of its own: 12 B a pixel and bin of the tally.
+        lanes: Cameras that a GPU traces side by side, each with memory of its own: 8 B a pixel and bin of the tally.
         public_tree: See `make_surfaces`.
 
     Attributes:
@@ -125,7 +132,7 @@ class SpadTracer(WorldCameras):
         config = check_config(config)
         self._parts = check_integer("oversampling", oversampling, 1, 1024)
         sizes = {"config.height": config.height, "config.width": config.width, "config.bins": config.bins}
-        check_room("tallies", {**sizes, "oversampling": self._parts}, 12, shapes.device, rows=4)
+        check_room("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
         super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
@@ -140,7 +147,7 @@ class SpadTracer(WorldCameras):
             if not len(faces):
                 raise ArgumentError(f"world {worlds[v]} of camera {v} has no shapes")
         taps, self._lowest = self.config.bin_response(self._parts)
-        self._taps = wp.array(taps, dtype=float, device=self.device)
+        self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
         self._lane_count = min(check_integer("lanes", lanes, 1, 64), self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
@@ -172,15 +179,17 @@ class SpadTracer(WorldCameras):
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
         wp.launch(_albedo_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
-        update_surfaces(surfaces, model.mesh)
+        update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
         launch_transport(self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons)
+        pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
-        wp.launch(_light_kernel, lane.light.shape, [lane.data.tally, factor], [lane.light], device=self.device)
-        rates = self.rates[v].reshape((config.height * config.width, config.bins))
         dark = config.dark_rate * config.bin_path / config.speed
-        inputs = [lane.light, dark, self._taps, self._lowest]
-        wp.launch(_response_kernel, rates.shape, inputs, [rates], device=self.device)
+        tally = lane.data.tally.reshape((pixels, model.gate.bins))
+        rates = self.rates[v].reshape((pixels, config.bins))
+        runs = (pixels, -(-config.bins // int(_RUN)))
+        inputs = [tally, factor, dark, self._taps, self._lowest]
+        wp.launch(_rates_kernel, runs, inputs, [rates], device=self.device)
 
     def rebuild(self) -> None:
         """Builds the trees anew at the next step, for where things are then: faster rays where they have moved far.
@@ -221,6 +230,7 @@ class SpadTracer(WorldCameras):
                 reflectance,
                 corner_reflectance=corners,
                 textures=textures,
+                camera=camera,
                 extent=extent,
                 public_tree=self._public_tree,
             )
@@ -234,11 +244,10 @@ class SpadTracer(WorldCameras):
             self.data = self._lanes[0].data
 
     def _make_lane(self, k: int, model: Model, shared: Data) -> _Lane:
-        shape = (self.config.height * self.config.width, model.gate.bins)
-        tally = wp.zeros(shape[0] * shape[1], dtype=wp.int64, device=self.device)
+        size = self.config.height * self.config.width * model.gate.bins
+        tally = wp.zeros(size, dtype=wp.int64, device=self.device)
         data = dataclasses.replace(shared, tally=tally, cursor=wp.zeros(1, dtype=int, device=self.device))
-        light = wp.zeros(shape, dtype=float, device=self.device)
-        return _Lane(wp.Stream(self.device) if k > 0 else None, data, light)
+        return _Lane(wp.Stream(self.device) if k > 0 else None, data)
 
     def _textures(self, owner: np.ndarray) -> "Textures | None":
         """The shapes' images for the faces of one camera's mesh."""

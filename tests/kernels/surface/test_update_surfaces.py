@@ -43,6 +43,15 @@ def cast(
     hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
 
 
+@wp.kernel(enable_backward=False)
+def meets(
+    surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), way: wp.array(dtype=wp.vec3), met: wp.array(dtype=int)
+):
+    i = wp.tid()
+    hit = sk.intersect_surfaces(surfaces, x[i], wp.normalize(way[i]), wp.length(way[i]), True)
+    met[i] = wp.where(hit.slot >= 0, 1, 0)
+
+
 def distances(surfaces, device, count=20_000):
     rng = np.random.default_rng(2)
     u = rng.normal(size=(count, 3))
@@ -121,18 +130,63 @@ def test_surfaces_of_a_refitted_mesh(constructor, device):
     assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
 
 
-def test_a_camera_map_cannot_follow(device):
-    mesh, _ = ball(device)
+def wide_camera():
     camera = sk.Camera()
-    camera.width = camera.height = 8
-    camera.pixel_tangent, camera.aperture_area = 0.1, 1e-4
-    with pytest.raises(sk.ArgumentError, match="make them without camera"):
-        sk.update_surfaces(sk.make_surfaces(mesh, camera=camera), mesh)
+    camera.width = camera.height = 64
+    camera.pixel_tangent, camera.aperture_radius, camera.aperture_area = 0.025, 0.1, math.pi * 1e-2
+    return camera
+
+
+def test_the_map_of_a_camera_follows(device):
+    mesh, points = ball(device)
+    camera = wide_camera()
+    surfaces = sk.make_surfaces(mesh, camera=camera, extent=9.0)
+    inside = surfaces.near_depth.numpy()  # the lens is in the ball
+    assert 0.3 < inside.min() and inside.max() < 1.1
+    for shift in (3.0, 5.0):
+        mesh.points.assign(points + np.array([0.5, 0.0, shift], np.float32))
+        sk.update_surfaces(surfaces, mesh, camera)
+        found = surfaces.near_depth.numpy()
+        assert np.array_equal(found, sk.near_depth_map(mesh, camera).numpy())
+        assert found[64, 64] == pytest.approx(shift - 1.0, abs=0.25) and found[64, 0] > 1e29
+    with pytest.raises(sk.ArgumentError, match="made with a camera; update_surfaces needs the same"):
+        sk.update_surfaces(surfaces, mesh)
+    with pytest.raises(sk.ArgumentError, match="made without a camera"):
+        sk.update_surfaces(sk.make_surfaces(mesh, extent=9.0), mesh, camera)
     with pytest.raises(sk.ArgumentError, match="make_surfaces needs an extent"):
         sk.update_surfaces(sk.make_surfaces(mesh), mesh)
     other, _ = ball(device)
     with pytest.raises(sk.ArgumentError, match="not those of mesh"):
         sk.update_surfaces(sk.make_surfaces(mesh), other)
+
+
+def test_nothing_hides_what_lies_before_the_map(device):
+    """A floor and a tilted wall that go past a wide lens, faces behind it, a small one: rays from points before the map
+    to all of the lens meet none, and the map reaches far along the floor."""
+    turn = np.array([[0.8, 0.1, 0.59], [0.0, 0.98, -0.17], [-0.6, 0.14, 0.79]])
+    square = np.array([(-20.0, 0, -20), (20, 0, -20), (20, 0, 20), (-20, 0, 20)])
+    small = np.array([(-0.3, -0.8, 2.0), (0.2, -0.7, 2.2), (0.0, -0.4, 1.9), (0.1, -0.9, 2.1)])
+    parts = [square + (0, 0.5, 0), square[:, [1, 0, 2]] @ turn - (3.0, 0, 0), 0.1 * square - (0, 0, 2.5), small]
+    corners = np.concatenate(parts).astype(np.float32)
+    faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
+    points = wp.array(corners, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(points, wp.array(faces, dtype=int, device=device))
+    camera = wide_camera()
+    near = sk.near_depth_map(mesh, camera).numpy().astype(float)
+    assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
+    assert (near[:62] > 1.0).mean() > 0.5 and (near > 0.1).mean() > 0.9
+    rng = np.random.default_rng(4)
+    count = 20_000
+    row, column = rng.integers(0, 128, (2, count))
+    tangent = (np.stack([column, row], axis=1) + rng.uniform(0.01, 0.99, (count, 2)) - 64.0) / 80.0
+    depth = np.minimum(near[row, column], 15.0) * np.where(rng.random(count) < 0.5, 1.0 - 1e-6, rng.random(count))
+    start = np.concatenate([tangent, np.ones((count, 1))], axis=1) * depth[:, None]
+    turn = rng.uniform(0, 2 * np.pi, count)
+    lens = camera.aperture_radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
+    x, way = (wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (start, lens - start))
+    met = wp.zeros(count, dtype=int, device=device)
+    wp.launch(meets, count, [sk.make_surfaces(mesh), x, way], [met], device=device)
+    assert not met.numpy().any()
 
 
 def small_model(mesh, surfaces):
