@@ -130,6 +130,34 @@ def test_a_captured_step_is_the_step(device):
     assert mine == pytest.approx(theirs, rel=1e-3)
 
 
+def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
+    """With bodies that have moved, and a floor that goes past the lens."""
+    from spadwarp_kernels.worlds import spad_tracer
+
+    def trace():
+        shapes = sk.make_shapes(
+            ["plane", "plane", "sphere", "box"],
+            [(0, 0, 0), (0, 0, 0), (0.4, 0, 0), (0.4, 0.3, 0.2)],
+            body=[-1, -1, 0, 1],
+            local=[(0, 1, 0, 0.7071068, 0, 0, 0.7071068), (0, 0, 4, 0, 0, 0, 1), *[(0, 0, 0, 0.6, 0, 0, 0.8)] * 2],
+            device=device,
+        )
+        tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), photons=20_000)
+        pose = transforms([(0, 0, 0, 0, 0, 0, 1)], device)
+        for x in (-0.5, 0.5):
+            tracer.update(pose, transforms([(x, 0.2, 2, 0, 0, 0, 1), (-x, 0, 3, 0, 0, 0, 1)], device))
+        return tracer.rates.numpy(), sk.read_ledger(tracer.data)[1]
+
+    rates, counters = trace()
+    make, update = spad_tracer.make_surfaces, spad_tracer.update_surfaces
+    monkeypatch.setattr(spad_tracer, "make_surfaces", lambda *a, **k: make(*a, **k | {"camera": None}))
+    monkeypatch.setattr(spad_tracer, "update_surfaces", lambda surfaces, mesh, camera: update(surfaces, mesh))
+    others, more = trace()
+    assert np.array_equal(rates, others)
+    assert more["shadow_queries"] == more["contributions"] == counters["contributions"]
+    assert 0 < counters["shadow_queries"] < 0.4 * more["shadow_queries"]
+
+
 def test_steps_have_photons_of_their_own(device):
     """Their mean converges as that of independent runs does."""
     tracer, _, step = small_step(device, photons=5_000)
