@@ -34,8 +34,8 @@ _ROULETTE_BELOW = 0.1
 
 
 # Bins that a thread computes: what they need of the tally overlaps.
-_RUN = wp.constant(4)
-_Run = wp.types.vector(length=4, dtype=float)
+_RUN = wp.constant(2)
+_Run = wp.types.vector(length=2, dtype=float)
 
 
 @wp.kernel(enable_backward=False)
