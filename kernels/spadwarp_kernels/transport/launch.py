@@ -152,7 +152,14 @@ def load_transport_kernel(spec: TransportSpec, device: wp.DeviceLike = None) -> 
 
 
 def launch_transport(
-    spec: TransportSpec, model: Model, data: Data, *, seed: int, first_id: int, photon_count: int
+    spec: TransportSpec,
+    model: Model,
+    data: Data,
+    *,
+    seed: int,
+    first_id: int,
+    photon_count: int,
+    threads: int = CUDA_THREADS,
 ) -> None:
     """Walks the photons first_id ... first_id + photon_count - 1 and adds them to `data`; asynchronous on CUDA.
 
@@ -162,6 +169,8 @@ def launch_transport(
         seed: 0 ... 2^64 - 1. A photon's history depends on (seed, id) alone.
         first_id: 64-bit.
         photon_count: 1 ... 2^26 in one launch.
+        threads: At most so many on CUDA, 128 or more: fewer for launches that share a GPU, so that each thread moves
+            many photons.
 
     Raises:
         ArgumentError: Before anything is launched, for what the kernel of this spec cannot take: a number out of range,
@@ -173,8 +182,9 @@ def launch_transport(
     photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
     first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
     seed = check_seed(seed)
+    blocks = min(-(-photon_count // BLOCK_SIZE), check_integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE)
     check_launch(spec, model, data, photon_count)
-    threads = min(-(-photon_count // BLOCK_SIZE) * BLOCK_SIZE, CUDA_THREADS) if model.device.is_cuda else 1
+    threads = blocks * BLOCK_SIZE if model.device.is_cuda else 1
     derivatives = model.derivatives
     if spec.blocks:
         threads = threads_of_blocks(threads, 2 * len(spec.blocks) * derivatives.blocks.count)

@@ -16,7 +16,7 @@ from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
-from spadwarp_kernels.transport.launch import Data, Model, launch_transport, make_data
+from spadwarp_kernels.transport.launch import CUDA_THREADS, Data, Model, launch_transport, make_data
 
 from .cameras import WorldCameras
 from .checks import check_room
@@ -181,7 +181,15 @@ class SpadTracer(WorldCameras):
         wp.launch(_albedo_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
-        launch_transport(self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons)
+        launch_transport(
+            self._spec,
+            model,
+            lane.data,
+            seed=config.seed,
+            first_id=v * photons,
+            photon_count=photons,
+            threads=CUDA_THREADS // len(self._lanes),
+        )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
         dark = config.dark_rate * config.bin_path / config.speed
