@@ -102,8 +102,8 @@ def update_near_depth(near_depth: wp.array, mesh: wp.Mesh, camera: Camera) -> No
     check_camera("camera", camera, calibrated=False)
     check_array("near_depth", near_depth, wp.float32, (int(_TEXELS), int(_TEXELS)), mesh.device)
     near_depth.fill_(_NOTHING)
-    # Many for each face on a GPU: some cover all of the map.
-    threads = 128 if mesh.device.is_cuda else 1
+    # A warp for each face on a GPU: some cover all of the map.
+    threads = 32 if mesh.device.is_cuda else 1
     faces = (mesh.indices.size // 3, threads)
     wp.launch(_near_depth_kernel, faces, [camera, mesh.id, threads], [near_depth], device=mesh.device)
 
