@@ -118,6 +118,7 @@ from .tally import (
 from .transport import (
     Data,
     Model,
+    TransportLauncher,
     launch_transport,
     load_transport_kernel,
     make_data,
@@ -199,6 +200,7 @@ __all__ = [
     "SurfaceHit",
     "Surfaces",
     "Textures",
+    "TransportLauncher",
     "TransportSpec",
     "arrival_bins",
     "dark_count_rates",
