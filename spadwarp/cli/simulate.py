@@ -185,7 +185,8 @@ def simulate(
         _fail_as_interrupted(result, records)
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
-        complain(f"warning: the error {reached} after all photons, not {100 * relative_error:.3g} %")
+        why = "after all photons" if result.photons >= scene.transport.photons else "since bright photons came late"
+        complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
 
 
 def _missing(scene_path: Path | None) -> typer.BadParameter:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
 __all__ = ["ComponentError", "component_errors", "dominance_warnings", "joined_moments", "moments_of"]
-__all__ += ["batches_of", "pixel_standard_error", "relative_error"]
+__all__ += ["batches_of", "largest_share", "pixel_standard_error", "relative_error"]
 
 # Share of the variance between batches from which one batch is said to decide a standard error. Chance alone exceeds
 # it with a probability of _FALSE_ALARM at most, see `_threshold`.
@@ -68,6 +68,23 @@ def joined_moments(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]
 
 def component_errors(result: Result) -> dict[str, ComponentError]:
     """By component; empty without batches, and for components without light."""
+    found = {}
+    for name, (count, total, spread, furthest) in _spreads(result).items():
+        error = math.sqrt(spread / (count - 1)) / total
+        found[name] = ComponentError(error, furthest * furthest / ((count - 1) * spread), count)
+    return found
+
+
+def largest_share(result: Result) -> float:
+    """As `ComponentError.largest_share`, of the variance of all components together; 1 where nothing is known."""
+    spreads = list(_spreads(result).values())
+    together = sum(spread for _, _, spread, _ in spreads)
+    return max((furthest * furthest / ((count - 1) * together) for count, _, _, furthest in spreads), default=1.0)
+
+
+def _spreads(result: Result) -> dict[str, tuple[int, int, int, int]]:
+    """Of components that vary: number n of batches, total, n times the sum of squared deviations of the batches from
+    their mean, n times the largest deviation."""
     moments = result.batch_moments
     if not moments or result.photons < 2 * result.batch_size:
         return {}
@@ -80,8 +97,7 @@ def component_errors(result: Result) -> dict[str, ComponentError]:
         spread = count * moments[f"{name}_squares"] - total * total
         furthest = max(count * moments[f"{name}_largest"] - total, total - count * moments[f"{name}_smallest"])
         if total > 0 and spread > 0:
-            error = math.sqrt(spread / (count - 1)) / total
-            found[name] = ComponentError(error, furthest * furthest / ((count - 1) * spread), count)
+            found[name] = count, total, spread, furthest
     return found
 
 

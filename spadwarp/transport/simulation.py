@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from spadwarp.errors import ConfigError, DeviceError, SpadwarpWarning
 from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, Tallies
+from spadwarp.result.batch_moments import largest_share
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.merging import add_timing, check_capacity, check_focus, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
@@ -28,6 +30,7 @@ from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, make_plan
+from spadwarp.transport.stopping import FIRST_LOOK, StoppingRule
 
 __all__ = ["Progress", "provenance", "simulate"]
 
@@ -37,10 +40,6 @@ Progress = Callable[[str, int, int], None]
 # so small, in numbers of them to one unit, that their own scatter is less.
 _LARGEST_ROUNDING_ERROR = 0.05
 _MANY = 10
-
-# With a stopping rule: batches at the first look at the error; those that know it well; photons beyond the number that
-# should reach the goal, since most looks would else come a little too early.
-_FIRST_LOOK, _FEW, _RESERVE = 16, 32, 1.05
 
 
 def simulate(
@@ -83,10 +82,11 @@ def simulate(
             with ("trace", photons done, photons asked for); any other first word is a remark for the user.
         uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
             at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
-        relative_error: Stop once `Result.relative_error` is below this; implies `uncertainty`, and `photons` is the
-            most that are traced. The error is looked at after 16 batches of 1/128 to 1/1024 of the photons, and then
-            where it says that the goal will be reached, whatever the device. See "Which estimator, how many photons"
-            for what the choice of the moment does to the error.
+        relative_error: Stop when `Result.relative_error` is about this; implies `uncertainty`, and `photons` is the
+            most that are traced. The error is looked at after 32 batches of 1/128 to 1/1024 of the photons, and then
+            where it says that the goal will be reached, whatever the device. There the run goes on by a part of its
+            photons that is then fixed, so that it does not end because bright photons have not come yet; if they come
+            then, the error is larger than asked for. See "Which estimator, how many photons".
         first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
         shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
         resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
@@ -178,17 +178,6 @@ def _warn_of_rounding(result: Result) -> None:
             )
 
 
-def _batches_wanted(batches: int, excess: float) -> int:
-    """After how many batches the error is looked at again, when after so many it is `excess` times what is asked for.
-
-    Errors fall with the root of the photons. Few batches know them badly, and rather too large, since a high quantile
-    of the pixels is taken: until 32 there are at most twice as many at the next look, then eight times as many.
-    """
-    most = batches * (2 if batches < _FEW else 8)
-    wanted = math.ceil(_RESERVE * batches * excess**2) if excess < math.inf else most
-    return min(max(wanted, batches + max(1, batches // 16)), most)
-
-
 class _Run:
     """The photons of a plan, those of an earlier result included."""
 
@@ -224,9 +213,9 @@ class _Run:
 
     def _known_result(self, stopped: threading.Event, relative_error: float) -> Result:
         """Traces until the error is known to be small enough, looking at it where it may be."""
-        done, size = self._earlier, self._plan.batch_size
+        done, size, rule = self._earlier, self._plan.batch_size, StoppingRule(relative_error)
         (start, stop), photons = self._plan.ids, count([self._plan.ids])
-        goal = min(start + max(_FIRST_LOOK * size, count(done)), stop)
+        goal = min(start + max(FIRST_LOOK * size, count(done)), stop)
         while True:
             done = self._trace((start, goal), done, stopped)
             if count(done) == count(self._earlier) and stopped.is_set():
@@ -236,14 +225,14 @@ class _Run:
                 return result
             batches = result.photons // size
             error = result.relative_error if batches > 1 else math.inf
+            wanted = rule.next_look(batches, error, partial(largest_share, result))
             remark = f"error {100 * error:.3g} % after {batches} batches"
-            if error <= relative_error or goal == stop:
-                self._report(remark, result.photons, photons)
-                return replace(result, requested=(start, goal), partial=False)
-            if error < math.inf:
+            if relative_error < error < math.inf:
                 remark += f"; about {result.photons * (error / relative_error) ** 2:.2g} photons are needed"
             self._report(remark, result.photons, photons)
-            goal = min(goal + (_batches_wanted(batches, error / relative_error) - batches) * size, stop)
+            if wanted is None or goal == stop:
+                return replace(result, requested=(start, goal), partial=False)
+            goal = min(goal + (wanted - batches) * size, stop)
 
     def _trace(self, span: Range, done: Ranges, stopped: threading.Event) -> Ranges:
         """The ids done once a span is, or once the run was stopped."""

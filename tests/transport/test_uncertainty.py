@@ -124,8 +124,8 @@ def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     run = spadwarp.simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)
     assert run.relative_error <= 0.05 and not run.partial
     assert run.photons < 2**22
-    # Where the error so far said that the goal would be reached, not at the next power of two.
-    assert run.relative_error > 0.8 * 0.05
+    # Where the error so far said that the goal would be reached, not at the next power of two, and a part on.
+    assert run.relative_error > 0.6 * 0.05
     never = spadwarp.simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)
     assert never.photons == 2**14 and not never.partial and never.relative_error > 1e-6
 
