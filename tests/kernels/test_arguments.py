@@ -64,9 +64,9 @@ def test_a_launcher_refuses_what_a_launch_refuses(box):
     data = sk.make_data(one, record_count=10)
     with pytest.raises(sk.ArgumentError, match=r"photon_count = 0 is outside \[1, 67108864\]"):
         sk.TransportLauncher(NEXT_EVENT, one, data, seed=1).launch(0, 0)
-    with pytest.raises(sk.ArgumentError, match="model.surfaces"):
+    with pytest.raises(sk.ArgumentError, match=r"model\.surfaces"):
         sk.TransportLauncher(NEXT_EVENT, dataclasses.replace(one, surfaces=sk.Surfaces()), data, seed=1)
-    with pytest.raises(sk.ArgumentError, match="spec.records and spec.blocks need memory for each launch"):
+    with pytest.raises(sk.ArgumentError, match="need memory for each launch"):
         sk.TransportLauncher(sk.TransportSpec("none", records=True), one, data, seed=1)
 
 
