@@ -1,6 +1,7 @@
 """The rule by which a run with a relative error as its goal ends, on batches of invented scores of mean 1."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ RUNS, BATCHES = 1000, 1024
 
 
 class Ends:
-    """Where the runs whose batches are the rows end: batches, mean, standard error, and where they first had the goal."""
+    """Where the runs whose batches are the rows end: batches, mean, standard error, and where first at the goal."""
 
     def __init__(self, values, goal):
         count = np.arange(1, values.shape[1] + 1)
@@ -38,7 +39,7 @@ class Ends:
         while True:
             known = float(error[batches - 1])
             searched = batches if searched is None and known <= goal else searched
-            wanted = rule.next_look(batches, known, lambda: float(share[batches - 1]))
+            wanted = rule.next_look(batches, known, partial(float, share[batches - 1]))
             if wanted is None or batches == len(error):
                 return searched or batches, batches
             batches = min(wanted, len(error))
@@ -54,7 +55,7 @@ def test_many_equal_photons_cost_little_more_and_reach_the_goal():
 
 
 def test_rare_bright_photons_are_waited_for():
-    """Light of a next event whose distance r is even in r^3 goes as r^-2: the tail has the exponent 3/2, no variance."""
+    """Light of a next event whose distance r is even in r^3 goes as r^-2: a tail of exponent 3/2, no variance."""
     rng = np.random.default_rng(3)
     photons = rng.poisson(8.0, (RUNS, BATCHES))
     bright = np.zeros((RUNS, BATCHES))
