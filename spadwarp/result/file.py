@@ -16,6 +16,7 @@ from spadwarp.io.exr import read_exr, write_exr
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.io.hdf5_packing import write_packed
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
 from spadwarp.result.batch_moments import moments_of
@@ -88,12 +89,13 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         file.attrs.update(
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )
-        file.create_dataset("tallies", data=result.tallies, chunks=(1, rows, columns, bins), **packed)
+        write_packed(file, "tallies", result.tallies, chunks=(1, rows, columns, bins), compression=compression)
         if result.second_moment is not None:
-            shape = (1, rows, columns, bins)
-            file.create_dataset("second_moment", data=result.second_moment, chunks=shape, **packed)
-        write_signed(file, "derivatives", result.derivative_tallies, chunks=(1, 1, rows, columns, bins), **packed)
-        write_signed(file, "channels", result.channel_tallies, chunks=(1, 1, rows, columns, bins), **packed)
+            chunks = (1, rows, columns, bins)
+            write_packed(file, "second_moment", result.second_moment, chunks=chunks, compression=compression)
+        for group in ("derivatives", "channels"):
+            signed = result.derivative_tallies if group == "derivatives" else result.channel_tallies
+            write_signed(file, group, signed, chunks=(1, 1, rows, columns, bins), compression=compression)
         file.create_dataset("bin_edges", data=result.bin_edges)
         if result.scene.scan_positions > 1:
             file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from spadwarp.io.hdf5_dimensions import PIXELS
 from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.io.hdf5_packing import write_packed
 from spadwarp.result.signed_tallies import SignedTallies
 
 __all__ = ["SIGNED_DIMENSIONS", "read_signed", "write_signed"]
@@ -39,15 +41,17 @@ SIGNED_DIMENSIONS = {
 """Dimensions, unit and meaning of the arrays."""
 
 
-def write_signed(file: Any, group: str, found: SignedTallies | None, **options: Any) -> None:
-    """Writes the tallies to a group of an open file, with HDF5's `options` of large arrays; their names are the file's
-    attribute of that name."""
+def write_signed(
+    file: Any, group: str, found: SignedTallies | None, *, chunks: Sequence[int], compression: int
+) -> None:
+    """Writes the tallies to a group of an open file, as `write_packed`; their names are the file's attribute of that
+    name."""
     if found is None:
         return
     file.attrs[group] = list(found.names)
     for name, array in {"tallies": found.tallies, "second_moment": found.second_moment}.items():
         if array is not None:
-            file.create_dataset(f"{group}/{name}", data=array, **options)
+            write_packed(file, f"{group}/{name}", array, chunks=chunks, compression=compression)
     file.create_dataset(f"{group}/unit", data=np.array(found.units))
 
 

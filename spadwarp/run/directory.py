@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from spadwarp.errors import FileError
 from spadwarp.frames import detector_response
 from spadwarp.io.atomic import atomic_path, remove_temporaries
 from spadwarp.io.paths import file_within
+from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head
 from spadwarp.scene import Scene
@@ -50,7 +52,7 @@ class RunFiles:
 
 
 def write_run(result: Result, out: str | Path, *, device: str | None = None, keep: Sequence[str] = ()) -> RunFiles:
-    """Writes the files that a result's `[output]` asks for to a directory, the result first.
+    """Writes the files that a result's `[output]` asks for to a directory, its pictures by other processes (Linux).
 
     result.h5, scene.toml, depth.exr, truth.exr, and depth, intensity, histogram and truth as PNG and PDF. Files of
     these names that an earlier run has left, its checkpoint and records included, are removed.
@@ -66,24 +68,44 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
             which the text names.
     """
     folder, scene, output = Path(out), result.scene, result.scene.output
-    written = [_save(result, folder / "result.h5")] if output.result else []
-    with atomic_path(folder / "scene.toml") as temporary:
-        temporary.write_text(scene.to_toml(), encoding="utf-8")
-    written.append(folder / "scene.toml")
-    options: dict[str, Any] = {}
-    if output.depth_method in ("matched", "likelihood"):
-        options["irf"] = detector_response(scene.detector, scene.laser)
-    depth = result.depth(method=output.depth_method, device=device, **options)
-    if output.exr:
-        written += [save_depth_exr(result, depth, folder / "depth.exr"), save_truth_maps(result, folder / "truth.exr")]
-    if formats := [ending for ending in ("png", "pdf") if getattr(output, ending)]:
-        from spadwarp.viz import draw_result
-
-        written += draw_result(result, folder, depth=depth, method=output.depth_method, formats=formats)
+    written: list[Path] = []
+    try:
+        depth = _depth(result, device)
+    except BaseException:
+        if output.result:  # photons must not be lost
+            _save(result, folder / "result.h5")
+        raise
+    with Forked(_pictures(result, folder, depth)) as pictures:
+        if output.result:
+            written.append(_save(result, folder / "result.h5"))
+        with atomic_path(folder / "scene.toml") as temporary:
+            temporary.write_text(scene.to_toml(), encoding="utf-8")
+        written.append(folder / "scene.toml")
+        if output.exr:
+            written.append(save_depth_exr(result, depth, folder / "depth.exr"))
+            written.append(save_truth_maps(result, folder / "truth.exr"))
+        written += itertools.chain.from_iterable(pictures.results())
     remove_checkpoint(folder)
     for name in set(RUN_FILES) - set(keep) - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)
     return RunFiles(written, depth)
+
+
+def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
+    scene, method = result.scene, result.scene.output.depth_method
+    options: dict[str, Any] = {}
+    if method in ("matched", "likelihood"):
+        options["irf"] = detector_response(scene.detector, scene.laser)
+    return result.depth(method=method, device=device, **options)
+
+
+def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
+    output = result.scene.output
+    if not (formats := [ending for ending in ("png", "pdf") if getattr(output, ending)]):
+        return []
+    from spadwarp.viz.result import picture_calls
+
+    return picture_calls(result, folder, depth=depth, method=output.depth_method, formats=formats)
 
 
 def _save(result: Result, path: Path) -> Path:

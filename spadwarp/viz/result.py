@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from spadwarp.viz.style import (
 )
 from spadwarp.viz.style import COMPONENTS as STYLES
 
-__all__ = ["KINDS", "draw_result", "result_figure"]
+__all__ = ["KINDS", "draw_result", "picture_calls", "result_figure"]
 
 KINDS = ("depth", "intensity", "histogram", "truth")
 """Figures of a result."""
@@ -64,9 +65,21 @@ def draw_result(
     Raises:
         FileError: The folder or a file cannot be written.
     """
-    folder = Path(directory)
-    figures = {name: result_figure(result, name, depth=depth, method=method, width=width) for name in KINDS}
-    return [save(figure, folder / f"{name}.{ending}") for name, figure in figures.items() for ending in formats]
+    options: dict[str, Any] = {"depth": depth, "method": method, "formats": formats, "width": width}
+    return [path for call in picture_calls(result, directory, **options) for path in call()]
+
+
+def picture_calls(
+    result: Result, directory: str | Path, *, formats: Sequence[str], **options: Any
+) -> list[Callable[[], list[Path]]]:
+    """The parts of `draw_result`, which do not need each other: a figure each."""
+    return [partial(_draw, result, kind, Path(directory), formats, options) for kind in KINDS]
+
+
+@paper()
+def _draw(result: Result, kind: str, folder: Path, formats: Sequence[str], options: dict[str, Any]) -> list[Path]:
+    figure = result_figure(result, kind, **options)
+    return [save(figure, folder / f"{kind}.{ending}") for ending in formats]
 
 
 @paper()

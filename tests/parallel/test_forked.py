@@ -1,0 +1,49 @@
+"""Calls in copies of this process."""
+
+import os
+import sys
+import time
+
+import pytest
+
+from spadwarp.parallel import Forked
+
+pytestmark = pytest.mark.fast
+
+
+def test_calls_return_in_order_from_processes_of_their_own():
+    held = list(range(100_000))
+    calls = [lambda k=k: (k, len(held), os.getpid()) for k in range(3)]
+    with Forked(calls) as forked:
+        found = forked.results()
+    assert [one[:2] for one in found] == [(k, 100_000) for k in range(3)]
+    own = {one[2] for one in found}
+    assert len(own) == 3 and os.getpid() not in own if sys.platform == "linux" else own == {os.getpid()}
+
+
+def test_what_fails_in_a_copy_is_made_here():
+    here = os.getpid()
+
+    def only_here():
+        if os.getpid() != here:
+            os._exit(3)
+        return "here"
+
+    def fails():
+        raise ValueError("as it says")
+
+    with Forked([only_here]) as forked:
+        assert forked.results() == ["here"]
+    with Forked([fails]) as forked, pytest.raises(ValueError, match="as it says"):
+        forked.results()
+
+
+def test_none_outlives_its_context(tmp_path):
+    def slow():
+        time.sleep(1.0)
+        (tmp_path / "late").touch()
+
+    with pytest.raises(RuntimeError, match="full"), Forked([slow]):
+        raise RuntimeError("full")
+    time.sleep(1.2)
+    assert not (tmp_path / "late").exists()
