@@ -147,7 +147,7 @@ def simulate(
         _check_records(scene, whole=not (first_photon or shard_text))
     shard = opt.read_part(shard_text, "--shard")
     engine = opt.read_engine(engine_name, ray_address, workers)
-    run = _prepared(scene, device, engine)
+    run = _prepared(device, engine)
     _warn(scene, device)
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     names = _parameters(scene, derivatives, blocks, earlier)
@@ -156,6 +156,7 @@ def simulate(
     inputs = (scene_path, *scene.files)
     options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
     outputs = _outputs(out, resume=earlier is not None, **options)
+    _load_pictures(scene)
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
@@ -255,16 +256,18 @@ def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt
     return outputs
 
 
-def _prepared(scene: Scene, device: str | None, engine: Ray | None) -> ModuleType:
-    """Begins what takes long when kernels must be compiled: the compiler, and what draws the pictures at the end.
-
-    Returns the room `spadwarp.run`, which is loaded meanwhile.
-    """
+def _prepared(device: str | None, engine: Ray | None) -> ModuleType:
+    """Begins to prepare the compiler of kernels; returns the room `spadwarp.run`, which is loaded meanwhile."""
     if engine is None:
         spadwarp.transport.prepare_kernels(device)
+    return importlib.import_module("spadwarp.run")
+
+
+def _load_pictures(scene: Scene) -> None:
+    """Begins to load what draws the pictures at the end: while kernels are loaded and photons traced, not before, since
+    it would hold up this thread."""
     if (scene.output.png or scene.output.pdf) and address_space() is None:
         threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True).start()
-    return importlib.import_module("spadwarp.run")
 
 
 def _has_errors(result: Result) -> bool:
