@@ -32,7 +32,7 @@ def test_estimators_agree_in_every_component(axis_threshold, device):
 def test_estimators_agree_with_a_tabulated_phase_function(device):
     """Two terms, one of them backward, under a raised near-axis threshold."""
     photons = {"analog": 40_000, "next_event": 20_000, "guided": 20_000}
-    agreeing_cells(scene(medium=TABLE, transport={"axis_threshold": 0.97}), device, photons=photons)
+    agreeing_cells(scene(medium=TABLE, transport={"axis_threshold": 0.97}), device, photons=photons, clear=True)
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def test_layers_of_one_water_are_that_water(estimator, device):
 
 @pytest.mark.slow
 def test_estimators_agree_through_layers(device):
-    cells = agreeing_cells(scene(medium=LAYERED), device)
+    cells = agreeing_cells(scene(medium=LAYERED), device, clear=True)
     assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 

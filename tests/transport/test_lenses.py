@@ -28,7 +28,7 @@ CAMERAS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
-    cells = agreeing_cells(scene(**CAMERAS[camera]), device, pixels=True, converged=0.1)
+    cells = agreeing_cells(scene(**CAMERAS[camera]), device, pixels=True, converged=0.1, clear=True)
     # Every component and pixel is seen.
     pixels = cells["guided"][:, -16:]
     assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(32) < 0.1).all()

@@ -60,7 +60,7 @@ def test_the_estimators_agree_in_a_scan(device):
     """From 1 m on: nearer, next_event's rare and bright events next to the lens have no normal mean yet."""
     one = scene(**CONFOCAL, gate={"start_ns": 6.671, "bins": 4})
     photons = {"analog": 160_000, "next_event": 64_000, "guided": 64_000}
-    agreeing_cells(one, device, photons=photons, seeds=24, converged=0.1)
+    agreeing_cells(one, device, photons=photons, seeds=24, converged=0.1, clear=True)
 
 
 def test_pixels_of_a_scan_see_their_own_light_alone(device):

@@ -269,7 +269,7 @@ def _corner(path) -> list[dict]:
 @pytest.mark.slow
 def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     targets = _corner(shaded_square(tmp_path / "square.ply", greens=(40, 120, 180, 200)))
-    agreeing_cells(scene(targets=targets), device, seeds=24)
+    agreeing_cells(scene(targets=targets), device, seeds=24, clear=True)
 
 
 def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(device):
