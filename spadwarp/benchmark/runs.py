@@ -106,7 +106,6 @@ class TransportRun:
         _wait(device)
         ready = time.perf_counter()
         sk.load_transport_kernel(self._spec, device)
-        self._launcher = sk.TransportLauncher(self._spec, self._model, self._data, seed=0) if device.is_cuda else None
         self.setup, self.compile = ready - began, time.perf_counter() - ready
         self.faces = 0 if mesh is None else mesh.face_count
         self.tally_bytes = 8 * self._model.tally_size if self.scores else None
@@ -118,11 +117,9 @@ class TransportRun:
 
         def launch(start: int, stop: int) -> None:
             for at in range(start, stop, _LAUNCH):
-                count = min(_LAUNCH, stop - at)
-                if self._launcher is not None:
-                    self._launcher.launch(at, count)
-                else:
-                    sk.launch_transport(self._spec, self._model, self._data, seed=0, first_id=at, photon_count=count)
+                sk.launch_transport(
+                    self._spec, self._model, self._data, seed=0, first_id=at, photon_count=min(_LAUNCH, stop - at)
+                )
 
         device = self._model.device
         workers = 1 if device.is_cuda else min(core_count(), photons)

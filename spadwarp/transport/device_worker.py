@@ -65,9 +65,6 @@ class DeviceWorker:
                 self._gradient_batches = sk.Batches(gradients, len(COMPONENTS), signed=True)
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             sk.load_transport_kernel(spec, model.device)
-            self._launcher = None
-            if model.device.is_cuda and not (spec.records or spec.blocks):
-                self._launcher = sk.TransportLauncher(spec, model, self.data, seed=seed)
         self._names, self._channels = derivatives, channels
         self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
         self._moments: dict[str, int] = {}
@@ -75,12 +72,9 @@ class DeviceWorker:
     def launch(self, first: int, stop: int) -> None:
         """Traces the photons of one launch to their end."""
         with device_errors(self.model.device):
-            if self._launcher is not None:
-                self._launcher.launch(first, stop - first)
-            else:
-                sk.launch_transport(
-                    self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
-                )
+            sk.launch_transport(
+                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
+            )
             wp.synchronize_device(self.model.device)
 
     def trace(
