@@ -20,6 +20,32 @@ def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upp
     return near <= far
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    typedef float row __attribute__((vector_size(16)));
+    const auto least = [](row p, row q) { return p < q ? p : q; };
+    const auto most = [](row p, row q) { return p > q ? p : q; };
+    // The fourth lane is the segment itself, from 0 to its length.
+    const row start = {x[0], x[1], x[2], 0.0f}, low = {lower[0], lower[1], lower[2], 0.0f};
+    const row high = {upper[0], upper[1], upper[2], length}, heading = {u[0], u[1], u[2], 1.0f};
+    const row tiny = row{} + 1.0e-12f;
+    const row inverse = 1.0f / (__builtin_elementwise_abs(heading) < tiny ? tiny : heading);
+    const row a = (low - start) * inverse, b = (high - start) * inverse;
+    row near = least(a, b), far = most(a, b);
+    near = most(near, __builtin_shufflevector(near, near, 2, 3, 0, 1));
+    far = least(far, __builtin_shufflevector(far, far, 2, 3, 0, 1));
+    near = most(near, __builtin_shufflevector(near, near, 1, 0, 3, 2));
+    far = least(far, __builtin_shufflevector(far, far, 1, 0, 3, 2));
+    return near[0] <= far[0];
+#else
+    return true;
+#endif
+""")
+def segment_meets_box_on_cpu(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """`segment_meets_box`, its three axes in one vector register; CPU alone."""
+    ...
+
+
 @wp.func
 def _inverse(d: float) -> float:
     return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)

@@ -18,7 +18,7 @@ from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box
+from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, step_leaf, step_node
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
@@ -112,6 +112,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
     arrives, flies = make_arrives(flights), make_flies(crosses)
     scatter = make_scatter(spec, estimator.direct, crosses)
+    meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     push, pop = make_queue(flights, queues, len(spec.derivatives), spec.polarised)
     deposit = make_deposit(spec.signed, len(spec.blocks))
@@ -182,7 +183,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.stage = EVENT
                     s.albedo = draw_albedo(s, medium, keys, id)
                     if wp.static(has_bvh):
-                        meets = segment_meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper)
+                        meets = meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper)
                         s.ray = wp.where(meets, SURFACE_RAY, NO_RAY)
                     if wp.static(brute_force):
                         hit = intersect_faces(surfaces, s.x, s.u, s.flight.reach)

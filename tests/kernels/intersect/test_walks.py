@@ -17,6 +17,7 @@ from spadwarp_kernels import (
     segment_meets_box,
     u01,
 )
+from spadwarp_kernels.intersect.box import segment_meets_box_on_cpu
 
 
 @wp.kernel(enable_backward=False)
@@ -55,6 +56,13 @@ def _bounce(surfaces: sk.Surfaces, x: Vectors, u: Vectors, gap: Floats):
 def _boxes(x: Vectors, u: Vectors, length: float, meets: Integers):
     i = wp.tid()
     box = segment_meets_box(x[i], u[i], length, wp.vec3(-1.0, -2.0, -0.5), wp.vec3(1.0, 2.0, 0.5))
+    meets[i] = wp.where(box, 1, 0)
+
+
+@wp.kernel(enable_backward=False)
+def _boxes_on_cpu(x: Vectors, u: Vectors, length: float, meets: Integers):
+    i = wp.tid()
+    box = segment_meets_box_on_cpu(x[i], u[i], length, wp.vec3(-1.0, -2.0, -0.5), wp.vec3(1.0, 2.0, 0.5))
     meets[i] = wp.where(box, 1, 0)
 
 
@@ -179,6 +187,7 @@ def test_segments_meet_the_box_that_they_cross():
     u[:1000, 0] = 0.0
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     (meets,) = launched(_boxes, [x, u, 3.0], [int])
+    np.testing.assert_array_equal(launched(_boxes_on_cpu, [x, u, 3.0], [int], device="cpu")[0], meets)
     # Points of the segment inside the box prove that it meets it; a box grown by 1e-3 that is missed proves the
     # contrary.
     s = np.linspace(0, 3, 201)[:, None, None]
