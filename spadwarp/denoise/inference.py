@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
-from spadwarp.denoise.frames import DepthFrames, depth_frames
+from spadwarp.denoise.frames import MARGIN, DepthFrames, depth_frames
 from spadwarp.denoise.gates import narrowed_input
 from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
@@ -145,6 +145,8 @@ def _from_histograms(
 ) -> Estimate:
     """`estimate` for the methods that use counts, in the bins that hold the target."""
     first, stop, part = target_bins(counts, background, response, gate)
+    if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
+        first, stop, part = 0, counts.shape[-1], gate
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
         return part[0] + (part[1] - part[0]) * place
@@ -165,6 +167,21 @@ def _from_histograms(
             warnings.simplefilter("ignore")  # depths outside this part are false peaks
         frames = depth_frames(depth, gate=part, profile=profile, features=features)
     return estimate_frames(frames, model=model, weights=weights, device=device)
+
+
+def _leaves_frames_empty(depth: ArrayLike, gate: tuple[float, float], part: tuple[float, float]) -> bool:
+    """Whether a frame has reports near the gate, but none near this part of it."""
+    values = np.asarray(depth)
+    if values.ndim not in (2, 3) or values.dtype.kind not in "iuf":
+        return False  # refused by what follows
+
+    def reports(start: float, stop: float) -> NDArray[np.bool_]:
+        margin = MARGIN * (stop - start)
+        with np.errstate(invalid="ignore"):
+            near = (values > 0) & (values >= start - margin) & (values <= stop + margin)
+        return near.any(axis=(-2, -1))  # type: ignore[no-any-return]
+
+    return bool((reports(*gate) & ~reports(*part)).any())
 
 
 def target_threshold(model: str) -> float:

@@ -133,6 +133,15 @@ def test_a_rotated_frame_gives_the_same_depth():
     assert np.nanmax(np.abs(rotated[::-1, ::-1] - denoised(depth, counts=counts, **options))) < 1e-4
 
 
+def test_depths_far_from_the_counts_are_answered():
+    """All reports before the bins that hold the returns: the answer comes from the whole gate, for both frames."""
+    counts, level = histograms(90.0, 5.0, 3.0)
+    given = {"counts": np.stack([counts, counts]), "background": level, "response": TAPS}
+    depth = np.stack([np.full((32, 32), 13.6), np.full((32, 32), 13.5 + 2.5 * 90.0 / BINS)])
+    assert histogram_inputs.target_bins(given["counts"], level, TAPS, (13.5, 16.0))[:2] != (0, BINS)
+    assert np.isfinite(denoised(depth, **given)).all()
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
