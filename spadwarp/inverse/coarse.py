@@ -17,7 +17,7 @@ __all__ = ["Cells", "blocks_of", "coarse_step", "in_cells"]
 
 Floats = NDArray[np.float64]
 
-_ACROSS = 8  # blocks along each side of the image
+_ACROSS = 4  # blocks along each side of the image; more of them are noisier
 
 
 class Cells:

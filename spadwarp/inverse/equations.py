@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spadwarp.device import core_count
 from spadwarp.inverse.rendering import Half
 
-__all__ = ["Cell", "Equations", "Law", "equations", "planned_pulses"]
+__all__ = ["Cell", "Equations", "Law", "Means", "equations", "means_of", "planned_pulses"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
@@ -111,6 +111,7 @@ def equations(
     pulses: float,
     image: tuple[int, int],
     cells: Sequence[Cell] | None = None,
+    means: Means | None = None,
 ) -> Equations:
     """The equations of counts `[pixel, bin]`, or of a plan of so many `pulses`, from two halves of photons.
 
@@ -122,64 +123,97 @@ def equations(
         image: (height, width).
         cells: Of each unknown: rows, columns and bins over which its weights are averaged. Any weights give equations
             that are right in the mean; noisy ones are less precise.
+        means: From `means_of` with the same arguments, for several equations of one rendering.
     """
-    a, b = halves
-    pixels, unknowns = a.rates.shape[0], a.slopes.shape[0]
+    pixels, unknowns = halves[0].rates.shape[0], halves[0].slopes.shape[0]
     score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
     noise = np.zeros_like(slope)
     simulation = [np.zeros((len(half.batches), pixels, unknowns)) for half in halves]
-    if trials is None:
-        trials = planned_pulses(law, 0.5 * (a.rates + b.rates), pulses)
     cells = [(1, 1, 1)] * unknowns if cells is None else cells
-    parts = [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
+    own = means_of(law, halves, trials, counts, pulses=pulses) if means is None else means
     with ThreadPoolExecutor(core_count()) as pool:
-        slopes = [_mean_slopes(law, half, trials, parts, pool) for half in halves]
-        weights = [_weights(law, *pair, trials, image, cells, pool) for pair in zip(halves, slopes, strict=True)]
+        weights = [_weights(law, half, i, own, image, cells, pool) for i, half in enumerate(halves)]
 
         def part(chosen: slice) -> None:
-            left = trials[chosen]
-            for i, other in enumerate(reversed(halves)):
-                weight = weights[i][chosen]
-                slope[chosen] += 0.5 * np.matmul(weight, slopes[1 - i][chosen].transpose(0, 2, 1))
-                if counts is not None:
-                    rest = counts[chosen] - law.mean(other.rates[chosen], left)
-                    score[chosen] += 0.5 * np.matmul(weight, rest[..., None])[..., 0]
-                for batch, rates in enumerate(other.batches):
-                    mean = law.mean(rates[chosen], left)
-                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[..., None])[..., 0]
+            for i, weight in enumerate(one[chosen] for one in weights):
+                slope[chosen] += 0.5 * np.matmul(weight, own.slopes[1 - i][chosen].transpose(0, 2, 1))
+                if own.rest is not None:
+                    score[chosen] += 0.5 * np.matmul(weight, own.rest[1 - i][chosen, :, None])[..., 0]
+                for batch, mean in enumerate(own.batches[1 - i]):
+                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
             both = 0.5 * (weights[0][chosen] + weights[1][chosen])
-            mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
-            variance = law.variance(law.mean(mean_rates, left), left)
-            noise[chosen] = np.matmul(both * variance[:, None], both.transpose(0, 2, 1))
+            noise[chosen] = np.matmul(both * own.variance[chosen, None], both.transpose(0, 2, 1))
 
-        list(pool.map(part, parts))
+        list(pool.map(part, _parts(pixels)))
     return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation])
 
 
-def _mean_slopes(law: Law, half: Half, trials: Rows, parts: list[slice], pool: ThreadPoolExecutor) -> Rows:
-    """Derivatives of the mean counts, `[pixel, unknown, bin]`."""
-    found = np.empty((len(half.first), len(half.slopes), law.recorded), np.float32)
+class Means(NamedTuple):
+    """What the equations take of a rendering whatever their cells are, float32.
+
+    Attributes:
+        trials: Pulses that can still count in each bin.
+        slopes: Derivatives of the mean counts by each half, `[half][pixel, unknown, bin]`.
+        rest: Counts less their mean by each half, `[half][pixel, bin]`; None without counts.
+        batches: Mean counts by each batch of photons, `[half][batch][pixel, bin]`.
+        variance: Of the counts, by both halves.
+    """
+
+    trials: Rows
+    slopes: list[Rows]
+    rest: list[Rows] | None
+    batches: list[list[Rows]]
+    variance: Rows
+
+
+def means_of(
+    law: Law, halves: list[Half], trials: Rows | None, counts: NDArray[np.integer] | None, *, pulses: float
+) -> Means:
+    """Of a rendering, for several `equations` of it; arguments are theirs."""
+    a, b = halves
+    left = planned_pulses(law, 0.5 * (a.rates + b.rates), pulses) if trials is None else trials
+    pixels, unknowns = a.rates.shape[0], a.slopes.shape[0]
+
+    def rows() -> Rows:
+        return np.empty((pixels, law.recorded), np.float32)
+
+    slopes = [np.empty((pixels, unknowns, law.recorded), np.float32) for _ in halves]
+    batches, variance = [[rows() for _ in half.batches] for half in halves], rows()
+    rest = None if counts is None else [rows(), rows()]
 
     def part(chosen: slice) -> None:
-        own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-        found[chosen] = law.slopes(half.first[chosen], own, trials[chosen])
+        trials = left[chosen]
+        for i, half in enumerate(halves):
+            own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+            slopes[i][chosen] = law.slopes(half.first[chosen], own, trials)
+            for mean, rates in zip(batches[i], half.batches, strict=True):
+                mean[chosen] = law.mean(rates[chosen], trials)
+            if rest is not None and counts is not None:
+                rest[i][chosen] = counts[chosen] - law.mean(half.rates[chosen], trials)
+        mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
+        variance[chosen] = law.variance(law.mean(mean_rates, trials), trials)
 
-    list(pool.map(part, parts))
-    return found
+    with ThreadPoolExecutor(core_count()) as pool:
+        list(pool.map(part, _parts(pixels)))
+    return Means(left, slopes, rest, batches, variance)
+
+
+def _parts(pixels: int) -> list[slice]:
+    return [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
 
 
 def _weights(
     law: Law,
     half: Half,
-    slopes: Rows,
-    trials: Rows,
+    number: int,
+    means: Means,
     image: tuple[int, int],
     cells: Sequence[Cell],
     pool: ThreadPoolExecutor,
 ) -> Rows:
     """Derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
-    mean = law.mean(half.first, trials)
-    variance = law.variance(mean, trials)
+    slopes = means.slopes[number]
+    variance = law.variance(means.batches[number][0], means.trials)
     below = {cell: _in_cells(variance, image, cell) for cell in set(cells)}
     found = np.empty_like(slopes)
 

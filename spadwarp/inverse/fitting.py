@@ -36,7 +36,9 @@ Progress = Callable[[str, int, int], None]
 PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
 _COARSE, _FINE = 16, 8  # renderings at most
 BATCHES = 4  # of photons in each half
+_SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
 _CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
+_LEFT = 0.01  # gain for each unknown that a further step would bring: a seventh of a standard error
 SIMULATION = 0.1  # of the variance by the counts
 _STEP = {"log": 1.1, "depth": 0.05, "anisotropy": 0.05}
 
@@ -122,7 +124,7 @@ class _State:
 
     def move(self, one: Unknown, step: Any) -> None:
         """Takes a step on the scale that is searched."""
-        largest = _STEP["log" if one.is_positive else "depth" if one.name == DEPTH else "anisotropy"]
+        largest = _STEP[_kind(one)]
         step = np.clip(np.nan_to_num(step), -largest, largest)
         value = self.values[one.name]
         value = value * np.exp(step) if one.is_positive else value + step
@@ -131,6 +133,11 @@ class _State:
         if one.name == "medium.anisotropy":
             value = np.clip(value, -0.99, 0.99)
         self.values[one.name] = value if one.per_pixel else float(value)
+
+
+def _kind(one: Unknown) -> str:
+    """The scale on which an unknown is searched."""
+    return "log" if one.is_positive else "depth" if one.name == DEPTH else "anisotropy"
 
 
 class Fitter:
@@ -223,14 +230,15 @@ class Fitter:
     # Iterations
 
     def _approach(self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]) -> None:
-        """Coarse steps of the shared unknowns, with few photons, until a step is within the noise or small."""
+        """Coarse steps of the shared unknowns, with few photons at first, until Fisher scoring can do the rest."""
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
         if not shared:
             return
-        blocks, photons = blocks_of(self._image), max(self.photons // 16, 1000)
+        blocks, photons = blocks_of(self._image), self.photons // 128
         largest = np.array([0.7 if self.unknowns[i].is_positive else 0.02 for i in shared])
         assert self.exposure.counts is not None
         for _ in range(_COARSE):
+            photons = max(photons, 1000)
             (half,) = self.render(state.values, photons=photons, halves=1)
             scales = state.scales(self.unknowns, 1)[0]
             cells = in_cells(self.law, half, trials, self.exposure.counts, scales, blocks)
@@ -242,16 +250,17 @@ class Fitter:
             for i, one in zip(shared, step, strict=True):
                 state.move(self.unknowns[i], one)
             report(", ".join(f"{name} {value:.4g}" for name, value in state.shared().items()))
-            if (np.abs(step) < np.maximum(2.0 * error, 0.1 * largest)).all():
+            if (np.abs(step) < np.maximum(2.0 * error, _SETTLED * largest)).all():
                 return
+            photons = min(2 * photons, self.photons // 16)
 
     def _refine(
         self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]
     ) -> tuple[list[Half], Solution, bool]:
-        """Fisher scoring with fresh photons, more of them where the simulation is noisy."""
+        """Fisher scoring with fresh photons: few at first, as many as the noise of the simulation asks for at last."""
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
-        photons, converged, level = max(self.photons // 4, 8000), False, None
-        for number in range(_FINE):
+        photons, level = max(self.photons // 16, 8000), None
+        for _ in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
             level, _, solution = solved(
                 self.unknowns,
@@ -265,18 +274,28 @@ class Fitter:
                 counts=self.exposure.counts,
                 pulses=self.exposure.pulses,
             )
-            gain = solution.gain
+            gain, left = solution.gain, self._left(solution)
             state.iterations.append(Iteration(values=state.shared(), gain=gain, photons=photons, coarse=False))
             self._step(state, solution)
             report(", ".join(f"{name} {value:.5g}" for name, value in state.shared().items()))
-            converged = gain <= _CONVERGED * max(len(shared), 1)
-            noise = solution.simulation_share
-            more = min(self.photons, int(photons * noise / (0.8 * SIMULATION)))
-            if noise > SIMULATION and more > 1.2 * photons and number < _FINE - 1:
-                photons = more
-            elif converged:
+            size = max(len(shared), 1)
+            converged = gain <= _CONVERGED * size or left <= _LEFT * size
+            needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
+            more = min(needed, self.photons, needed if converged else 4 * photons)
+            noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
+            if converged and not noisy:
                 break
+            photons = max(photons, more)
         return halves, solution, converged
+
+    def _left(self, solution: Solution) -> float:
+        """What the log-likelihood can still gain after the step: Newton's error is the square of the step."""
+        shared = [one for one in self.unknowns if not one.per_pixel]
+        if len(shared) < len(self.unknowns):
+            return solution.gain
+        straight = {"log": 0.5, "depth": self.render.depth_step, "anisotropy": 0.025}
+        parts = [step / straight[_kind(one)] for one, step in zip(shared, solution.shared, strict=True)]
+        return solution.gain * min(float(np.max(np.square(parts))), 1.0)
 
     def _step(self, state: _State, solution: Solution) -> None:
         shared, own = iter(solution.shared), iter(solution.own.T)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.inverse.equations import Cell, Equations, equations
+from spadwarp.inverse.equations import Cell, Equations, equations, means_of
 from spadwarp.inverse.solving import Solution, solve
 from spadwarp.inverse.unknowns import DEPTH, Unknown
 
@@ -38,34 +38,38 @@ def solved(
     prior: tuple[Floats, Floats],
     **given: Any,
 ) -> Solved:
-    """The equations with the cells of a level, or of that with the least standard errors.
+    """The equations with the cells that have the least standard errors, from coarse to fine.
 
     Args:
         unknowns: In the order of the slopes.
         scales: Their units, `[pixel, unknown]`.
-        level: Of `LEVELS`; None: all are tried.
+        level: The coarsest that is tried, of `LEVELS`, as one of an earlier rendering; None: the coarsest of all.
         image: (height, width).
         prior: Score and information, see `solve`.
         given: Other arguments of `spadwarp.inverse.equations.equations`.
     """
     is_own = np.array([one.per_pixel for one in unknowns])
     pull, information = prior
+    arguments = (given["law"], given["halves"], given["trials"], given["counts"])
+    means = means_of(*arguments, pulses=given["pulses"])
     best, least = None, np.inf
-    for size in _levels(unknowns, image) if level is None else (level,):
-        own = equations(image=image, cells=[_cell(one, size) for one in unknowns], **given).times(scales)
+    for size in reversed(_levels(unknowns, image, level)):
+        cells = [_cell(one, size) for one in unknowns]
+        own = equations(image=image, cells=cells, means=means, **given).times(scales)
         solution = solve(own, is_own, prior=information, pull=pull)
         variances = np.diag(solution.covariance)
         total = float(np.log(np.maximum(variances, 1e-300)).sum()) if (variances > 0).all() else np.inf
-        if best is None or total < least:
-            best, least = Solved(size, own, solution), total
+        if best is not None and np.isfinite(least) and total >= least:
+            break
+        best, least = Solved(size, own, solution), total
     assert best is not None
     return best
 
 
-def _levels(unknowns: Sequence[Unknown], image: tuple[int, int]) -> tuple[int, ...]:
+def _levels(unknowns: Sequence[Unknown], image: tuple[int, int], coarsest: int | None) -> tuple[int, ...]:
     if all(one.per_pixel for one in unknowns):
         return (1,)
-    return tuple(size for size in LEVELS if size <= max(image))
+    return tuple(size for size in LEVELS if size <= (max(image) if coarsest is None else coarsest))
 
 
 def _cell(one: Unknown, size: int) -> Cell:
