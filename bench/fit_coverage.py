@@ -1,16 +1,20 @@
 """How often the 95 % intervals of fits hold the truth: one simulation, many draws of counts, a fit of each.
 
-python bench/fit_coverage.py staircase_5m --exposures 100 --device cuda:0
+python bench/fit_coverage.py staircase_5m --exposures 100 --device cuda:0 --rows staircase.jsonl
+python bench/fit_coverage.py summary --rows staircase.jsonl harbour.jsonl tank.jsonl
 
 64 x 64 pixels, as many pulses as make the Cramér–Rao bounds of absorption and scattering 1 %, g known; absorption,
 scattering, reflectance and depth unknown. harbour_5m has a target calibrated to 1 % (a prior whose mean is drawn anew
-for each exposure): there, its reflectance and the absorption are nearly the same unknown. The first fit starts from
-water that is wrong by a factor of 3, the others from its estimates; all take fresh photons.
+for each exposure): there, its reflectance and the absorption are nearly the same unknown. Every fit starts from water
+that is wrong by a factor of 3, absorption and scattering in turn too large, and takes photons of its own. Several
+processes share the exposures (`--first 0 --every 2`, `--first 1 --every 2`) and the simulation (`--light FILE`).
 """
 
 import argparse
+import json
 import time
 import warnings
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import binom
@@ -69,76 +73,115 @@ def pulses_for_one_percent(scene, calibrated, photons, device):
     return int(1e9)
 
 
-def main(name, exposures, device, photons, truth_photons, seconds):
+def wrong_start(scene, number):
+    factor = 3.0 if number % 2 else 1 / 3
+    return {
+        "medium.absorption": factor * scene.medium.absorption,
+        "medium.scattering": scene.medium.scattering / factor,
+        "depth": 0.01 if number % 4 < 2 else -0.01,
+    }
+
+
+def light_of(scene, path, photons, device):
+    """The expectation that counts are drawn from, of a file if there is one."""
+    if path is not None and path.is_file():
+        return spadwarp.load(path)
+    light = spadwarp.simulate(scene, photons=photons, seed=1234, device=device)
+    if path is not None:
+        light.save(path)
+    return light
+
+
+def main(asked):
     warnings.simplefilter("ignore", spadwarp.errors.SpadwarpWarning)
-    began, scene = time.perf_counter(), load(name)
+    began, name, device, scene = time.perf_counter(), asked.scene, asked.device, load(asked.scene)
     calibrated = name == "harbour_5m"
     reflectance = scene.targets[0].reflectance
-    pulses = pulses_for_one_percent(scene, calibrated, photons // 4, device)
-    truth = spadwarp.simulate(scene, photons=truth_photons, seed=1234, device=device)
-    known = {
-        "medium.absorption": scene.medium.absorption,
-        "medium.scattering": scene.medium.scattering,
-        "targets[0].reflectance": reflectance,
-    }
-    start, rows, times, shares = None, [], [], []
-    for number in range(exposures):
-        if time.perf_counter() - began > seconds:
+    pulses = pulses_for_one_percent(scene, calibrated, int(asked.photons) // 4, device)
+    many = (12e9 if calibrated else 3e9) if asked.truth_photons is None else asked.truth_photons
+    light = light_of(scene, asked.light, int(many), device)
+    centroid = float(np.nanmedian(spadwarp.frames.depth_frame(light) - light.truth.depth))
+    print(
+        f"{name}: {pulses} pulses; centroid {1e3 * centroid:+.2f} mm; ready after {time.perf_counter() - began:.1f} s"
+    )
+    for number in range(asked.first, asked.exposures, asked.every):
+        if time.perf_counter() - began > asked.seconds:
             break
-        frames = spadwarp.detect(truth, pulses=pulses, seed=1000 + number, device=device)
+        frames = spadwarp.detect(light, pulses=pulses, seed=1000 + number, device=device)
         measured = float(np.random.default_rng(number).normal(reflectance, CALIBRATED))
         prior = {"targets[0].reflectance": (measured, CALIBRATED)} if calibrated else None
-        choices = {"prior": prior, "photons": photons, "seed": 5000 + number, "device": device}
-        fitter = Fitter(scene, f"{WATER},depth", read_exposure(frames, scene), **choices)
-        if start is None:
-            wrong = {"medium.absorption": 3 * scene.medium.absorption, "medium.scattering": scene.medium.scattering / 3}
-            fit = fitter.fit(start=wrong)
-            start = {one: fit.estimates[one].value for one in known}
-            start["depth"] = float(np.nanmean(fit.depth - truth.truth.depth))
-            print(
-                f"{name}: {pulses} pulses, {fit.counts.sum()} counts; from a wrong start {fit.seconds:.2f} s",
-                flush=True,
-            )
-        else:
-            fit = fitter.fit(start=start, near=True)
-        depth = fit.estimates["depth"].value - float(np.nanmean(fit.depth - truth.truth.depth))
-        rows.append(
-            [
-                (one.value, true, one.standard_error, one.interval[0] <= true <= one.interval[1])
-                for one, true in ((fit.estimates[one], true) for one, true in {**known, "depth": depth}.items())
-            ]
+        choices = {"prior": prior, "photons": int(asked.photons), "seed": 5000 + number, "device": device}
+        fit = Fitter(scene, f"{WATER},depth", read_exposure(frames, scene), **choices).fit(
+            start=wrong_start(scene, number)
         )
-        times.append(fit.seconds)
-        shares.append(max(one.simulation for one in fit.estimates.values()))
-    values = np.array(rows, float)
-    print(
-        f"{name}: {len(rows)} fits; median {np.median(times):.2f} s, simulation {100 * np.median(shares):.2g} % of "
-        "the largest variance"
-    )
-    for column, one in enumerate([*known, "depth"]):
-        value, true, error, inside = values[:, column].T
-        hits, total = int(inside.sum()), len(rows)
-        p = min(1.0, 2 * min(binom.cdf(hits, total, 0.95), binom.sf(hits - 1, total, 0.95)))
-        scale, unit = (1e3, "mm") if one == "depth" else (100 / true, "%")
-        off, stated = scale * (value - true), scale * error
-        beyond = np.abs(off) > np.maximum(2.0 if unit == "%" else 1.0, 2 * stated)
+        true = {
+            "medium.absorption": scene.medium.absorption,
+            "medium.scattering": scene.medium.scattering,
+            "targets[0].reflectance": reflectance,
+            "depth": fit.estimates["depth"].value - float(np.nanmean(fit.depth - light.truth.depth)),
+        }
+        row = {
+            "scene": name,
+            "number": number,
+            "seconds": fit.seconds,
+            "photons": fit.photons,
+            "iterations": [(int(one.coarse), one.photons, round(one.gain, 3)) for one in fit.iterations],
+            "converged": fit.converged,
+            "centroid": centroid,
+            "counts": int(fit.counts.sum()),
+            "estimates": {
+                one: (fit.estimates[one].value, value, fit.estimates[one].standard_error, *fit.estimates[one].interval)
+                for one, value in true.items()
+            },
+            "simulation": {one: fit.estimates[one].simulation for one in true},
+        }
+        with open(asked.rows[0], "a") as file:
+            file.write(json.dumps(row, default=float) + "\n")
+
+
+def summary(paths):
+    """A table of all rows, with the p-value of each coverage and the smallest one corrected for their number."""
+    rows = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+    values = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        own = list({row["number"]: row for row in rows if row["scene"] == scene}.values())
+        seconds = np.median([row["seconds"] for row in own])
+        share = np.median([max(row["simulation"].values()) for row in own])
         print(
-            f"  {one:24s} {hits}/{total} covered (p {p:.2g}); error {off.mean():+.3f} ± "
-            f"{off.std(ddof=1) / total**0.5 if total > 1 else 0:.3f} {unit}; scatter "
-            f"{off.std(ddof=1) if total > 1 else 0:.3f}, stated {stated.mean():.3f}; largest {np.abs(off).max():.2f}; "
-            f"{beyond.sum()} beyond 2 bounds and {'1 mm' if unit == 'mm' else '2 %'}"
+            f"{scene}: {len(own)} fits, {sum(row['converged'] for row in own)} converged; median {seconds:.2f} s, "
+            f"{np.median([row['photons'] for row in own]):.2e} photons, {np.median([row['counts'] for row in own]):.0f}"
+            f" counts; simulation {100 * share:.2g} % of the largest variance; centroid {1e3 * own[0]['centroid']:+.2f}"
+            " mm"
         )
-    centroid = spadwarp.frames.depth_frame(truth) - truth.truth.depth
-    print(f"  bias of the centroid {1e3 * np.nanmedian(centroid):.2f} mm; {time.perf_counter() - began:.0f} s in all")
+        for name in own[0]["estimates"]:
+            value, true, error, low, high = np.array([row["estimates"][name] for row in own]).T
+            hits, total = int(((low <= true) & (true <= high)).sum()), len(own)
+            p = min(1.0, 2 * min(binom.cdf(hits, total, 0.95), binom.sf(hits - 1, total, 0.95)))
+            values.append(p)
+            scale, unit = (1e3, "mm") if name == "depth" else (100 / true[0], "%")
+            off, stated, z = scale * (value - true), scale * error, (value - true) / error
+            beyond = np.abs(off) > np.maximum(2.0 if unit == "%" else 1.0, 2 * stated)
+            root = max(total - 1, 1) ** 0.5
+            print(
+                f"  {name:24s} {hits}/{total} covered, p {p:.3f}; bias {z.mean():+.2f} ± {z.std() / root:.2f} bounds, "
+                f"{off.mean():+.4f} ± {off.std() / root:.4f} {unit}; scatter {off.std():.4f}, stated "
+                f"{stated.mean():.4f}; largest {np.abs(off).max():.3f}; {beyond.sum()} beyond 2 bounds and "
+                f"{'1 mm' if unit == 'mm' else '2 %'}"
+            )
+    print(f"smallest p of {len(values)}, corrected for their number: {min(1.0, len(values) * min(values)):.3g}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", choices=("harbour_5m", "staircase_5m", "tank"))
+    parser.add_argument("scene", choices=("harbour_5m", "staircase_5m", "tank", "summary"))
+    parser.add_argument("--rows", type=Path, nargs="+", required=True, help="files of one JSON line a fit")
     parser.add_argument("--exposures", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--light", type=Path, help="file of the simulation; written if it does not exist")
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--photons", type=float, default=4e8, help="of an iteration at most")
-    parser.add_argument("--truth-photons", type=float, default=3e9)
+    parser.add_argument("--truth-photons", type=float, help="by default 3e9, harbour_5m 1.2e10")
     parser.add_argument("--seconds", type=float, default=1e9, help="no further exposure begins after so long")
     asked = parser.parse_args()
-    main(asked.scene, asked.exposures, asked.device, int(asked.photons), int(asked.truth_photons), asked.seconds)
+    summary(asked.rows) if asked.scene == "summary" else main(asked)
