@@ -35,6 +35,7 @@ Progress = Callable[[str, int, int], None]
 
 PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
 _COARSE, _FINE = 16, 8  # renderings at most
+_FEWEST, _FEW = 128, 16  # divide the photons: of the first coarse rendering; of the last one and the first fine one
 BATCHES = 4  # of photons in each half
 _SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
 _CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
@@ -234,7 +235,7 @@ class Fitter:
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
         if not shared:
             return
-        blocks, photons = blocks_of(self._image), self.photons // 128
+        blocks, photons = blocks_of(self._image), self.photons // _FEWEST
         largest = np.array([0.7 if self.unknowns[i].is_positive else 0.02 for i in shared])
         assert self.exposure.counts is not None
         for _ in range(_COARSE):
@@ -252,14 +253,14 @@ class Fitter:
             report(", ".join(f"{name} {value:.4g}" for name, value in state.shared().items()))
             if (np.abs(step) < np.maximum(2.0 * error, _SETTLED * largest)).all():
                 return
-            photons = min(2 * photons, self.photons // 16)
+            photons = min(2 * photons, self.photons // _FEW)
 
     def _refine(
         self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]
     ) -> tuple[list[Half], Solution, bool]:
         """Fisher scoring with fresh photons: few at first, as many as the noise of the simulation asks for at last."""
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
-        photons, level = max(self.photons // 16, 8000), None
+        photons, level = max(self.photons // _FEW, 8000), None
         for _ in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
             level, _, solution = solved(
