@@ -166,7 +166,9 @@ def bounds(
     found, maps, alone_maps = _table(unknowns, values, scales, own, solution, image)
     covariance = _inverse(solution.information)
     names = [one.name for one in shared]
-    warnings = not_identifiable(names, covariance, [values[name] > 0 and name != DEPTH for name in names])
+    warnings = render.warnings() + not_identifiable(
+        names, covariance, [values[name] > 0 and name != DEPTH for name in names]
+    )
     if solution.simulation_share > SIMULATION:
         share = 100 * solution.simulation_share
         warnings.append(f"the noise of the simulation is {share:.2g} % of that of the counts, above 10 %: more photons")

@@ -204,6 +204,7 @@ class Fitter:
             edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
             photons=self.render.photons - first,
             seconds=time.perf_counter() - began,
+            warnings=self.render.warnings(),
         )
 
     def _all_pulses(self) -> NDArray[np.float32]:

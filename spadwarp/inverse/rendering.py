@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Half", "Renderer", "Values"]
 
 Rows = NDArray[np.float32]
+_WIDEST_BIN = 0.5  # least width of the response in bins, for a histogram that follows the depth smoothly
 Values = Mapping[str, Any]
 """By name a number, or for an unknown of each pixel `[pixel]`; depth as a shift from the scene's [m]."""
 
@@ -79,9 +80,24 @@ class Renderer:
     def __post_init__(self) -> None:
         if self.depth_step == 0.0:
             # Half the response, where the slopes are steep and the histogram is still nearly straight between the two.
-            response = detector_response(self.scene.detector, self.scene.laser)
-            sigma = response.fwhm / 2.355 if response.is_smooth else 0.0
+            sigma = self._response_width / 2.355
             self.depth_step = 0.25 * self.scene.medium.pulse_speed * max(sigma, 0.5 * self.scene.gate.bin_width)
+
+    @property
+    def _response_width(self) -> float:
+        """Full width at half maximum of the instrument response [s]; 0 of a delta."""
+        response = self.exposure.irf or detector_response(self.scene.detector, self.scene.laser)
+        return response.fwhm if response.is_smooth else 0.0
+
+    def warnings(self) -> list[str]:
+        """Sentences on what the linear model of the bins does not cover."""
+        width, bin_width = self._response_width, self.scene.gate.bin_width
+        if width >= _WIDEST_BIN * bin_width or all(one.name != DEPTH for one in self.unknowns):
+            return []
+        return [
+            f"depth: the instrument response, {width * 1e12:.3g} ps, is much shorter than a bin, "
+            f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, and the standard error of the depth is too small"
+        ]
 
     @property
     def window(self) -> Window:

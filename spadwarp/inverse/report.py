@@ -50,8 +50,9 @@ def estimates_of(
     edges: Floats,
     photons: int,
     seconds: float,
+    warnings: Sequence[str] = (),
 ) -> Fit:
-    """The fit from its last values and the solution of its equations there."""
+    """The fit from its last values and the solution of its equations there; `warnings`: of the renderer."""
     image = (scene.camera.height, scene.camera.width)
     fitted = with_values(scene, {name: float(np.nanmean(value)) for name, value in values.items()})
     middle = middle_depth(truth.depth)
@@ -90,7 +91,7 @@ def estimates_of(
         covariance=solution.covariance,
         iterations=tuple(iterations),
         converged=converged,
-        warnings=_warnings(names, solution, shared, prior, converged),
+        warnings=(*warnings, *_warnings(names, solution, shared, prior, converged)),
         depth=depth,
         counts=exposure.counts.reshape(*image, -1),
         expected=expected.reshape(*image, -1),

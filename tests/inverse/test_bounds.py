@@ -69,3 +69,11 @@ def test_of_a_pixels_depth_know_of_the_water():
     assert together.shape == (8, 8) and np.isfinite(together).all()
     assert (together > 0.99 * alone).all()
     assert found.bounds["depth"].per_pixel and found.names == list(found.bounds)[:3]
+
+
+def test_bins_much_wider_than_the_response_are_named():
+    """Where in its bin a return lies is not in the counts."""
+    wide = plate({"gate.bin_width_ps": 1000.0, "gate.bins": 20})
+    for unknown, named in (("depth", True), ("reflectance", False)):
+        found = bounds(wide, unknown=unknown, photons=2000, device="cpu")
+        assert any("much shorter than a bin" in text for text in found.warnings) == named
