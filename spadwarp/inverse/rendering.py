@@ -96,7 +96,8 @@ class Renderer:
             return []
         return [
             f"depth: the instrument response, {width * 1e12:.3g} ps, is much shorter than a bin, "
-            f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, and the standard error of the depth is too small"
+            f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, "
+            "and the standard error of the depth is too small"
         ]
 
     @property
