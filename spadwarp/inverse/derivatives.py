@@ -10,23 +10,30 @@ from spadwarp.transport import ExpectedLight, LightTracer
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["central_difference"]
+__all__ = ["DepthDifference"]
 
 
-def central_difference(
-    scene: Scene, step: float, *, first: int, photons: int, kept: dict[str, Any], **choices: Any
-) -> ExpectedLight:
+class DepthDifference:
     """Derivative by the depth of the targets [1/m], from two runs with the same photons and the targets at ± `step`.
 
-    `choices`: arguments of `LightTracer`.
+    Args:
+        scene: With the targets in the middle.
+        step: [m].
+        kept: Meshes of earlier scenes.
+        choices: Other arguments of `LightTracer`.
     """
-    far, near = (
-        LightTracer(moved(scene, sign * step), photons=photons, kept=kept.setdefault(name, {}), **choices)(
-            first, photons
-        )[0]
-        for name, sign in (("far", 1.0), ("near", -1.0))
-    )
-    return ExpectedLight(_slope(far.total, near.total, step), _slope(far.target, near.target, step))
+
+    def __init__(self, scene: Scene, step: float, *, kept: dict[str, Any], **choices: Any) -> None:
+        self._step = step
+        self._far, self._near = (
+            LightTracer(moved(scene, sign * step), kept=kept.setdefault(name, {}), **choices)
+            for name, sign in (("far", 1.0), ("near", -1.0))
+        )
+
+    def __call__(self, first: int, photons: int) -> ExpectedLight:
+        """By the photons `first` … `first + photons`."""
+        far, near = (tracer(first, photons)[0] for tracer in (self._far, self._near))
+        return ExpectedLight(_slope(far.total, near.total, self._step), _slope(far.target, near.target, self._step))
 
 
 def _slope(far: Any, near: Any, step: float) -> Any:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device
 from spadwarp.frames import InstrumentResponse, Receiver, detector_response
 from spadwarp.frames.window import Window
-from spadwarp.inverse.derivatives import central_difference
+from spadwarp.inverse.derivatives import DepthDifference
 from spadwarp.inverse.shifting import shifted
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, with_values
 from spadwarp.scene import noise_rate
@@ -76,6 +76,7 @@ class Renderer:
     truth: Truth | None = None
     photons: int = 0
     _kept: dict[str, Any] = field(default_factory=dict)
+    _tally: Any = None
 
     def __post_init__(self) -> None:
         if self.depth_step == 0.0:
@@ -118,6 +119,9 @@ class Renderer:
         names = [one.name for one in self.unknowns if one.is_light]
         scored = self._tracer(scene, photons, names)
         plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
+        depth = None
+        if any(one.name == DEPTH for one in self.unknowns):
+            depth = DepthDifference(scene, self.depth_step, photons=photons, kept=self._kept, **self._choices)
         self.truth = scored.truth
         receiver = self._receiver(scene, values)
         place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
@@ -125,9 +129,8 @@ class Renderer:
         for _ in range(halves):
             number = self._take(photons)
             light, slopes = scored(number, photons)
-            if any(one.name == DEPTH for one in self.unknowns):
-                choices: Any = {"seed": self.seed, "device": self.device, "apart": self.apart, "kept": self._kept}
-                slopes[DEPTH] = central_difference(scene, self.depth_step, first=number, photons=photons, **choices)
+            if depth is not None:
+                slopes[DEPTH] = depth(number, photons)
             first = _rates(receiver, light, place)
             group = [first]
             for _ in range(batches - 1):
@@ -146,15 +149,15 @@ class Renderer:
         return first
 
     def _tracer(self, scene: Scene, photons: int, names: Sequence[str]) -> LightTracer:
-        return LightTracer(
-            scene,
-            photons=photons,
-            seed=self.seed,
-            device=self.device,
-            derivatives=names,
-            apart=self.apart,
-            kept=self._kept.setdefault("scored" if names else "plain", {}),
-        )
+        kept = self._kept.setdefault("scored" if names else "plain", {})
+        tracer = LightTracer(scene, photons=photons, derivatives=names, kept=kept, **self._choices)
+        self._tally = tracer.tally
+        return tracer
+
+    @property
+    def _choices(self) -> dict[str, Any]:
+        """Of all tracers; one tally serves them in turn."""
+        return {"seed": self.seed, "device": self.device, "apart": self.apart, "tally": self._tally}
 
     def _with_focus(self, scene: Scene) -> Scene:
         """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved."""

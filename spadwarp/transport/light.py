@@ -36,6 +36,7 @@ class LightTracer:
         derivatives: Names, as in `simulate`.
         apart: Whether the light of the targets is wanted apart.
         kept: As in `simulate`.
+        tally: That of another tracer of as many pixels and bins, to save memory: a call empties it.
 
     Raises what `simulate` raises.
     """
@@ -50,6 +51,7 @@ class LightTracer:
         derivatives: Sequence[str] = (),
         apart: bool = False,
         kept: dict[str, Any] | None = None,
+        tally: Any = None,
     ) -> None:
         plan = make_plan(
             scene,
@@ -63,10 +65,15 @@ class LightTracer:
             launch_size=None,
             derivatives=derivatives or None,
         )
-        workers = LocalWorkers(plan, pick_devices(device)[:1], kept=kept)
+        workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, kept=kept)
         self._scene, self._apart, self._unit = scene, apart, 1.0 / plan.scale
         self._names, self._worker = plan.derivatives, workers.workers[0]
         self.truth: Truth = workers.truth()
+
+    @property
+    def tally(self) -> Any:
+        """Warp int64, of the photons traced last."""
+        return self._worker.data.tally
 
     def __call__(self, first: int, photons: int) -> tuple[ExpectedLight, dict[str, ExpectedLight]]:
         """Light of the photons `first` … `first + photons`, and its derivatives by name with the same photons."""
