@@ -98,7 +98,7 @@ def main(asked):
     calibrated = name == "harbour_5m"
     reflectance = scene.targets[0].reflectance
     pulses = pulses_for_one_percent(scene, calibrated, int(asked.photons) // 4, device)
-    many = (8e9 if calibrated else 3e9) if asked.truth_photons is None else asked.truth_photons
+    many = (6e9 if calibrated else 3e9) if asked.truth_photons is None else asked.truth_photons
     light = light_of(scene, asked.light, int(many), device)
     centroid = float(np.nanmedian(spadwarp.frames.depth_frame(light) - light.truth.depth))
     print(
@@ -181,7 +181,7 @@ if __name__ == "__main__":
     parser.add_argument("--light", type=Path, help="file of the simulation; written if it does not exist")
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--photons", type=float, default=4e8, help="of an iteration at most")
-    parser.add_argument("--truth-photons", type=float, help="by default 3e9, harbour_5m 8e9")
+    parser.add_argument("--truth-photons", type=float, help="by default 3e9, harbour_5m 6e9")
     parser.add_argument("--seconds", type=float, default=1e9, help="no further exposure begins after so long")
     asked = parser.parse_args()
     summary(asked.rows) if asked.scene == "summary" else main(asked)

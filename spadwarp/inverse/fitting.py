@@ -35,7 +35,7 @@ Progress = Callable[[str, int, int], None]
 
 PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
 _COARSE, _FINE = 16, 8  # renderings at most
-_FEWEST, _FEW = 128, 16  # divide the photons: of the first coarse rendering; of the last one and the first fine one
+_FEWEST, _FEWER, _FEW = 128, 32, 16  # divide the photons: of the first coarse rendering, the last, the first fine one
 BATCHES = 4  # of photons in each half
 _SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
 _CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
@@ -254,7 +254,7 @@ class Fitter:
             report(", ".join(f"{name} {value:.4g}" for name, value in state.shared().items()))
             if (np.abs(step) < np.maximum(2.0 * error, _SETTLED * largest)).all():
                 return
-            photons = min(2 * photons, self.photons // _FEW)
+            photons = min(2 * photons, self.photons // _FEWER)
 
     def _refine(
         self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]
@@ -283,7 +283,7 @@ class Fitter:
             size = max(len(shared), 1)
             converged = gain <= _CONVERGED * size or left <= _LEFT * size
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
-            more = min(needed, self.photons, needed if converged else 4 * photons)
+            more = min(needed, self.photons, needed if left <= _CONVERGED * size else 4 * photons)
             noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
             if converged and not noisy:
                 break
