@@ -179,7 +179,7 @@ def _leaves_frames_empty(depth: ArrayLike, gate: tuple[float, float], part: tupl
         margin = MARGIN * (stop - start)
         with np.errstate(invalid="ignore"):
             near = (values > 0) & (values >= start - margin) & (values <= stop + margin)
-        return near.any(axis=(-2, -1))  # type: ignore[no-any-return]
+        return np.asarray(near.any(axis=(-2, -1)))
 
     return bool((reports(*gate) & ~reports(*part)).any())
 
