@@ -59,22 +59,38 @@ def inverse_direction(u: wp.vec3) -> wp.vec3:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4* box = reinterpret_cast<const float4*>(nodes.data) + 4 * node + 2 * child;
-    const float4 lower = __ldg(box), upper = __ldg(box + 1);
-    const float a = lower.x * inverse[0] - shift[0], b = upper.x * inverse[0] - shift[0];
-    const float c = lower.y * inverse[1] - shift[1], d = upper.y * inverse[1] - shift[1];
-    const float e = lower.z * inverse[2] - shift[2], f = upper.z * inverse[2] - shift[2];
-    return wp::vec3(
-        fmaxf(fmaxf(fminf(a, b), fminf(c, d)), fmaxf(fminf(e, f), 0.0f)),
-        fminf(fminf(fmaxf(a, b), fmaxf(c, d)), fminf(fmaxf(e, f), reach)),
-        lower.w);
+    const float4* box = reinterpret_cast<const float4*>(nodes.data) + 8 * node;
+    // Of the rows of lower and upper corners, those that a ray in this direction meets first.
+    const int x = inverse[0] < 0.0f ? 3 : 0, y = inverse[1] < 0.0f ? 4 : 1, z = inverse[2] < 0.0f ? 5 : 2;
+    const float4 x0 = __ldg(box + x), y0 = __ldg(box + y), z0 = __ldg(box + z);
+    const float4 x1 = __ldg(box + 3 - x), y1 = __ldg(box + 5 - y), z1 = __ldg(box + 7 - z);
+    const auto entry = [&](float a, float b, float c, float d, float e, float f) {
+        const float in = fmaxf(fmaxf(a * inverse[0] - shift[0], b * inverse[1] - shift[1]),
+                               fmaxf(c * inverse[2] - shift[2], 0.0f));
+        const float out = fminf(fminf(d * inverse[0] - shift[0], e * inverse[1] - shift[1]),
+                                fminf(f * inverse[2] - shift[2], reach));
+        return in <= out ? in : 1.0e30f;
+    };
+    return wp::vec4(
+        entry(x0.x, y0.x, z0.x, x1.x, y1.x, z1.x), entry(x0.y, y0.y, z0.y, x1.y, y1.y, z1.y),
+        entry(x0.z, y0.z, z0.z, x1.z, y1.z, z1.z), entry(x0.w, y0.w, z0.w, x1.w, y1.w, z1.w));
 #else
-    return wp::vec3(1.0f, 0.0f, 0.0f);
+    return wp::vec4(1.0e30f);
 #endif
 """)
-def box_span(
-    nodes: wp.array(dtype=wp.vec4), node: int, child: int, inverse: wp.vec3, shift: wp.vec3, reach: float
-) -> wp.vec3:
-    """Where a ray enters and leaves the box of a child, within [0, reach], and the child's bits; it misses where the
-    first exceeds the second. CUDA alone."""
+def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shift: wp.vec3, reach: float) -> wp.vec4:
+    """Where a ray enters the boxes of four children, within [0, reach]; 1e30 for those that it misses. CUDA alone."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 child = __ldg(reinterpret_cast<const float4*>(nodes.data) + 8 * node + 6);
+    return wp::vec4(child.x, child.y, child.z, child.w);
+#else
+    return wp::vec4(-1.0f);
+#endif
+""")
+def box_children(nodes: wp.array(dtype=wp.vec4), node: int) -> wp.vec4:
+    """The bits of the four children of a node. CUDA alone."""
     ...

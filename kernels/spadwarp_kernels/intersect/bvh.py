@@ -7,9 +7,10 @@ a kernel moves on by a step, `step_node` or `step_leaf`: all lanes that are in n
 leaves, and new rays join while old ones still walk (Aila & Laine, High-Performance Graphics 2009, on what the order of
 steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
 
-Nodes stand in pairs of four vec4: lower and upper corner of the first child, then of the second. The fourth component
-of a lower corner holds the bits of the child: the index of its own pair, or -2 - slot of its first face. Faces are
-three vec4 each, see `face_distance`, in the order of the leaves.
+A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice. It is
+eight vec4, a line of a GPU's cache: lower x, y, z and upper x, y, z of the four, and their bits: the index of a node,
+-2 - slot of a leaf's first face, or NO_NODE; the last is not used. Faces are three vec4 each, see `face_distance`, in
+the order of the leaves.
 """
 
 import numpy as np
@@ -17,118 +18,118 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
 
-from .box import box_span
+from .box import box_children, box_entries
+from .pairs import DEEPEST, NO_NODE, NOWHERE, read_tree
 from .triangle import box_padding, face_distance, face_in, pack_faces, set_faces
 
-# What a walk holds in place of a node when it has come to its end: nodes are above, leaves below.
-NO_NODE = wp.constant(-1)
-
-# Nodes that a walk will return to: Warp's trees are at most 32 deep.
-Stack = wp.types.vector(length=34, dtype=int)
-
-
-_NOWHERE = wp.constant(1.0e30)
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
-    const wp::BVHPackedNodeHalf half = upper ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
-    union { float number; int bits; } both;
-    both.bits = static_cast<int32_t>(half.i);
-    return wp::vec4(half.x, half.y, half.z, both.number);
-""")
-def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
-    """A corner of a node's box and the bits of its child, or of the first and last face of a leaf."""
-    ...
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
-    // The linear builder fills all nodes that there are room for, the others count theirs.
-    const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
-    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
-    return m.bvh.node_lowers[node].b ? 1 : 0;
-""")
-def _tree_kind(mesh: wp.uint64, node: int) -> int:
-    """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
-    ...
-
-
-@wp.func_native("return *wp::mesh_get(mesh).bvh.root;")
-def _tree_root(mesh: wp.uint64) -> int: ...
-
-
-@wp.func_native("return wp::mesh_get(mesh).bvh.primitive_indices[slot];")
-def _tree_face(mesh: wp.uint64, slot: int) -> int: ...
+# Nodes that a walk will return to: three a level, and NO_NODE.
+Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
 
 
 @wp.func
-def _with_bits(corner: wp.vec3, bits: int) -> wp.vec4:
-    return wp.vec4(corner[0], corner[1], corner[2], from_bits(bits))
+def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
+    """Of the box of a node [m²]; -1 for a leaf, which cannot be opened."""
+    size = nodes[2 * node + 1] - nodes[2 * node]
+    area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
+    return wp.where(bits_of(nodes[2 * node][3]) >= 0, area, -1.0)
+
+
+@wp.func
+def _set_box(nodes: wp.array(dtype=wp.vec4), node: int, k: int, low: wp.vec3, high: wp.vec3):
+    for axis in range(3):
+        nodes[8 * node + axis][k] = low[axis]
+        nodes[8 * node + 3 + axis][k] = high[axis]
+
+
+@wp.func
+def _child(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
+    return bits_of(nodes[8 * node + 6][k])
 
 
 @wp.kernel(enable_backward=False)
-def _count_kernel(mesh: wp.uint64, has_children: wp.array(dtype=int)):
-    """Launch: nodes that the tree may have."""
+def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4)):
+    """A node of four children for each pair; the largest are opened first. Launch: pairs."""
+    pair = wp.tid()
+    held = wp.vec4i(2 * pair, 2 * pair + 1, -1, -1)
+    for count in range(2, 4):
+        best = int(-1)
+        most = float(0.0)
+        for k in range(count):
+            if held[k] >= 0:
+                area = _surface(pairs, held[k])
+                if area > most:
+                    most = area
+                    best = k
+        if best >= 0:
+            opened = bits_of(pairs[2 * held[best]][3])
+            held[best] = 2 * opened
+            held[count] = 2 * opened + 1
+    for k in range(4):
+        low = wp.vec4(NOWHERE)
+        high = wp.vec4(NOWHERE)
+        child = int(NO_NODE)
+        if held[k] >= 0:
+            low = pairs[2 * held[k]]
+            high = pairs[2 * held[k] + 1]
+            child = bits_of(low[3])
+        _set_box(nodes, pair, k, wp.vec3(low[0], low[1], low[2]), wp.vec3(high[0], high[1], high[2]))
+        nodes[8 * pair + 6][k] = from_bits(child)
+
+
+@wp.kernel(enable_backward=False)
+def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dtype=int)):
+    """Launch: nodes."""
     node = wp.tid()
-    has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
+    if depth[node] == level:
+        for k in range(4):
+            child = _child(nodes, node, k)
+            if child >= 0:
+                depth[child] = level + 1
 
 
-@wp.func
-def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array(dtype=int)):
-    for slot in range(start, stop):
-        face = _tree_face(mesh, slot)
-        order[slot] = wp.where(slot + 1 < stop, ~face, face)
+def node_depths(nodes: wp.array) -> wp.array:
+    """How deep in the tree each node of four stands, int32 [nodes], -1 where no other leads to it."""
+    depth = wp.full(nodes.size // 8, -1, dtype=int, device=nodes.device)
+    depth[:1].zero_()
+    for level in range(DEEPEST + 2):
+        wp.launch(_depth_kernel, depth.size, [nodes, level], outputs=[depth], device=nodes.device)
+    return depth
 
 
 @wp.kernel(enable_backward=False)
-def _pack_kernel(
-    mesh: wp.uint64,
-    padding: float,
-    before: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
+def _flag_kernel(depth: wp.array(dtype=int), used: wp.array(dtype=int)):
+    """Launch: nodes."""
+    used[wp.tid()] = wp.where(depth[wp.tid()] >= 0, 1, 0)
+
+
+@wp.kernel(enable_backward=False)
+def _gather_kernel(
+    wide: wp.array(dtype=wp.vec4), used: wp.array(dtype=int), place: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)
 ):
-    """Launch: nodes that the tree may have. The root's pair is the first; the others stand in the tree's order."""
+    """The nodes that are used, in their order. Launch: nodes."""
     node = wp.tid()
-    kind = _tree_kind(mesh, node)
-    root = _tree_root(mesh)
-    pad = wp.vec3(padding)
-    if kind == 1 and node == root:  # a tree of one leaf
-        lower = _tree_node(mesh, node, False)
-        upper = _tree_node(mesh, node, True)
-        _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
-        nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
-        nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
-        nodes[2] = _with_bits(wp.vec3(_NOWHERE), NO_NODE)
-        nodes[3] = _with_bits(wp.vec3(_NOWHERE), NO_NODE)
-    if kind == 0:
-        # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
-        pair = wp.where(node == root, 0, before[node] + 1)
-        for k in range(2):
-            child = bits_of(_tree_node(mesh, node, k == 1)[3])
-            low = _tree_node(mesh, child, False)
-            high = _tree_node(mesh, child, True)
-            entry = before[child] + 1
-            if _tree_kind(mesh, child) == 1:
-                entry = -2 - bits_of(low[3])
-                _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
-            nodes[4 * pair + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
-            nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
+    if used[node] > 0:
+        for row in range(6):
+            nodes[8 * place[node] + row] = wide[8 * node + row]
+        for k in range(4):
+            child = _child(wide, node, k)
+            if child >= 0:
+                child = place[child]
+            nodes[8 * place[node] + 6][k] = from_bits(child)
 
 
-def read_tree(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array]:
-    """Nodes and order of a mesh's tree, see `pack_bvh`."""
-    count, device = mesh.indices.size // 3, mesh.device
-    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
-    before = wp.zeros_like(has_children)
-    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
-    order = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
-    wp.utils.array_scan(has_children, before, inclusive=False)
-    inputs = [mesh.id, box_padding(extent), before]
-    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
-    return nodes, order
+def _open(pairs: wp.array) -> wp.array:
+    """Nodes of four children, as they are described above, from pairs."""
+    count, device = pairs.size // 4, pairs.device
+    wide = wp.zeros(2 * pairs.size, dtype=wp.vec4, device=device)
+    wp.launch(_open_kernel, count, [pairs], [wide], device=device)
+    used, place = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
+    wp.launch(_flag_kernel, count, [node_depths(wide)], [used], device=device)
+    wp.utils.array_scan(used, place, inclusive=False)
+    kept = int(place[-1:].numpy()[0] + used[-1:].numpy()[0])
+    nodes = wp.zeros(8 * kept, dtype=wp.vec4, device=device)
+    wp.launch(_gather_kernel, count, [wide, used, place], [nodes], device=device)
+    return nodes
 
 
 def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
@@ -139,33 +140,12 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         extent: Its largest coordinate [m], for the padding of the boxes.
 
     Returns:
-        nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
+        nodes: vec4 [8 * nodes], see above; boxes are padded against rounding.
         faces: vec4 [3 * slots], see `face_distance`.
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
     """
-    nodes, order = read_tree(mesh, extent)
-    return nodes, pack_faces(mesh, extent, order), order
-
-
-@wp.kernel(enable_backward=False)
-def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dtype=int)):
-    """Launch: pairs."""
-    pair = wp.tid()
-    if depth[pair] == level:
-        for k in range(2):
-            entry = bits_of(nodes[4 * pair + 2 * k][3])
-            if entry >= 0:
-                depth[entry] = level + 1
-
-
-def pair_depths(nodes: wp.array) -> tuple[wp.array, int]:
-    """How deep in the tree each pair of nodes of `pack_bvh` stands, int32 [pairs], -1 for none, and the number of
-    levels; waits for the device."""
-    depth = wp.full(nodes.size // 4, -1, dtype=int, device=nodes.device)
-    depth[:1].zero_()
-    for level in range(Stack._length_):
-        wp.launch(_depth_kernel, depth.size, [nodes, level], outputs=[depth], device=nodes.device)
-    return depth, int(depth.numpy().max()) + 1
+    pairs, order = read_tree(mesh, extent)
+    return _open(pairs), pack_faces(mesh, extent, order), order
 
 
 @wp.kernel(enable_backward=False)
@@ -177,23 +157,23 @@ def _refit_kernel(
     order: wp.array(dtype=int),
     nodes: wp.array(dtype=wp.vec4),
 ):
-    """Boxes of the pairs of one level, those below being done. Launch: pairs."""
-    pair = wp.tid()
-    if depth[pair] != level:
+    """Boxes of the children of one level's nodes, those below being done. Launch: nodes."""
+    node = wp.tid()
+    if depth[node] != level:
         return
     m = wp.mesh_get(mesh)
-    for k in range(2):
-        entry = bits_of(nodes[4 * pair + 2 * k][3])
-        low = wp.vec3(_NOWHERE)
-        high = wp.vec3(-_NOWHERE)
-        if entry >= 0:
-            for child in range(2):
-                lower = nodes[4 * entry + 2 * child]
-                upper = nodes[4 * entry + 2 * child + 1]
-                low = wp.min(low, wp.vec3(lower[0], lower[1], lower[2]))
-                high = wp.max(high, wp.vec3(upper[0], upper[1], upper[2]))
-        elif entry != NO_NODE:
-            slot = -2 - entry
+    for k in range(4):
+        child = _child(nodes, node, k)
+        low = wp.vec3(NOWHERE)
+        high = wp.vec3(-NOWHERE)
+        if child >= 0:
+            for i in range(4):
+                if _child(nodes, child, i) != NO_NODE:
+                    for axis in range(3):
+                        low[axis] = wp.min(low[axis], nodes[8 * child + axis][i])
+                        high[axis] = wp.max(high[axis], nodes[8 * child + 3 + axis][i])
+        elif child != NO_NODE:
+            slot = -2 - child
             more = bool(True)
             while more:
                 face = face_in(order, slot)
@@ -203,16 +183,15 @@ def _refit_kernel(
                     high = wp.max(high, p + wp.vec3(padding))
                 more = order[slot] < 0
                 slot += 1
-        if entry != NO_NODE:
-            nodes[4 * pair + 2 * k] = _with_bits(low, entry)
-            nodes[4 * pair + 2 * k + 1] = _with_bits(high, 0)
+        if child != NO_NODE:
+            _set_box(nodes, node, k, low, high)
 
 
 def refit_bvh(
     mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array, depth: wp.array, levels: int
 ) -> None:
     """Boxes and faces of a packed tree for points that have moved: a launch a level, without an allocation or a look
-    at Warp's own tree. `depth` and `levels` are those of `pair_depths`."""
+    at Warp's own tree. `depth` is that of `node_depths`, `levels` their number."""
     for level in reversed(range(levels)):
         inputs = [mesh.id, box_padding(extent), level, depth, order]
         wp.launch(_refit_kernel, depth.size, inputs, outputs=[nodes], device=mesh.device)
@@ -220,9 +199,9 @@ def refit_bvh(
 
 
 def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
-    """What `pack_bvh` returns, for no faces at all: a root whose two children no ray meets."""
+    """What `pack_bvh` returns, for no faces at all: a root whose four children no ray meets."""
     x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    nodes = wp.array([[x, x, x, bits]] * 4, dtype=wp.vec4, device=device)
+    nodes = wp.array([[x, x, x, bits]] * 8, dtype=wp.vec4, device=device)
     return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
@@ -244,8 +223,15 @@ class TreeWalk:
 
 
 @wp.func
-def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3):
-    """The children of a node that a ray meets, the nearer first: two nodes, `NO_NODE` in place of one that it misses.
+def _first(near: wp.vec2, far: wp.vec2):
+    """(entry, bits of the child) of two, the nearer first."""
+    swap = far[0] < near[0]
+    return wp.where(swap, far, near), wp.where(swap, near, far)
+
+
+@wp.func
+def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4i:
+    """The children of a node that a ray meets, the nearest first: four nodes, `NO_NODE` in place of one that it misses.
 
     Args:
         nodes: From `pack_bvh`.
@@ -253,12 +239,17 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
         inverse: `inverse_direction` of the ray.
         shift: The ray's origin times `inverse`, by components.
     """
-    one = box_span(nodes, walk.node, 0, inverse, shift, walk.nearest)
-    two = box_span(nodes, walk.node, 1, inverse, shift, walk.nearest)
-    first = wp.where(one[0] <= one[1], bits_of(one[2]), NO_NODE)
-    second = wp.where(two[0] <= two[1], bits_of(two[2]), NO_NODE)
-    swap = first == NO_NODE or (second != NO_NODE and two[0] < one[0])
-    return wp.where(swap, second, first), wp.where(swap, first, second)
+    entry = box_entries(nodes, walk.node, inverse, shift, walk.nearest)
+    child = box_children(nodes, walk.node)
+    a, b = _first(wp.vec2(entry[0], child[0]), wp.vec2(entry[1], child[1]))
+    c, d = _first(wp.vec2(entry[2], child[2]), wp.vec2(entry[3], child[3]))
+    a, c = _first(a, c)
+    return wp.vec4i(
+        wp.where(a[0] < NOWHERE, bits_of(a[1]), NO_NODE),
+        wp.where(b[0] < NOWHERE, bits_of(b[1]), NO_NODE),
+        wp.where(c[0] < NOWHERE, bits_of(c[1]), NO_NODE),
+        wp.where(d[0] < NOWHERE, bits_of(d[1]), NO_NODE),
+    )
 
 
 @wp.struct

@@ -16,7 +16,7 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of
 
-from .bvh import NO_NODE, read_tree
+from .pairs import NO_NODE, read_tree
 from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
 
 # Entries of the stack of `_faces_in_order_kernel`: three a level of Warp's trees, which are at most 32 deep.
@@ -28,7 +28,7 @@ class _Part:
     """Faces that follow each other in the tree's order.
 
     Attributes:
-        pair: Of Warp's nodes below it, see `bvh`; -1 for none: then they are parted in the middle.
+        pair: Of Warp's nodes below it, see `pairs`; -1 for none: then they are parted in the middle.
         start, stop: The faces.
         area: Half the surface of their box [m²].
     """

@@ -16,7 +16,7 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_values,
 )
-from spadwarp_kernels.intersect.bvh import empty_bvh, pack_bvh, pair_depths, refit_bvh
+from spadwarp_kernels.intersect.bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
 from spadwarp_kernels.intersect.triangle import LANES, face_vectors, pack_faces, set_faces
 from spadwarp_kernels.intersect.wide import empty_wide, pack_wide, refit_wide
 from spadwarp_kernels.sensor.camera import Camera
@@ -54,7 +54,7 @@ class Surfaces:
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
-        depth, levels: Of the tree of a moving mesh, see `pair_depths`; empty for others, and on the CPU but for one
+        depth, levels: Of the tree of a moving mesh, see `node_depths`; empty for others, and on the CPU but for one
             level.
         extent: Largest coordinate that the tree is made for [m].
     """
@@ -169,7 +169,8 @@ def make_surfaces(
     elif device.is_cuda:
         surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent)
         if extent is not None:
-            surfaces.depth, surfaces.levels = pair_depths(surfaces.nodes)
+            surfaces.depth = node_depths(surfaces.nodes)
+            surfaces.levels = int(surfaces.depth.numpy().max()) + 1
     else:
         surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
         surfaces.levels = 0 if extent is None else 1
@@ -213,7 +214,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     elif not surfaces.levels:
         raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
     elif mesh.device.is_cuda:
-        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), mesh.device)
+        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 8,), mesh.device)
         refit_bvh(*tree, surfaces.depth, surfaces.levels)
     else:
         refit_wide(*tree)

@@ -114,11 +114,12 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
         walk.node = NO_NODE
     while walk.node != NO_NODE:
         if walk.node > NO_NODE:
-            near, far = step_node(surfaces.nodes, walk, inverse, shift)
-            walk.node = near
-            if far != NO_NODE:
-                stack[walk.depth] = far
-                walk.depth += 1
+            met = step_node(surfaces.nodes, walk, inverse, shift)
+            walk.node = met[0]
+            for k in range(3):
+                if met[3 - k] != NO_NODE:
+                    stack[walk.depth] = met[3 - k]
+                    walk.depth += 1
         else:
             step = step_leaf(surfaces.faces, surfaces.order, walk, x, u)
             walk.node = step.node

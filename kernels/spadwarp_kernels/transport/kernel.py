@@ -264,7 +264,6 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.contributions += more.contributions
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
-
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
                 if s.stage == SCATTER and s.ray == NO_RAY:
                     new = scatter(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
@@ -342,12 +341,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         company = wp.static(WALKING_LANES)
                         if in_nodes >= at_faces:
                             if s.walk.node > NO_NODE:
-                                near, far = step_node(surfaces.nodes, s.walk, inverse, shift)
-                                s.walk.node = near
-                                if far != NO_NODE:
-                                    stack[s.walk.depth] = far
-                                    s.walk.depth += 1
-                                if near == NO_NODE:
+                                met = step_node(surfaces.nodes, s.walk, inverse, shift)
+                                s.walk.node = met[0]
+                                for k in range(3):
+                                    if met[3 - k] != NO_NODE:
+                                        stack[s.walk.depth] = met[3 - k]
+                                        s.walk.depth += 1
+                                if met[0] == NO_NODE:
                                     s.walk.depth -= 1
                                     s.walk.node = stack[s.walk.depth]
                         elif s.walk.node < NO_NODE:
