@@ -33,15 +33,19 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
         Its start and its width, with a margin, in widths of the gate, each `[N]`; 0 and 1, the whole gate, where
         nothing agrees, or where little would be gained.
     """
+    import torch
+
     start, width = depth.new_zeros(len(depth)), depth.new_ones(len(depth))
-    searched = width > 0.0
+    frames = torch.arange(len(depth), device=depth.device)
     for _ in range(_ROUNDS):
-        frame_width = width[:, None, None]
-        low, high = _narrowed((depth - start[:, None, None]) / frame_width, density * frame_width)
-        searched = searched & (high - low < _KEPT)
-        start = start + searched * low * width
-        width = width * ((high - low - 1.0) * searched + 1.0)
-        if not (depth.is_cuda or searched.any()):  # a GPU would have to wait for the answer
+        begin, extent = start[frames], width[frames]
+        scaled = (depth[frames] - begin[:, None, None]) / extent[:, None, None]
+        low, high = _narrowed(scaled, density[frames] * extent[:, None, None])
+        narrower = high - low < _KEPT
+        start[frames] = torch.where(narrower, begin + low * extent, begin)
+        width[frames] = torch.where(narrower, (high - low) * extent, extent)
+        frames = frames[narrower]
+        if len(frames) == 0:
             break
     return start, width
 
@@ -78,9 +82,9 @@ def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
     share = reported.flatten(1).float().mean(dim=1)
     # Backscatter of this density, in as many pixels as report, agrees by chance.
     chance = (2.0 * _NEAR * share[:, None, None] * density).clamp(0.0, 1.0)
-    rows = torch.stack([torch.ones_like(chance), chance, (agreeing >= _AGREEING).float()], dim=1).flatten(2)
-    place = torch.where(reported, scaled * _BINS, _BINS).to(torch.uint8).flatten(1)
-    pixels, by_chance, observed = _sums(rows, place).double().unbind(dim=1)
+    values = torch.stack([torch.ones_like(chance), chance, (agreeing >= _AGREEING).float()], dim=1)
+    place = torch.where(reported, scaled * _BINS, _BINS).long()
+    pixels, by_chance, observed = _sums(values, place).double().unbind(dim=1)
     part = by_chance / pixels.clamp_min(1.0)
     fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
     expected = pixels * (1.0 - fewer)
@@ -91,15 +95,18 @@ def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(found, low, 0.0), torch.where(found, high, 1.0)
 
 
-def _sums(rows: Tensor, place: Tensor) -> Tensor:
-    """Sums `[N, C, _BINS]` of rows of values `[N, C, P]` by the bin of each pixel `[N, P]`; `_BINS` is in none."""
+def _sums(values: Tensor, place: Tensor) -> Tensor:
+    """Sums `[N, C, _BINS]` of values `[N, C, H, W]` by the bin of each pixel `[N, H, W]`; `_BINS` is in none.
+
+    Row by row, and then of all rows: on a GPU, sums by index into few places wait for each other.
+    """
     import torch
 
-    if rows.is_cuda:  # where sums by index of so few bins would wait for each other
-        bins = torch.arange(_BINS, device=rows.device, dtype=torch.uint8)
-        return rows @ (place[:, None] == bins[:, None]).float().mT
-    index = place.long()[:, None].expand(-1, rows.shape[1], -1)
-    return rows.new_zeros(*rows.shape[:2], _BINS + 1).scatter_add_(2, index, rows)[..., :_BINS]
+    frames, channels, rows, _ = values.shape
+    index = place + (_BINS + 1) * torch.arange(rows, device=place.device)[:, None]
+    sums = values.new_zeros(frames, channels, rows * (_BINS + 1))
+    sums.scatter_add_(2, index.flatten(1)[:, None].expand(-1, channels, -1), values.flatten(2))
+    return sums.view(frames, channels, rows, -1).sum(dim=2)[..., :_BINS]
 
 
 def bins_of_target(

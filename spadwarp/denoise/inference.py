@@ -219,17 +219,8 @@ def estimate_frames(
         check_choice("precision", precision, get_args(Precision))
     if model in CLASSICAL or (model == "histograms" and frames.features is None):
         raise ArgumentError(f"model = {model!r} needs counts with their background and response; they are missing")
-    reported = ~np.isnan(frames.depth)
-    empty = ~reported.any(axis=(1, 2), keepdims=True)
-    probability = reported.astype(np.float32)
-    confidence = np.full_like(frames.depth, np.nan)
     if model in BASELINES:
-        if weights is not None:
-            raise ArgumentError(f"weights are for a network, not for {model!r}")
-        if window < 1 or window % 2 == 0:
-            raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
-        found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
-        return Estimate(np.where(empty, np.float32(np.nan), found), probability, confidence)
+        return _baseline(frames, model, window, weights)
     torch = require_torch()
     place = torch_device(device)
     if model != "pyramid":
@@ -238,32 +229,47 @@ def estimate_frames(
     inputs = None
     if model != "pyramid":
         inputs = frames.network_input(histograms=model == "histograms", fills=model in ("dncnn", "usdn"))
-    found = np.empty_like(frames.depth)
     begin, extent = frames.gate[0], frames.gate[1] - frames.gate[0]
     part = max(1, _PIXELS_AT_ONCE[place.type] // frames.depth[0].size)
     # glibc returns memory to the system after each frame, and fresh pages take as long as half the network, unless a
     # block this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
     torch.empty(31 << 20, dtype=torch.uint8)
-    for first in range(0, len(found), part):
+    answers = torch.empty(3, *frames.depth.shape)
+    for first in range(0, len(frames.depth), part):
         some = slice(first, first + part)
         with torch.inference_mode():
+            depth = torch.from_numpy(frames.depth[some]).to(place)
+            reported = ~torch.isnan(depth)
             if inputs is None:
-                depth, density = (
-                    torch.from_numpy(values[some]).to(place) for values in (frames.scaled, frames.density)
+                given, start, width = narrowed_input(
+                    (depth - begin) / extent, torch.from_numpy(frames.density[some]).to(place)
                 )
-                given, start, width = narrowed_input(depth, density)
                 output = network(given).float()
                 output[:, 0].clamp_(0.0, 1.0).mul_(width[:, None, None]).add_(start[:, None, None])
             else:
                 output = network(torch.from_numpy(inputs[some]).to(place)).float()
                 output[:, 0].clamp_(0.0, 1.0)
-            output[:, 1:3].sigmoid_()
-            output = output[:, :3].cpu().numpy()
-        found[some] = begin + extent * output[:, 0]
-        if output.shape[1] > 1:
-            probability[some], confidence[some] = output[:, 1], output[:, 2]
+            found = output[:, 0].mul_(extent).add_(begin)
+            probability, confidence = reported.float(), torch.full_like(found, torch.nan)
+            if output.shape[1] > 1:
+                probability, confidence = output[:, 1:3].sigmoid_().unbind(dim=1)
+            some_seen = reported.flatten(1).any(dim=1)[:, None, None]
+            answers[0, some] = torch.where(some_seen, found, torch.nan)
+            answers[1, some] = torch.where(some_seen, probability, 0.0)
+            answers[2, some] = confidence
         if progress is not None:
-            progress("frames", min(first + part, len(found)), len(found))
-    return Estimate(
-        np.where(empty, np.float32(np.nan), found), np.where(empty, np.float32(0.0), probability), confidence
-    )
+            progress("frames", min(first + part, len(frames.depth)), len(frames.depth))
+    return Estimate(*answers.numpy())
+
+
+def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path | None) -> Estimate:
+    """`estimate_frames` for one of `BASELINES`."""
+    if weights is not None:
+        raise ArgumentError(f"weights are for a network, not for {model!r}")
+    if window < 1 or window % 2 == 0:
+        raise ArgumentError(f"window = {window} is not an odd number >= 1, such as {MEDIAN_WINDOWS}")
+    found = median_filter(frames, window=window) if model == "median" else BASELINES[model](frames)
+    reported = ~np.isnan(frames.depth)
+    empty = ~reported.any(axis=(1, 2), keepdims=True)
+    found = np.where(empty, np.float32(np.nan), found)
+    return Estimate(found, reported.astype(np.float32), np.full_like(frames.depth, np.nan))
