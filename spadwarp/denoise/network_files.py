@@ -52,8 +52,6 @@ def load_network(
     try:
         network: Any = build_network(model)
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
-        # Older weights for histograms have no selection: a new one takes the network's answer.
-        values = {n: value for n, value in network.state_dict().items() if n.startswith("select.")} | values
         network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")

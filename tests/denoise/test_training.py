@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
 from spadwarp.denoise import network_files, networks, pyramid, selection
@@ -139,14 +139,6 @@ def test_the_selection_is_never_the_mean_of_two_surfaces():
     for scores, expected in (([0.0, 0.0, 0.1, 0.0], 0.7), ([0.1, 0.0, 0.0, 0.0], 0.2)):
         found = selection.selected(candidates, torch.tensor(scores)[None, :, None, None])
         assert torch.allclose(found, torch.tensor(expected))
-
-
-def test_weights_without_a_selection_still_load(tmp_path):
-    path = tmp_path / "histograms.safetensors"
-    kept = {n: v for n, v in networks.build_network("histograms").state_dict().items() if not n.startswith("select.")}
-    save_file(kept, path, metadata={"model": "histograms"})
-    network = network_files.load_network("histograms", path)
-    assert torch.equal(network.state_dict()["evidence"], kept["evidence"])
 
 
 def test_drawn_scenes_are_varied_and_repeatable():
