@@ -101,7 +101,7 @@ class PyramidNet(nn.Module):
         self.wide = nn.ModuleList(SymmetricWindow(last, 3) for _ in self.boxes)
         # Weight and value of the network's own depth; logits; reach of refining; weight of the depth voted for.
         self.scalars = nn.Conv2d(last, 5 + refines + votes, 1)
-        self.enter_features: nn.Module | None = None
+        self.enter_features: SymmetricConv | None = None
         with torch.no_grad():  # begins near the identity
             assert self.scalars.bias is not None
             self.near.bias[0] = 3.0  # of the pixel itself
