@@ -18,14 +18,15 @@ from spadwarp.errors import address_space
 
 __all__ = ["Forked"]
 
-_PATIENCE = 120.0  # seconds
+_PATIENCE = 30.0  # seconds
 
 
 class Forked:
     """Begins calls, each in a process of its own; a context, at whose end none of them runs any more.
 
-    Where processes cannot be copied (not Linux, limited memory), or where one fails or takes two minutes, the call is
-    made here, by `results`. Calls must not use a GPU, and their results are pickled.
+    Where processes cannot be copied (not Linux, limited memory), or where one fails or takes half a minute, the call
+    is made here, by `results`. Calls must not use a GPU, nor import what another thread may be importing; their results
+    are pickled.
     """
 
     def __init__(self, calls: Sequence[Callable[[], Any]]) -> None:

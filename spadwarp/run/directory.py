@@ -103,7 +103,8 @@ def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[
     output = result.scene.output
     if not (formats := [ending for ending in ("png", "pdf") if getattr(output, ending)]):
         return []
-    from spadwarp.viz.result import picture_calls
+    # The whole room: a copy of this process would wait for ever for what another thread still imports.
+    from spadwarp.viz import picture_calls
 
     return picture_calls(result, folder, depth=depth, method=output.depth_method, formats=formats)
 

@@ -8,7 +8,7 @@ from spadwarp.viz.frames import draw_analytic, draw_recording
 from spadwarp.viz.learning_curves import draw_learning_curves
 from spadwarp.viz.notebook import html, plot
 from spadwarp.viz.progress import progress_bar
-from spadwarp.viz.result import draw_result
+from spadwarp.viz.result import draw_result, picture_calls
 from spadwarp.viz.targets import describe_targets, draw_mesh, draw_targets
 from spadwarp.viz.transient_video import video
 from spadwarp.viz.validation import draw_validation
@@ -27,4 +27,4 @@ __all__ += [
     "draw_validation",
     "draw_water",
 ]
-__all__ += ["html", "plot", "progress_bar", "video", "view"]
+__all__ += ["html", "picture_calls", "plot", "progress_bar", "video", "view"]

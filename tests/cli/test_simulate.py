@@ -155,7 +155,7 @@ def test_result_survives_a_picture_that_cannot_be_written(scene, tmp_path, monke
     def full(*_, **__):
         raise spadwarp.FileError("depth.png: cannot be written: No space left on device")
 
-    monkeypatch.setattr("spadwarp.viz.draw_result", full)
+    monkeypatch.setattr("spadwarp.viz.result.save", full)
     out = tmp_path / "out"
     outcome = run("simulate", scene, "--out", out, *DEVICE, "--set", "output.png=true", code=1)
     assert "No space left" in outcome.stderr
