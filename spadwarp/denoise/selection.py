@@ -22,7 +22,7 @@ CHOICES = 1 + 2 + POOLED + 1
 median of belief propagation over 3 × 3 pixels."""
 
 _REACH = 2  # pixels around a pixel that its choice depends on
-_PIXELS_AT_ONCE = 1 << 16  # of which candidates are held in memory
+_PIXELS_AT_ONCE = 1 << 14  # of which candidates are held in memory
 _CLOSE = 0.01  # a candidate this near to a pooled depth has its score [gate widths]
 _SPREAD = 0.004  # candidates this near to the one chosen count, too [gate widths]
 _OF_CHOICE = 19  # what is known of a candidate
