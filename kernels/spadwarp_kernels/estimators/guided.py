@@ -42,8 +42,9 @@ LARGEST_WEIGHT_RATIO = wp.constant(64.0)
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
     request_flight, request_event = make_requests(spec)
+    registers = (128, 96) if spec.polarised else (96, 72)
     return Estimator(
-        max_registers=(80, 72) if spec.grid is not None else (96, 72),
+        max_registers=(80, 72) if spec.grid is not None else registers,
         plan_flight=make_plan_flight(spec),
         request_flight=request_flight,
         request_event=request_event,

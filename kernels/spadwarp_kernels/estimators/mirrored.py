@@ -235,7 +235,8 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
             return found
         along = turn(limits, link.to_lens)
         heading = image_direction(image, along)
-        scattering = scattering_density(request, request.x, turn_back(limits, heading), medium, layers, surfaces)
+        to = turn_back(limits, heading)
+        scattering = scattering_density(request, request.x, to, to, 1.0, medium, layers, surfaces)
         scattering *= image_reflectance(limits.boundary, image, along)
         extinction = float(medium.extinction)
         if wp.static(derives):

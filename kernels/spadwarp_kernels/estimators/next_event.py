@@ -8,4 +8,8 @@ from .estimator import Estimator
 
 def make_next_event(spec: TransportSpec) -> Estimator:
     """A contribution from every collision and surface, by way of a uniform point of the lens."""
-    return Estimator(request_event=make_event_request(spec), score=make_score(spec))
+    return Estimator(
+        max_registers=(96, 80) if spec.polarised else (64, 64),
+        request_event=make_event_request(spec),
+        score=make_score(spec),
+    )
