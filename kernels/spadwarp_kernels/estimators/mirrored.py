@@ -235,12 +235,11 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
             return found
         along = turn(limits, link.to_lens)
         heading = image_direction(image, along)
-        to = turn_back(limits, heading)
-        scattering = scattering_density(request, request.x, to, to, 1.0, medium, layers, surfaces)
+        v = turn_back(limits, heading)
+        scattering = scattering_density(request, request.x, v, v, 1.0, medium, layers, surfaces)
         scattering *= image_reflectance(limits.boundary, image, along)
         extinction = float(medium.extinction)
         if wp.static(derives):
-            v = turn_back(limits, heading)
             found.contribution.scores = leaving_scores(request, v, derivatives, medium, layers, surfaces)
             if wp.static(not needs_way):
                 found.contribution.scores = flight_scores(
