@@ -25,7 +25,7 @@ class StoppingRule:
     It looks for the number of photons at which the error reaches the goal. A run that ended there would end where rare
     bright photons have not come yet: too dark, with an error that is too small. So it goes on by a part of these
     photons that is fixed there and then, and ends whatever the last of them bring. The part is small where many photons
-    matter equally, 20 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
+    matter equally, 40 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
 
     Args:
         goal: Relative error.
