@@ -52,16 +52,19 @@ def solved(
     pull, information = prior
     arguments = (given["law"], given["halves"], given["trials"], given["counts"])
     means = means_of(*arguments, pulses=given["pulses"])
-    best, least = None, np.inf
+    best, least, worse = None, np.inf, 0
     for size in reversed(_levels(unknowns, image, level)):
         cells = [_cell(one, size) for one in unknowns]
         own = equations(image=image, cells=cells, means=means, **given).times(scales)
         solution = solve(own, is_own, prior=information, pull=pull)
         variances = np.diag(solution.covariance)
         total = float(np.log(np.maximum(variances, 1e-300)).sum()) if (variances > 0).all() else np.inf
-        if best is not None and np.isfinite(least) and total >= least:
+        if best is None or total < least:
+            best, least, worse = Solved(size, own, solution), total, 0
+        elif np.isfinite(least):
+            worse += 1
+        if worse == 2:  # the noise of the errors can hide one better level behind a worse one
             break
-        best, least = Solved(size, own, solution), total
     assert best is not None
     return best
 
