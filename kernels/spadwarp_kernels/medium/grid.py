@@ -39,6 +39,7 @@ class Grid:
         block_size: Number of blocks along the three edges of the box; the last may be incomplete.
         block_majorant: Largest c in each block [1/m].
         block_control: Mean c of each block, and the largest difference from it in the block [1/m].
+        residual: c less the mean of its block [1/m], by cell.
     """
 
     turn: wp.mat33
@@ -51,6 +52,7 @@ class Grid:
     block_size: wp.vec3i
     block_majorant: wp.array(dtype=float)
     block_control: wp.array(dtype=wp.vec2)
+    residual: wp.array(dtype=float)
 
 
 @wp.struct
@@ -339,6 +341,10 @@ def make_grid(
     grid.block_size = wp.vec3i(*blocks[0].shape)
     grid.block_majorant = wp.array(blocks[0].ravel(), dtype=float, device=device)
     grid.block_control = wp.array(np.stack([b.ravel() for b in blocks[1:]], axis=1), dtype=wp.vec2, device=device)
+    mean = blocks[1]
+    for axis, count in enumerate(shape):
+        mean = np.repeat(mean, edge_cells, axis=axis).take(range(count), axis=axis)
+    grid.residual = wp.array((arrays["extinction"] - mean).ravel(), dtype=float, device=device)
     return grid
 
 

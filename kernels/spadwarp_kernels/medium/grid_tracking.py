@@ -115,7 +115,10 @@ def grid_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     if cell >= 0:
         water.extinction = load_float(layers.grid.extinction, cell)
         water.albedo = load_float(layers.grid.albedo, cell)
-        if layers.grid.anisotropy.shape[0] > 0:
+    # Apart, so that who asks for the phase function alone looks up nothing without it.
+    if layers.grid.anisotropy.shape[0] > 0:
+        cell = grid_cell(layers.grid, x)
+        if cell >= 0:
             water.anisotropy = load_float(layers.grid.anisotropy, cell)
     return water
 
@@ -167,34 +170,35 @@ def delta_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: 
 @wp.func
 def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     """Extinction [1/m] whose exp(-mean length) has the expectation of what passes between x and x + length u; by
-    residual ratio tracking about the mean extinction of the blocks."""
+    residual ratio tracking about the mean extinction of the blocks, with one rate: first all lanes of a warp go through
+    blocks, then all look up cells."""
     grid = layers.grid
     line = block_line(grid, x, u, length)
     if line.begin >= line.end:
         return medium.extinction
-    depth = medium.extinction * (length - (line.end - line.begin))
-    part = float(1.0)
-    random = step_sequence(begin_sequence(seed))
-    rest = -wp.log(u01_open(sequence_word(random)))
     place = first_block(grid, line)
     control = load_vec2(grid.block_control, place.block)
-    while place.t < line.end:
-        while control[1] * (place.stop - place.t) < rest and place.stop < line.end:
-            rest -= control[1] * (place.stop - place.t)
-            depth += control[0] * (place.stop - place.t)
-            place = next_block(grid, line, place)
-            control = load_vec2(grid.block_control, place.block)
-        if control[1] * (place.stop - place.t) < rest:
-            depth += control[0] * (place.stop - place.t)
-            break
-        inverse = 1.0 / wp.max(control[1], 1.0e-30)
-        t = wp.min(place.t + rest * inverse, place.stop)
-        depth += control[0] * (t - place.t)
-        place.t = t
-        extinction = load_float(grid.extinction, cell_on_line(grid, line.p, line.d, t))
-        part *= wp.max(1.0 - (extinction - control[0]) * inverse, 0.0)
-        random = step_sequence(random)
-        rest = -wp.log(u01_open(sequence_word(random)))
+    rate = float(control[1])
+    depth = medium.extinction * (length - (line.end - line.begin)) + control[0] * (place.stop - place.t)
+    while place.stop < line.end:
+        place = next_block(grid, line, place)
+        control = load_vec2(grid.block_control, place.block)
+        depth += control[0] * (place.stop - place.t)
+        rate = wp.max(rate, control[1])
+    part = float(1.0)
+    mean_step = 1.0 / wp.max(rate, 1.0e-30)
+    random = step_sequence(begin_sequence(seed))
+    t = line.begin - wp.log(u01_open(sequence_word(random))) * mean_step
+    while t < line.end:
+        # Two at a time: a cell takes long to come from memory.
+        residual = wp.vec2()
+        for i in range(2):
+            found = load_float(grid.residual, cell_on_line(grid, line.p, line.d, wp.min(t, line.end)))
+            residual[i] = wp.where(t < line.end, found, 0.0)
+            random = step_sequence(random)
+            t -= wp.log(u01_open(sequence_word(random))) * mean_step
+        for i in range(2):
+            part *= wp.max(1.0 - residual[i] * mean_step, 0.0)
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 

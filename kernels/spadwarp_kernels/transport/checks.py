@@ -192,7 +192,7 @@ def _check_grid(grid: Grid, device: wp.Device) -> None:
         for count in size:
             check_integer(f"model.layers.grid.{name}", count, 1)
     cells, blocks = (math.prod(size) for size in sizes.values())
-    for name in ("extinction", "albedo"):
+    for name in ("extinction", "albedo", "residual"):
         check_array(f"model.layers.grid.{name}", getattr(grid, name), wp.float32, (cells,), device)
     anisotropy = check_array("model.layers.grid.anisotropy", grid.anisotropy, wp.float32, (None,), device)
     if anisotropy.size:
