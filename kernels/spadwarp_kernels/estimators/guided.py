@@ -42,9 +42,13 @@ LARGEST_WEIGHT_RATIO = wp.constant(64.0)
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
     request_flight, request_event = make_requests(spec)
-    registers = (128, 96) if spec.polarised else (96, 72)
+    registers = (96, 72)
+    if spec.polarised:
+        registers = (128, 96)
+    elif spec.grid is not None:
+        registers = (72 if takes_collisions(spec) else 80, 72)
     return Estimator(
-        max_registers=(80, 72) if spec.grid is not None else registers,
+        max_registers=registers,
         plan_flight=make_plan_flight(spec),
         request_flight=request_flight,
         request_event=request_event,
