@@ -118,7 +118,6 @@ from .tally import (
 from .transport import (
     Data,
     Model,
-    TransportLauncher,
     launch_transport,
     load_transport_kernel,
     make_data,
@@ -200,7 +199,6 @@ __all__ = [
     "SurfaceHit",
     "Surfaces",
     "Textures",
-    "TransportLauncher",
     "TransportSpec",
     "arrival_bins",
     "dark_count_rates",

@@ -47,29 +47,6 @@ def test_what_is_valid_runs_also_with_a_count_that_is_written_as_a_float(box):
     assert sum(sk.read_ledger(data)[0].values()) * sk.LEDGER_UNIT == 1000
 
 
-def test_launches_that_are_packed_once_leave_what_single_ones_leave(box):
-    one = sk.Model(device="cpu", mesh=box, surfaces=sk.make_surfaces(box, 0.5), scale=2.0**50, **structs())
-    first, second = sk.make_data(one), sk.make_data(one)
-    launcher = sk.TransportLauncher(NEXT_EVENT, one, second, seed=2**63 + 1)
-    for first_id, count in ((0, 700), (2**40, 300)):
-        launch(box, NEXT_EVENT, data=first, model=one, seed=2**63 + 1, first_id=first_id, photon_count=count)
-        launcher.launch(first_id, count)
-    assert np.array_equal(first.tally.numpy(), second.tally.numpy())
-    assert first.tally.numpy().any()
-    assert sk.read_ledger(first) == sk.read_ledger(second)
-
-
-def test_a_launcher_refuses_what_a_launch_refuses(box):
-    one = sk.Model(device="cpu", mesh=box, surfaces=sk.make_surfaces(box, 0.5), scale=2.0**50, **structs())
-    data = sk.make_data(one, record_count=10)
-    with pytest.raises(sk.ArgumentError, match=r"photon_count = 0 is outside \[1, 67108864\]"):
-        sk.TransportLauncher(NEXT_EVENT, one, data, seed=1).launch(0, 0)
-    with pytest.raises(sk.ArgumentError, match=r"model\.surfaces"):
-        sk.TransportLauncher(NEXT_EVENT, dataclasses.replace(one, surfaces=sk.Surfaces()), data, seed=1)
-    with pytest.raises(sk.ArgumentError, match="need memory for each launch"):
-        sk.TransportLauncher(sk.TransportSpec("none", records=True), one, data, seed=1)
-
-
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

@@ -4,7 +4,6 @@ from .kernel import make_transport_kernel
 from .launch import (
     Data,
     Model,
-    TransportLauncher,
     launch_transport,
     load_transport_kernel,
     make_data,
@@ -14,7 +13,6 @@ from .launch import (
 __all__ = [
     "Data",
     "Model",
-    "TransportLauncher",
     "launch_transport",
     "load_transport_kernel",
     "make_data",

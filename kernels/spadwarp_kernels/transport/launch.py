@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_kind, check_seed
+from spadwarp_kernels.arguments import check_array, check_device, check_integer, check_kind, check_seed
 from spadwarp_kernels.math.memory import zeros
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -179,79 +179,26 @@ def launch_transport(
     """
     check_kind("model", model, Model)
     check_kind("data", data, Data)
-    first_id, photon_count = _checked(first_id, photon_count)
+    photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
+    first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
     seed = check_seed(seed)
     threads = check_integer("threads", threads, BLOCK_SIZE)
     check_launch(spec, model, data, photon_count)
-    threads, derivatives = _threads(model.device, photon_count, threads), model.derivatives
+    blocks = min(-(-photon_count // BLOCK_SIZE), threads // BLOCK_SIZE)
+    threads, derivatives = blocks * BLOCK_SIZE if model.device.is_cuda else 1, model.derivatives
     if spec.blocks:
         threads = threads_of_blocks(threads, 2 * len(spec.blocks) * derivatives.blocks.count)
         derivatives = _with_memory(spec, derivatives, threads, model.device)
     data.cursor.zero_()
-    _record(spec, model, data, derivatives, seed, first_id, photon_count, threads, record_cmd=False)
-
-
-class TransportLauncher:
-    """Many launches of one spec, model and data: checked and packed once, which takes longer than a launch.
-
-    `model` and `data` keep their arrays and numbers while it is in use; what the arrays hold may change. For callers on
-    one thread; specs with records or derivatives by block are for `launch_transport`.
-
-    Raises `ArgumentError`, as `launch_transport`.
-    """
-
-    def __init__(self, spec: TransportSpec, model: Model, data: Data, *, seed: int) -> None:
-        check_kind("model", model, Model)
-        check_kind("data", data, Data)
-        seed = check_seed(seed)
-        check_launch(spec, model, data, 1)
-        if spec.records or spec.blocks:
-            raise ArgumentError("spec.records and spec.blocks need memory for each launch: use launch_transport")
-        self._device, self._cursor, self._data, self._model = model.device, data.cursor, data, model
-        self._command = _record(spec, model, data, model.derivatives, seed, 0, 1, BLOCK_SIZE, record_cmd=True)
-
-    def launch(self, first_id: int, photon_count: int) -> None:
-        """Walks these photons, as `launch_transport`."""
-        first_id, photon_count = _checked(first_id, photon_count)
-        self._cursor.zero_()
-        self._command.set_dim(_threads(self._device, photon_count, CUDA_THREADS))
-        self._command.set_param_by_name("first_id", first_id)
-        self._command.set_param_by_name("photon_count", photon_count)
-        self._command.launch()
-
-
-def _checked(first_id: int, photon_count: int) -> tuple[int, int]:
-    photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
-    return check_integer("first_id", first_id, 0, 2**64 - photon_count), photon_count
-
-
-def _threads(device: wp.Device, photon_count: int, most: int) -> int:
-    return min(-(-photon_count // BLOCK_SIZE), most // BLOCK_SIZE) * BLOCK_SIZE if device.is_cuda else 1
-
-
-def _record(
-    spec: TransportSpec,
-    model: Model,
-    data: Data,
-    derivatives: Derivatives,
-    seed: int,
-    first_id: int,
-    photon_count: int,
-    threads: int,
-    *,
-    record_cmd: bool,
-) -> wp.Launch | None:
-    """Launches the kernel, or makes the command that does."""
     inputs = [model.medium, model.layers, model.laser, model.camera, model.gate, model.limits, model.guiding]
     inputs += [model.surfaces, model.scan, derivatives, model.polarisation]
-    return wp.launch(
+    wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
         dim=threads,
         inputs=[*inputs, seed, round_keys(seed), first_id, photon_count, model.scale],
         outputs=[data.tally, data.gradients, data.ledger, data.records, data.cursor, data.offset],
         device=model.device,
         block_dim=BLOCK_SIZE,
-        record_cmd=record_cmd,
     )
 
 
