@@ -36,8 +36,10 @@ class Forked:
 
     def results(self) -> list[Any]:
         """Of all calls, in their order; waits for them. Raises what they raise."""
-        found = [None if one is None else _result(*one) for one in self._running]
-        self._running = []
+        found: list[tuple[Any] | None] = []
+        while self._running:
+            one = self._running.pop(0)
+            found.append(None if one is None else _result(*one))
         return [call() if one is None else one[0] for call, one in zip(self._calls, found, strict=True)]
 
     def __enter__(self) -> Forked:
@@ -56,11 +58,16 @@ def _begin(call: Callable[[], Any]) -> tuple[int, int] | None:
     """Process and the file that its result comes from; None where there is no further process."""
     try:
         source, target = os.pipe()
+    except OSError:
+        return None
+    try:
         with warnings.catch_warnings():
             # Python warns of copies of a process with threads; the copy takes none of their locks.
             warnings.simplefilter("ignore", DeprecationWarning)
             process = os.fork()
     except OSError:
+        os.close(source)
+        os.close(target)
         return None
     if process == 0:
         code = 1

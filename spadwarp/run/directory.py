@@ -71,11 +71,12 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
     written: list[Path] = []
     try:
         depth = _depth(result, device)
+        calls = _pictures(result, folder, depth)
     except BaseException:
         if output.result:  # photons must not be lost
             _save(result, folder / "result.h5")
         raise
-    with Forked(_pictures(result, folder, depth)) as pictures:
+    with Forked(calls) as pictures:
         if output.result:
             written.append(_save(result, folder / "result.h5"))
         with atomic_path(folder / "scene.toml") as temporary:

@@ -9,6 +9,7 @@ import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, tables
 from spadwarp.io.exr import read_exr
 from spadwarp.result.file import load_truth_maps
+from spadwarp.run import write_run
 from spadwarp.transport.records import load_records
 
 
@@ -160,6 +161,17 @@ def test_result_survives_a_picture_that_cannot_be_written(scene, tmp_path, monke
     outcome = run("simulate", scene, "--out", out, *DEVICE, "--set", "output.png=true", code=1)
     assert "No space left" in outcome.stderr
     assert spadwarp.load_result(out / "result.h5").photons == 20_000
+
+
+def test_result_survives_pictures_that_cannot_be_loaded(scene, tmp_path, monkeypatch):
+    def missing(*_):
+        raise ImportError("matplotlib is broken")
+
+    monkeypatch.setattr("spadwarp.run.directory._pictures", missing)
+    result = spadwarp.simulate(scene, photons=1000, device="cpu")
+    with pytest.raises(ImportError, match="broken"):
+        write_run(result, tmp_path)
+    assert spadwarp.load_result(tmp_path / "result.h5").photons == 1000
 
 
 def test_result_that_cannot_be_written_finds_a_refuge(scene, tmp_path, monkeypatch):

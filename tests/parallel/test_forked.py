@@ -47,3 +47,19 @@ def test_none_outlives_its_context(tmp_path):
         raise RuntimeError("full")
     time.sleep(1.2)
     assert not (tmp_path / "late").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="calls are made here")
+def test_an_interrupt_while_results_are_awaited_is_raised_as_it_is(tmp_path, monkeypatch):
+    def slow():
+        time.sleep(1.0)
+        (tmp_path / "late").touch()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("spadwarp.parallel.forked.select.select", interrupted)
+    with pytest.raises(KeyboardInterrupt), Forked([slow, slow]) as forked:
+        forked.results()
+    time.sleep(1.2)
+    assert not (tmp_path / "late").exists()
