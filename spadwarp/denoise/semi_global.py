@@ -44,7 +44,7 @@ def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
     """
     lines = score.flatten(0, 1)
     most = jump.expand(-1, score.shape[1], 1, 1).flatten(0, 1)[:, 0]
-    told, last = torch.zeros_like(lines), lines.shape[1] - 1
+    received, last = torch.zeros_like(lines), lines.shape[1] - 1
     ahead = lines.new_zeros(2, len(lines), lines.shape[2])  # the message sent last, forwards and backwards
     for place in range(last):
         known = torch.stack([lines[:, place], lines[:, last - place]]).add_(ahead)
@@ -54,6 +54,6 @@ def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
         torch.maximum(ahead[..., 1:], known[..., :-1], out=ahead[..., 1:])
         torch.maximum(ahead[..., :-1], known[..., 1:], out=ahead[..., :-1])
         ahead -= best
-        told[:, place + 1] += ahead[0]
-        told[:, last - place - 1] += ahead[1]
-    return told.view_as(score)
+        received[:, place + 1] += ahead[0]
+        received[:, last - place - 1] += ahead[1]
+    return received.view_as(score)
