@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.denoise.histogram_inputs import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_real
 
 __all__ = ["CLASSICAL", "TUNINGS", "Classical", "classical_depth"]
 
@@ -52,7 +53,7 @@ def classical_depth(
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
         method: One of `CLASSICAL`.
-        tuning: See `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
+        tuning: Above 0, see `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
         device: torch device.
 
     Raises:
@@ -60,6 +61,9 @@ def classical_depth(
     """
     if method not in CLASSICAL:
         raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, CLASSICAL))}")
+    tuning = None if tuning is None else check_real("tuning", tuning, "(0, inf)")
+    if method == "pooled" and tuning is not None and tuning % 2 != 1:
+        raise ArgumentError(f"tuning = {tuning:g} is not an odd number of pixels, such as {TUNINGS[method]}")
     torch = require_torch()
     from spadwarp.denoise.belief_propagation import JUMPS, beliefs
     from spadwarp.denoise.histogram_features import highest, log_likelihood, pooled
@@ -81,6 +85,6 @@ def classical_depth(
             if method == "total-variation":
                 weight = score.amax(dim=-1).clamp(0.0, 20.0)
                 weight /= weight.mean().clamp_min(1e-9)
-                depth = total_variation(depth, weight, strength=float(tuning or 1.0))
+                depth = total_variation(depth, weight, strength=tuning or 1.0)
             found.append(depth[0].cpu().numpy())
     return np.stack(found).astype(np.float32)

@@ -1,0 +1,82 @@
+"""Classical estimates of depth from histograms, against the best of all depth maps of a small frame."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from spadwarp import ArgumentError
+from spadwarp.denoise.belief_propagation import beliefs
+from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
+from spadwarp.denoise.semi_global import aggregate
+from spadwarp.denoise.total_variation import total_variation
+
+pytestmark = pytest.mark.fast
+
+PIXELS, BINS = 5, 5
+TAPS = norm.pdf(np.arange(-4, 5), scale=1.2)
+
+
+def best_of_each_depth(score, slope, jump):
+    """Of all depths of a row of pixels, the largest log-likelihood less the penalties, by pixel and its depth."""
+    best = np.full((PIXELS, BINS), -np.inf)
+    for depths in itertools.product(range(BINS), repeat=PIXELS):
+        apart = np.abs(np.diff(depths))
+        penalty = np.select([apart == 0, apart == 1], [0.0, min(slope, jump)], jump).sum()
+        for pixel, depth in enumerate(depths):
+            best[pixel, depth] = max(best[pixel, depth], score[range(PIXELS), depths].sum() - penalty)
+    return best - best.max()
+
+
+@pytest.mark.parametrize("jump", [0.3, 1.5])
+@pytest.mark.parametrize("column", [False, True])
+def test_messages_along_a_line_are_exact(jump, column):
+    """Max-product on a line gives the best score of each depth; semi-global matching has three times the pixel's own
+    besides."""
+    score = np.random.default_rng(5).normal(0.0, 1.0, (PIXELS, BINS))
+    line = torch.tensor(score).view((1, PIXELS, 1, BINS) if column else (1, 1, PIXELS, BINS))
+    weight = torch.full((1, 1, 1, 1), jump, dtype=line.dtype)
+    for found, own, slope in ((beliefs(line, weight), 0.0, 0.5), (aggregate(line, jump=weight), 3.0, 1.0)):
+        by_pixel = found.view(PIXELS, BINS).numpy() - own * score
+        by_pixel -= by_pixel.max(axis=1, keepdims=True)
+        np.testing.assert_allclose(by_pixel, best_of_each_depth(score, slope, jump), atol=1e-9)
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_total_variation_finds_the_least_energy(isotropic):
+    """In a row, where a map of least energy takes values of the data alone."""
+    rng = np.random.default_rng(6)
+    data, weight = rng.random(6), rng.uniform(0.2, 2.0, 6)
+
+    def energy(depth):
+        return np.abs(np.diff(depth)).sum() * 0.8 + (weight * np.abs(depth - data)).sum()
+
+    least = min(map(energy, itertools.product(data, repeat=6)))
+    row = [torch.tensor(values)[None, None] for values in (data, weight)]
+    found = total_variation(*row, strength=0.8, iterations=3000, isotropic=isotropic)
+    assert energy(found.numpy().ravel()) == pytest.approx(least, rel=1e-3)
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_neighbours_help_where_photons_are_few_and_edges_stay(method):
+    """Two walls, 20 bins apart, seen by two photons a pixel on a background of two."""
+    bins, place = 64, np.where(np.arange(24) < 12, 20.5, 40.5) + np.zeros((24, 1))
+    rate = 2.0 * np.diff(norm(scale=1.2).cdf(np.arange(bins + 1) - place[..., None]), axis=-1) + 2.0 / bins
+    counts = np.random.default_rng(2).poisson(rate)
+    given = {"background": np.full(bins, 2.0 / bins), "response": TAPS}
+    depth = bins * classical_depth(counts, method=method, **given)[0]
+    right = (np.abs(depth - place) < 3.0).mean()
+    assert 0.6 < right < 0.9 if method == "likelihood" else right > 0.95
+
+
+def test_a_tuning_that_cannot_be_is_refused():
+    given = {"background": np.ones(8), "response": TAPS}
+    for method, tuning, text in (
+        ("total-variation", 0.0, r"tuning = 0.0 is outside \(0, inf\)"),
+        ("belief-propagation", np.nan, r"tuning = nan is outside \(0, inf\)"),
+        ("pooled", 4, r"tuning = 4 is not an odd number of pixels, such as \(3, 5, 7, 11, 15\)"),
+    ):
+        with pytest.raises(ArgumentError, match=text):
+            classical_depth(np.ones((8, 8, 8)), method=method, tuning=tuning, **given)
