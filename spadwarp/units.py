@@ -20,6 +20,7 @@ __all__ = [
     "pulse_speed",
     "quantity",
     "range_from_time",
+    "rounded",
     "time_from_path",
     "time_from_range",
     "with_prefix",
@@ -135,6 +136,17 @@ def quantity(text: str, unit: str) -> float:
         return float(Fraction(number) * given_factor / factor)
     except OverflowError:
         raise ValueError("is beyond the largest number, 1.8e308") from None
+
+
+def rounded(value: float, error: float) -> str:
+    """A value to the second digit of its standard error, and to five digits at least: 1.49938 for an error of 0.00037.
+
+    Five digits where the error is 0 or not finite.
+    """
+    digits = 5
+    if value and error > 0.0 and math.isfinite(value) and math.isfinite(error):
+        digits = max(digits, math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2)
+    return f"{value:.{min(digits, 15)}g}"
 
 
 def with_prefix(value: float, unit: str, *, digits: int = 3) -> str:

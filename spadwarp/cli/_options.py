@@ -248,7 +248,7 @@ def show_table(table: Table) -> None:
     """A table on stdout, as wide as the terminal; 160 columns elsewhere."""
     from rich.console import Console
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)  # "[m]" is a unit
     if not console.is_terminal:
-        console = Console(highlight=False, width=160)
+        console = Console(highlight=False, markup=False, width=160)
     console.print(table)

@@ -73,13 +73,12 @@ def table_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
 
 def new_table(first: str, *titles: str) -> Table:
     from rich import box
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column(escape(first), no_wrap=True)
+    table.add_column(first, no_wrap=True)
     for title in titles:
-        table.add_column(escape(title), justify="right", no_wrap=True)
+        table.add_column(title, justify="right", no_wrap=True)
     return table
 
 

@@ -231,9 +231,7 @@ def _comparison_table(found: Sequence[Comparison]) -> Table:
     for one in found:
         interval = "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}"
         rates = (_with_spread(one.before, one.spread_before), _with_spread(one.now, one.spread_now))
-        table.add_row(
-            f"{one.case} [{one.unit}/s]".replace("[", r"\["), one.verdict, *rates, f"{one.ratio:.3f}", interval
-        )
+        table.add_row(f"{one.case} [{one.unit}/s]", one.verdict, *rates, f"{one.ratio:.3f}", interval)
     return table
 
 

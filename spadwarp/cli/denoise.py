@@ -131,9 +131,10 @@ def denoise(
         try:
             done = denoise_file(one, out, **settings)
         except (ConfigError, FileError, ArgumentError) as error:
+            text = str(error) if isinstance(error, FileError) else f"{one}: {error}"
             if len(paths) == 1:
-                raise
-            complain(f"error: {error}" if isinstance(error, FileError) else f"error: {one}: {error}")
+                raise type(error)(text) from None
+            complain(f"error: {text}")
             failed += 1
             continue
         there = float(np.isfinite(done.depth).mean())

@@ -14,6 +14,7 @@ from spadwarp.cli._app import app, complain, say
 from spadwarp.cli._progress import progress
 from spadwarp.cli._tables import new_table
 from spadwarp.cli._unknowns import Prior, UnknownNames, pairs
+from spadwarp.units import rounded
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -132,12 +133,11 @@ def fit(
 def _table(found: Fit) -> Table:
     table = new_table("estimate", "value", "±", "95 % interval", "start", "noise of\nsimulation")
     for one in found.estimates.values():
-        low, high = one.interval
         table.add_row(
             f"{one.name} [{one.unit}]" if one.unit else one.name,
-            f"{one.value:.5g}",
+            rounded(one.value, one.standard_error),
             f"{one.standard_error:.2g}",
-            f"{low:.5g} to {high:.5g}",
+            " to ".join(rounded(end, one.standard_error) for end in one.interval),
             f"{one.start:.4g}",
             f"{100 * one.simulation:.2g} %",
         )

@@ -32,11 +32,12 @@ def init(
     """
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
     opt.check_outputs(files={"NAME": path}, overwrite=overwrite)
+    out = f"{path.with_suffix('')}/"
     if example is None:
-        text = spadwarp.scene.template().replace(" scene.toml ", f" {path} ")
+        text = spadwarp.scene.template().replace("out/", out).replace(" scene.toml ", f" {path} ")
     else:
         text = spadwarp.io.example_or_path(example, "scenes").read_text(encoding="utf-8")
     spadwarp.io.write_text(text, path)
     if not quiet:
         say(f"written: {path}")
-        say(f"next: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out out/")
+        say(f"next: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")

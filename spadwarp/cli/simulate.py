@@ -47,7 +47,11 @@ def simulate(
     ] = False,
     uncertainty: Annotated[
         bool,
-        typer.Option("--uncertainty", help="Keep batches for the standard error of every bin; twice the memory."),
+        typer.Option(
+            "--uncertainty",
+            help="Keep batches for the standard error of every bin; twice the memory. --photons is rounded up to whole "
+            "batches.",
+        ),
     ] = False,
     relative_error: Annotated[
         float | None,

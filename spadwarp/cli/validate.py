@@ -75,6 +75,7 @@ def validate(
 def _table(results: Sequence[CaseResult]) -> Table:
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("case", no_wrap=True)
@@ -90,7 +91,7 @@ def _table(results: Sequence[CaseResult]) -> Table:
             f"{one.reference:.6g}",
             f"{one.standard_error:.2g}",
             f"{one.z:+.2f}",
-            "[green]ok[/]" if one.passed else "[bold red]FAILED[/]",
+            Text("ok", "green") if one.passed else Text("FAILED", "bold red"),
         )
         before = one.name
     return table

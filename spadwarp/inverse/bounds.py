@@ -170,8 +170,8 @@ def bounds(
         names, covariance, [values[name] > 0 and name != DEPTH for name in names]
     )
     if solution.simulation_share > SIMULATION:
-        share = 100 * solution.simulation_share
-        warnings.append(f"the noise of the simulation is {share:.2g} % of that of the counts, above 10 %: more photons")
+        share = float(f"{100 * solution.simulation_share:.2g}")
+        warnings.append(f"the noise of the simulation is {share:g} % of that of the counts, above 10 %: more photons")
     return Bounds(
         bounds=found,
         names=names,

@@ -60,8 +60,10 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         ArgumentError: Counts that do not fit the scene, or are no counts.
         FileError: A file that cannot be read.
     """
+    name = "counts"
     if isinstance(counts, str | os.PathLike):
         path = Path(counts)
+        name = str(path)
         own = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
         counts = FramesFile.load(path) if own else read_histograms(path, **facts)
     gate = scene.gate
@@ -79,10 +81,10 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         start, irf, values = counts.gate_start, counts.irf, counts.values
         width = width if counts.bin_width is None else counts.bin_width
     pulses = scene.detector.pulses_per_frame if pulses is None else check_integer("pulses", pulses, "[1, 1e15]")
-    cube, frames = _added_up(values, scene)
+    cube, frames = _added_up(values, scene, name)
     if abs(width / gate.bin_width - 1.0) > 1e-6:
         raise ArgumentError(
-            f"counts: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
+            f"{name}: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
         )
     return Exposure(
         counts=cube,
@@ -93,18 +95,18 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
     )
 
 
-def _added_up(values: Any, scene: Scene) -> tuple[NDArray[np.int64], int]:
-    """Counts `[pixel, bin]` over all frames, and the number of these."""
+def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], int]:
+    """Counts `[pixel, bin]` over all frames, and the number of these; `name`: of the counts, for messages."""
     array = np.asarray(values)
     if array.ndim not in (3, 4) or array.size == 0 or array.dtype.kind not in "biuf":
-        raise ArgumentError(f"counts: {array.dtype} {array.shape}; [H, W, T] or [frames, H, W, T] is needed")
+        raise ArgumentError(f"{name}: {array.dtype} {array.shape}; [H, W, T] or [frames, H, W, T] is needed")
     image = (scene.camera.height, scene.camera.width)
     if array.shape[-3:-1] != image:
-        raise ArgumentError(f"counts: an image of {array.shape[-3:-1]}; that of the scene, {image}, is needed")
+        raise ArgumentError(f"{name}: an image of {array.shape[-3:-1]}; that of the scene, {image}, is needed")
     if array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
-        raise ArgumentError("counts: rates, not whole counts; how sure they are is not known")
+        raise ArgumentError(f"{name}: rates, not whole counts; how sure they are is not known")
     if array.min() < 0:
-        raise ArgumentError(f"counts: {array.min()} is outside [0, inf)")
+        raise ArgumentError(f"{name}: {array.min()} is outside [0, inf)")
     frames = array.shape[0] if array.ndim == 4 else 1
     total = array.sum(axis=0, dtype=np.int64) if array.ndim == 4 else array.astype(np.int64)
     return total.reshape(-1, total.shape[-1]), frames

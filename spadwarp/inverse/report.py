@@ -131,9 +131,9 @@ def _warnings(
     if not converged:
         found.append("not converged: the last step still promised more likelihood than the noise of the counts")
     if solution.simulation_share > 0.1:
-        share = 100 * solution.simulation_share
+        share = float(f"{100 * solution.simulation_share:.2g}")
         found.append(
-            f"the noise of the simulation is {share:.2g} % of that of the counts in the variances, above 10 %: give "
+            f"the noise of the simulation is {share:g} % of that of the counts in the variances, above 10 %: give "
             "more photons; the standard errors contain it"
         )
     free = [name not in prior for name in names]

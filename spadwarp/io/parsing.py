@@ -142,7 +142,7 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
                 row = []
             if len(row) < len(columns):
                 if rows or named:
-                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)}")
+                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
                 named = True
                 continue
             for value, (name, within) in zip(row, columns.items(), strict=True):

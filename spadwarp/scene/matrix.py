@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.errors import ConfigError
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.targets import Target
 from spadwarp.scene.transport import Transport
@@ -28,7 +29,10 @@ def scattering_matrix(medium: Medium) -> Matrix | None:
     Raises `FileError` or `ConfigError` if its table cannot be read.
     """
     if medium.scattering_matrix == "tabulated":
-        return read_matrix_table(str(medium.matrix_table))
+        try:
+            return read_matrix_table(str(medium.matrix_table))
+        except ConfigError as error:
+            raise ConfigError(f"medium.matrix_table: {error}") from None
     return {
         "none": None,
         "rayleigh": partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio),

@@ -89,7 +89,10 @@ def phase_function(medium: Medium) -> PhaseFunction:
             if table in PHASE_TABLES
             else Path(table)
         )
-        angles, values = read_columns(path, PHASE_COLUMNS).T
+        try:
+            angles, values = read_columns(path, PHASE_COLUMNS).T
+        except ConfigError as error:
+            raise ConfigError(f"medium.phase_table: {error}") from None
         try:
             density = sk.interpolated_density(np.radians(angles), values)
             first_angle = math.radians(float(angles[0]))

@@ -68,9 +68,10 @@ def draw_dataset(
     strip_bar(bars[1], Normalize(0.0, 1.0), INTENSITY_MAP, "recorded photons, relative to the brightest", bars=2)
     note = (
         "Each frame: true depth, measured depth (light: none), recorded photons (brightest: their 99.5th percentile). "
-        "c r: attenuation lengths one way, c being the water's extinction and r the range of the target. BS: "
-        "backscatter fraction, the part of the pixels that report backscatter."
+        "c r: attenuation lengths one way, c being the water's extinction and r the range of the target."
     )
+    if not all(math.isnan(float(item["backscatter_fraction"])) for item in items):
+        note += " BS: backscatter fraction, the part of the pixels that report backscatter."
     return save(figure, path, note=note)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from spadwarp.units import rounded
 from spadwarp.viz.panels import Panels, shown_limits
 from spadwarp.viz.style import BLUE, ERROR_MAP, PAGE, RED, TEXT, log_axis, paper, save, spaced
 
@@ -60,7 +61,8 @@ def fit_figure(fit: Fit, width: float = PAGE) -> Figure:
     reach = max(3.5, 1.1 * float(np.abs(left).max()))
     bottom.set(ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
     values = "; ".join(
-        f"{one.name} = {one.value:.4g} ± {one.standard_error:.2g} {one.unit}".rstrip() for one in fit.estimates.values()
+        f"{one.name} = {rounded(one.value, one.standard_error)} ± {one.standard_error:.2g} {one.unit}".rstrip()
+        for one in fit.estimates.values()
     )
     panels.caption(f"{values}; {spaced(fit.pulses)} pulses" if values else f"{spaced(fit.pulses)} pulses")
     return panels.figure

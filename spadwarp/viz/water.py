@@ -43,10 +43,12 @@ def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None,
     figure = new_figure(width, 0.34 * width)
     mesh = build_mesh(scene) if mesh is None else mesh
     axes = figure.subplots(1, 2)
-    for axis, across, title in zip(axes, (0, 1), ("from above", "from the side"), strict=True):
-        image = draw_slice(axis, scene, mesh, across)
+    images = [draw_slice(axis, scene, mesh, across) for across, axis in enumerate(axes)]
+    for axis, title in zip(axes, ("from above", "from the side"), strict=True):
         axis.set_title(title)
-    figure.colorbar(image, ax=axes, label="extinction [1/m]", shrink=0.9)
+    drawn = [image.get_array().max() for image in images]
+    extend = "max" if max(drawn) > images[0].norm.vmax else "neither"
+    figure.colorbar(images[0], ax=axes, label="extinction [1/m]", shrink=0.7, extend=extend)
     return save(figure, path)
 
 

@@ -6,6 +6,8 @@ import typer
 
 from helpers.cli import run
 from spadwarp.cli import app
+from spadwarp.cli._options import show_table
+from spadwarp.cli._tables import new_table
 
 
 def commands(group, path=()):
@@ -89,3 +91,11 @@ def test_a_gate_in_time_needs_the_index(tmp_path):
     common = ("denoise", tmp_path / "depth.npy", "--model", "median", "--out", tmp_path / "out")
     assert "--group-index" in run(*common, "--gate", "90ns:110ns", code=2).stderr
     assert "ambiguous" in run(*common, "--gate", "9:11m", code=2).stderr
+
+
+def test_tables_keep_units_in_brackets(capsys):
+    table = new_table("range [m]", "error [mm]")
+    table.add_row("depth [m]", "1 [ps]")
+    show_table(table)
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in ("range [m]", "error [mm]", "depth [m]", "1 [ps]"))

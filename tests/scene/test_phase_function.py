@@ -105,7 +105,8 @@ def test_a_table_may_have_comments_and_a_line_of_names(tmp_path):
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("0,1\n90\n", "line 2: '90' is not angle_deg,value"),
+        ("0,1\n90,nan\n", "medium.phase_table: .*line 2: '90,nan' is not angle_deg,value in finite numbers"),
+        ("0,1\n90\n", "line 2: '90' is not angle_deg,value in finite numbers"),
         ("0,1\n90,x\n", "line 2"),
         ("0,1\n", "two or more"),
         ("90,1\n0,1\n", "ascending"),
