@@ -30,7 +30,9 @@ __all__ += ["write_run"]
 CHECKPOINT = "checkpoint.h5"
 """Name of the partial result of an unfinished run."""
 
-_PICTURES = (f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf"))
+_PICTURES = tuple(
+    f"{name}.{ending}" for name in ("depth", "intensity", "histogram", "truth") for ending in ("png", "pdf")
+)
 RUN_FILES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr", CHECKPOINT, *_PICTURES)
 """Names of all files that the directory of a run may have."""
 
@@ -76,16 +78,20 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
         if output.result:  # photons must not be lost
             _save(result, folder / "result.h5")
         raise
-    with Forked(calls) as pictures:
-        if output.result:
-            written.append(_save(result, folder / "result.h5"))
-        with atomic_path(folder / "scene.toml") as temporary:
-            temporary.write_text(scene.to_toml(), encoding="utf-8")
-        written.append(folder / "scene.toml")
-        if output.exr:
-            written.append(save_depth_exr(result, depth, folder / "depth.exr"))
-            written.append(save_truth_maps(result, folder / "truth.exr"))
-        written += itertools.chain.from_iterable(pictures.results())
+    try:
+        with Forked(calls) as pictures:
+            if output.result:
+                written.append(_save(result, folder / "result.h5"))
+            with atomic_path(folder / "scene.toml") as temporary:
+                temporary.write_text(scene.to_toml(), encoding="utf-8")
+            written.append(folder / "scene.toml")
+            if output.exr:
+                written.append(save_depth_exr(result, depth, folder / "depth.exr"))
+                written.append(save_truth_maps(result, folder / "truth.exr"))
+            written += itertools.chain.from_iterable(pictures.results())
+    finally:
+        for name in _PICTURES:  # of processes that were ended
+            remove_temporaries(folder / name)
     remove_checkpoint(folder)
     for name in set(RUN_FILES) - set(keep) - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)

@@ -1,5 +1,7 @@
 """`simulate`: what it writes, what it refuses; and that it says what Python says."""
 
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, tables
+from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import read_exr
 from spadwarp.result.file import load_truth_maps
 from spadwarp.run import write_run
@@ -172,6 +175,24 @@ def test_result_survives_pictures_that_cannot_be_loaded(scene, tmp_path, monkeyp
     with pytest.raises(ImportError, match="broken"):
         write_run(result, tmp_path)
     assert spadwarp.load_result(tmp_path / "result.h5").photons == 1000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="pictures are not drawn by processes of their own")
+def test_an_interrupt_leaves_no_parts_of_pictures(scene, tmp_path, monkeypatch):
+    def draw():
+        with atomic_path(tmp_path / "depth.png"):
+            time.sleep(60.0)
+
+    def interrupted(*_):
+        while not any(tmp_path.iterdir()):
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("spadwarp.run.directory._pictures", lambda *_: [draw])
+    monkeypatch.setattr("spadwarp.run.directory._save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_run(spadwarp.simulate(scene, photons=1000, device="cpu"), tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_result_that_cannot_be_written_finds_a_refuge(scene, tmp_path, monkeypatch):
