@@ -225,7 +225,8 @@ def estimate_frames(
     place = torch_device(device)
     if model != "pyramid":
         precision = "float32"
-    network = load_network(model, weights, str(place), precision or fast_precision(str(place)))
+    kind = precision or fast_precision(str(place))
+    network = load_network(model, weights, str(place), kind)
     inputs = None
     if model != "pyramid":
         inputs = frames.network_input(histograms=model == "histograms", fills=model in ("dncnn", "usdn"))
@@ -234,7 +235,7 @@ def estimate_frames(
     # glibc returns memory to the system after each frame, and fresh pages take as long as half the network, unless a
     # block this large (at most 32 MiB) was freed before: M_TRIM_THRESHOLD in mallopt(3).
     torch.empty(31 << 20, dtype=torch.uint8)
-    answers = torch.empty(3, *frames.depth.shape)
+    answers, finite = torch.empty(3, *frames.depth.shape), True
     for first in range(0, len(frames.depth), part):
         some = slice(first, first + part)
         with torch.inference_mode():
@@ -245,9 +246,11 @@ def estimate_frames(
                     (depth - begin) / extent, torch.from_numpy(frames.density[some]).to(place)
                 )
                 output = network(given).float()
+                finite &= bool(output.isfinite().all())
                 output[:, 0].clamp_(0.0, 1.0).mul_(width[:, None, None]).add_(start[:, None, None])
             else:
                 output = network(torch.from_numpy(inputs[some]).to(place)).float()
+                finite &= bool(output.isfinite().all())
                 output[:, 0].clamp_(0.0, 1.0)
             found = output[:, 0].mul_(extent).add_(begin)
             probability, confidence = reported.float(), torch.full_like(found, torch.nan)
@@ -259,6 +262,10 @@ def estimate_frames(
             answers[2, some] = confidence
         if progress is not None:
             progress("frames", min(first + part, len(frames.depth)), len(frames.depth))
+    if not finite:  # values beyond the range of float16, or weights that are not finite
+        if kind == "float32" or precision is not None:
+            raise ArgumentError(f"precision = {kind!r}: the network {model!r} gave values that are not finite")
+        return estimate_frames(frames, model=model, weights=weights, device=device, precision="float32")
     return Estimate(*answers.numpy())
 
 

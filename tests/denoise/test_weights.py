@@ -125,6 +125,23 @@ def test_layers_in_bfloat16_answer_as_those_in_float32():
     assert np.abs(first.target_probability - second.target_probability).mean() < 1e-3
 
 
+def test_values_beyond_the_range_of_float16_are_computed_in_float32_or_refused(monkeypatch):
+    frames = depth_frames(noisy_frame(scene(64, 64)), gate=GATE)
+    load = inference.load_network
+
+    def overflowing(model, weights=None, device="cpu", precision="float32"):
+        network = load(model, weights, device, "float32")
+        return network if precision == "float32" else lambda given: network(given) * torch.inf
+
+    monkeypatch.setattr(inference, "load_network", overflowing)
+    monkeypatch.setattr(inference, "fast_precision", lambda device: "float16")
+    exact = inference.estimate_frames(frames, model="pyramid", device="cpu", precision="float32")
+    found = inference.estimate_frames(frames, model="pyramid", device="cpu")
+    np.testing.assert_array_equal(found.depth, exact.depth)
+    with pytest.raises(ArgumentError, match="precision = 'float16': the network 'pyramid' gave values that are not"):
+        inference.estimate_frames(frames, model="pyramid", device="cpu", precision="float16")
+
+
 def test_a_shift_by_a_pixel_hardly_changes_the_answer():
     noisy = noisy_frame(np.nan_to_num(scene(97, 129), nan=15.0))
     first, second = denoised(noisy[:-1, :-1]), denoised(noisy[1:, 1:])
