@@ -86,6 +86,8 @@ def in_words(error: BaseException) -> str | None:
     deeply.
     """
     short = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+    # Python's parser loses the MemoryError and says "error return without exception set".
+    short = short or (isinstance(error, SystemError) and address_space() is not None)
     if short or (isinstance(error, OSError | ImportError | RuntimeError) and _names_memory(error)):
         return f"not enough memory{_limit_of_memory()}" + (f": {_one_line(error)}" if str(error) else "")
     if isinstance(error, OSError) and error.strerror:

@@ -112,7 +112,7 @@ class HistogramFile:
             self._events = file.stored("event_count", _COUNTS, (len(self._index),))
             if self._starts[0] != 0 or self._starts[-1] != len(self._index) or (np.diff(self._starts) < 0).any():
                 file.refuse("event_start", f"does not divide {len(self._index)} events")
-        self._path = file.path
+        self.path = file.path
 
     def expected(self, scene: int) -> NDArray[np.float32] | None:
         """Expected counts of a frame `[H, W, T]`; None for a scene that was not traced."""
@@ -135,7 +135,7 @@ class HistogramFile:
         part = slice(int(self._starts[row]), int(self._starts[row + 1]))
         index = self._index[part]
         if index.size and index.max() >= math.prod(self.shape):
-            raise FileError(f"{self._path}: event_index is outside the histograms {self.shape} in row {row}")
+            raise FileError(f"{self.path}: event_index is outside the histograms {self.shape} in row {row}")
         return _cube(index, self._events[part], self.shape, np.float32)
 
 

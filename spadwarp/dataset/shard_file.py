@@ -160,12 +160,14 @@ class ShardFile:
         return np.moveaxis(image, -1, 0) if name == "normal" else image[None]
 
     def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
-        cube = None
+        cube, path = None, self.frames.path
         if self.histograms is not None:
             number = int(self.columns["sample" if name == "counts" else "scene"][row])
             cube = getattr(self.histograms, name)(number)
+            if name not in self.histograms.fields:
+                path = self.histograms.path
         if cube is None:
-            raise FileError(f"{self.frames.path}: frame {int(self.columns['sample'][row])} has no {name!r}")
+            raise FileError(f"{path}: frame {int(self.columns['sample'][row])} has no {name!r}")
         return cube
 
     def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:

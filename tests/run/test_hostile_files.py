@@ -26,6 +26,10 @@ SMALL = {
     "gate.bins": 32,
     "scene.camera.width": 12,
     "scene.camera.height": 8,
+    "scene.camera.polarisation": "analyser",
+    "scene.laser.polarisation": "linear",
+    "scene.transport.axis_threshold": 1.0,
+    "scene.medium.scattering_matrix": "scaled_rayleigh",
     "monte_carlo.share": 1.0,
     "monte_carlo.photons": 10_000,
 }
