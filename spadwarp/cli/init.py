@@ -34,7 +34,7 @@ def init(
     opt.check_outputs(files={"NAME": path}, overwrite=overwrite)
     out = f"{path.with_suffix('')}/"
     if example is None:
-        text = spadwarp.scene.template().replace("out/", out).replace(" scene.toml ", f" {path} ")
+        text = spadwarp.scene.template().replace("out/", out).replace(" scene.toml", f" {path}")
     else:
         text = spadwarp.io.example_or_path(example, "scenes").read_text(encoding="utf-8")
     spadwarp.io.write_text(text, path)

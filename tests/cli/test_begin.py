@@ -23,7 +23,8 @@ def test_init_writes_a_scene_that_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     printed = run("init", "mine").stdout
     assert "written: mine.toml" in printed and "--out mine/" in printed
-    assert "spadwarp plan mine.toml" in Path("mine.toml").read_text()
+    text = Path("mine.toml").read_text()
+    assert "spadwarp plan mine.toml" in text and text.count("mine.toml") == 3 and "scene.toml" not in text
     scene = spadwarp.load_scene("mine.toml")
     assert [str(one) for one in spadwarp.check(scene) if one.level == "warning"] == []
     assert "mine.toml exists; --overwrite" in run("init", "mine", code=2).stderr
