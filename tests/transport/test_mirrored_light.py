@@ -21,13 +21,14 @@ def tank(**sections):
 
 CASES = {
     "water": tank(),
-    "rotated, roulette": tank(
-        camera={"rotation_deg": [12.0, -8.0, 25.0], "position": [0.05, 0.1, 0.1]},
+    "port, rotated, roulette": tank(
+        camera={
+            "port": {"shape": "flat", "distance": 0.1},
+            "horizontal_fov_deg": 60.0,
+            "rotation_deg": [12.0, -8.0, 25.0],
+            "position": [0.05, 0.1, 0.1],
+        },
         transport={"termination": "roulette", "weight_cutoff": 0.3},
-    ),
-    "port, layers": tank(
-        camera={"port": {"shape": "flat", "distance": 0.1}, "horizontal_fov_deg": 60.0},
-        medium={"layers": [{"start": 1.0, "extinction": 1.2, "albedo": 0.6}]},
     ),
 }
 
