@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.frames import depth_frames
+from spadwarp.denoise.frames import MARGIN, depth_frames
 from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
@@ -111,7 +111,7 @@ def denoise_file(
         out: The folder.
         model, weights, device, precision: See `spadwarp.denoise.estimate`.
         mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
-        gate: (start, stop) in depth [m]; default: the file's, else from the nearest to the farthest depth in it.
+        gate: (start, stop) in depth [m]; of histograms only the bins within it count. Default: the file's, else all.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
         reading: Arguments of `read_depth`.
 
@@ -121,12 +121,12 @@ def denoise_file(
     """
     folder, name = Path(out), Path(path).stem
     if folder.resolve() == Path(path).resolve().parent:
-        raise ArgumentError(
-            f"out = {folder} is the folder of {path}; another is needed, so that nothing is overwritten"
-        )
+        raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
     if mask is not None and not 0.0 <= mask <= 1.0:
         raise ArgumentError(f"mask = {mask} is outside [0, 1]")
     read = read_depth(path, **reading)
+    if gate is not None and read.histograms is not None:
+        read = _read_within(read, gate, reading)
     notes = [read.source]
     gate = gate or read.gate
     if gate is None:
@@ -136,6 +136,8 @@ def denoise_file(
         low, high = float(valid.min()), float(valid.max())
         gate = (low, high if high > low else 1.001 * low)
         notes.append(f"gate {gate[0]:.4g} to {gate[1]:.4g} m, from the nearest to the farthest depth of the file")
+    else:
+        _check_gate(gate, read.depth)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         counts = read.histograms if model in ("pyramid", "histograms", *CLASSICAL) else None
@@ -144,7 +146,7 @@ def denoise_file(
             model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
             found, second = _from_counts(
-                read, counts, gate, profile, model, weights, reading.get("group_index"), device
+                read, counts, profile, model, weights, float(reading.get("group_index") or 1.0), device
             )
         else:
             second = None
@@ -152,8 +154,7 @@ def denoise_file(
             found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
         depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
-    empty = np.count_nonzero(np.isnan(depth).all(axis=(1, 2)))
-    if empty:
+    if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
         notes.append(f"{100 * np.isfinite(second).mean():.2g} % of the pixels have a second return")
@@ -166,6 +167,15 @@ def denoise_file(
         depth=depth, target_probability=found.target_probability, threshold=threshold, confidence=found.confidence,
         gate=gate, files=tuple(files), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _check_gate(gate: tuple[float, float], depth: NDArray[np.float32]) -> None:
+    """Refuses a gate that no depth of the file lies in or near; a file without any depth stays empty."""
+    slack = MARGIN * (gate[1] - gate[0])
+    valid = depth[np.isfinite(depth) & (depth > 0)]
+    if valid.size and gate[0] < gate[1] and not ((valid >= gate[0] - slack) & (valid <= gate[1] + slack)).any():
+        extent = f"{valid.min():.4g} to {valid.max():.4g} m"
+        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds no depth of the file, which are {extent}")
 
 
 def _write(
@@ -304,26 +314,25 @@ def _estimate_depth(
 def _from_counts(
     read: DepthReading,
     histograms: Histograms,
-    gate: tuple[float, float],
     profile: NDArray[np.float64] | None,
     model: str,
     weights: str | Path | None,
-    group_index: float | None,
+    group_index: float,
     device: str | None,
 ) -> tuple[Estimate, NDArray[np.float32]]:
     """The estimate of a method that uses counts, in the bins that hold the target; and second returns [m]."""
-    scene, width = histograms.scene, float(histograms.bin_width or 0.0)
+    width = float(histograms.bin_width or 0.0)
     known = np.asarray(histograms.background, np.float32)
     shape = histograms.values.shape
     known = np.broadcast_to(known, shape[-3:] if known.ndim == 3 else shape[-1:])
-    assert histograms.response is not None
+    assert histograms.response is not None and read.gate is not None
     response = histograms.response.per_bin(width)
-    first, stop, part = target_bins(histograms.values, known, response, gate)
+    first, stop, part = target_bins(histograms.values, known, response, read.gate)
     values, start = histograms.values[..., first:stop], histograms.gate_start + first * width
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
         time = start + place.astype(np.float64) * (values.shape[-1] * width)
-        return range_from_time(time, float(group_index or 1.0)) if scene is None else depth_from_time(time, scene=scene)
+        return _depth_at(time, histograms, group_index)
 
     given: dict[str, Any] = {
         "counts": values, "background": known[..., first:stop], "response": response, "device": device,
@@ -342,6 +351,35 @@ def _from_counts(
         frames = depth_frames(read.depth, gate=part, profile=profile, features=features)
     found = estimate_frames(frames, model=model, weights=weights, device=device)
     return found, _second(found.depth, to_depth, given)
+
+
+def _depth_at(time: NDArray[np.float64], histograms: Histograms, group_index: float) -> NDArray[np.float64]:
+    """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
+    if histograms.scene is None:
+        return range_from_time(time, group_index)
+    return depth_from_time(time, scene=histograms.scene)
+
+
+def _read_within(read: DepthReading, gate: tuple[float, float], reading: dict[str, Any]) -> DepthReading:
+    """The same from those bins alone whose depth lies in a gate [m] in some pixel."""
+    held = read.histograms
+    assert held is not None
+    bins, width, index = held.values.shape[-1], float(held.bin_width or 0.0), reading.get("group_index")
+    times = [np.full(held.values.shape[-3:-1], held.gate_start + width * edge) for edge in (0, bins)]
+    near, far = (_depth_at(time, held, float(index or 1.0)) for time in times)
+    first = max(0, int(np.floor(np.min((gate[0] - near) / (far - near)) * bins + 1e-6)))
+    stop = min(bins, int(np.ceil(np.max((gate[1] - near) / (far - near)) * bins - 1e-6)))
+    if stop <= first:
+        extent = f"{near.min():.4g} to {far.max():.4g} m"
+        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m lies outside the histograms, {extent}")
+    known = held.background
+    if known is not None and known.ndim and known.shape[-1] == bins:
+        known = known[..., first:stop]
+    within = dataclasses.replace(
+        held, values=held.values[..., first:stop], gate_start=held.gate_start + first * width, background=known
+    )
+    found = _estimate_depth(within, reading.get("method"), index, reading.get("device"))
+    return dataclasses.replace(found, truth=read.truth)
 
 
 def _second(
