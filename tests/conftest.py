@@ -7,6 +7,7 @@ import sys
 # Tests run side by side; threads of BLAS and OpenMP that wait for small matrices would take the cores from each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")  # BM3D's, which sets that of torch too
 
 import pytest
 from hypothesis import HealthCheck, settings
