@@ -25,9 +25,14 @@ def ported(camera_port, *, laser_port=None, aperture=0.2, **sections):
 
 CASES = {
     "flat": lambda: ported(WINDOW),
-    "tilted": lambda: ported(WINDOW | {"normal": [0.3, -0.15, 1.0]}, laser_port=WINDOW | {"distance": 0.01}),
-    "dome": lambda: ported(DOME, laser_port="camera"),
-    "lens in front of the dome's centre": lambda: ported(DOME | {"offset": [0.01, 0.0, -0.03]}, aperture=0.1),
+    "tilted": lambda: ported(
+        WINDOW | {"normal": [0.3, -0.15, 1.0]},
+        laser_port=WINDOW | {"distance": 0.01},
+        domain={"shape": "slab", "lower": -1.0, "upper": 3.0},
+    ),
+    "lens in front of the dome's centre": lambda: ported(
+        DOME | {"offset": [0.01, 0.0, -0.03]}, laser_port="camera", aperture=0.15
+    ),
     "from the air": lambda: ported(
         {"distance": 0.7},
         laser_port="camera",
