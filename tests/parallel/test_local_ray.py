@@ -8,7 +8,7 @@ import pytest
 from helpers.cli import ENVIRONMENT
 
 HOST = """
-import subprocess, sys
+import os, subprocess, sys
 import ray
 from spadwarp.parallel import Ray
 from spadwarp.parallel.ray import RayWorkers
@@ -17,8 +17,9 @@ with RayWorkers(Ray(workers=1), "cpu") as workers:
     while not workers.idle:
         workers.wait(0.5)
     stranger = [sys.executable, "-c", sys.argv[1], ray.get_runtime_context().gcs_address]
-    without_token = {name: value for name, value in __import__("os").environ.items() if not name.startswith("RAY_")}
-    print("joined", subprocess.run(stranger, env=without_token, capture_output=True, text=True).stdout)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}  # without token
+    environment["RAY_NUM_REDIS_GET_RETRIES"] = "2"  # attempts, one a second
+    print("joined", subprocess.run(stranger, env=environment, capture_output=True, text=True).stdout)
 """
 STRANGER = """
 import sys
