@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,12 +84,15 @@ class Equations:
         slope: Σ w dm, `[pixel, unknown, unknown]`: minus the derivative of the score by the unknowns (last axis).
         noise: Σ w w v, its covariance by the counts, `[pixel, unknown, unknown]`.
         simulation: Σ w m of each batch of photons less their mean, of the two halves: `[half][batch, pixel, unknown]`.
+        weights: w, the mean of both halves', float32 `[pixel, unknown, bin]`; whatever the unknowns' units are, they
+            are those of the scene.
     """
 
     score: Floats
     slope: Floats
     noise: Floats
     simulation: list[Floats]
+    weights: Rows | None = field(default=None, repr=False)
 
     def times(self, scales: Floats) -> Equations:
         """The equations for unknowns in other units: each unknown is `scales` `[pixel, unknown]` times the new one."""
@@ -99,6 +102,7 @@ class Equations:
             self.slope * left * right,
             self.noise * left * right,
             [part * scales for part in self.simulation],
+            self.weights,
         )
 
 
@@ -129,6 +133,7 @@ def equations(
     score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
     noise = np.zeros_like(slope)
     simulation = [np.zeros((len(half.batches), pixels, unknowns)) for half in halves]
+    mean_weights = np.empty((pixels, unknowns, law.recorded), np.float32)
     cells = [(1, 1, 1)] * unknowns if cells is None else cells
     own = means_of(law, halves, trials, counts, pulses=pulses) if means is None else means
     with ThreadPoolExecutor(core_count()) as pool:
@@ -141,11 +146,12 @@ def equations(
                     score[chosen] += 0.5 * np.matmul(weight, own.rest[1 - i][chosen, :, None])[..., 0]
                 for batch, mean in enumerate(own.batches[1 - i]):
                     simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
-            both = 0.5 * (weights[0][chosen] + weights[1][chosen])
+            both = mean_weights[chosen]
+            np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
             noise[chosen] = np.matmul(both * own.variance[chosen, None], both.transpose(0, 2, 1))
 
         list(pool.map(part, _parts(pixels)))
-    return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation])
+    return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation], mean_weights)
 
 
 class Means(NamedTuple):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.inverse.coarse import blocks_of, coarse_step, in_cells
+from spadwarp.inverse.depth_slope import Local, locally_solved
 from spadwarp.inverse.equations import Law
 from spadwarp.inverse.estimates import Fit, Iteration
 from spadwarp.inverse.exposure import Exposure, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.report import estimates_of
-from spadwarp.inverse.solving import Solution
+from spadwarp.inverse.solving import Solution, solve
 from spadwarp.inverse.start import lidar_start
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, start_value
 from spadwarp.inverse.weighing import solved
@@ -264,19 +265,9 @@ class Fitter:
         photons, level = max(self.photons // _FEW, 8000), None
         for _ in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
-            level, _, solution = solved(
-                self.unknowns,
-                state.scales(self.unknowns, len(trials)),
-                level=level,
-                image=self._image,
-                prior=self._prior_at(state, shared),
-                law=self.law,
-                halves=halves,
-                trials=trials,
-                counts=self.exposure.counts,
-                pulses=self.exposure.pulses,
-            )
-            gain, left = solution.gain, self._left(solution)
+            level, local = self._solved(state, halves, trials, shared, level, photons // (2 * BATCHES))
+            solution = local.solution
+            gain, left = solution.gain, self._left(local)
             state.iterations.append(Iteration(values=state.shared(), gain=gain, photons=photons, coarse=False))
             self._step(state, solution)
             report(", ".join(f"{name} {value:.5g}" for name, value in state.shared().items()))
@@ -290,13 +281,52 @@ class Fitter:
             photons = max(photons, more)
         return halves, solution, converged
 
-    def _left(self, solution: Solution) -> float:
-        """What the log-likelihood can still gain after the step: Newton's error is the square of the step."""
+    def _solved(
+        self,
+        state: _State,
+        halves: list[Half],
+        trials: NDArray[np.float32],
+        shared: Sequence[int],
+        level: int | None,
+        photons: int,
+    ) -> tuple[int, Local]:
+        """The step from a rendering, with the depth's slope where the depth is looked for; and the level of cells."""
+        scales, prior = state.scales(self.unknowns, len(trials)), self._prior_at(state, shared)
+        given: dict[str, Any] = {"law": self.law, "halves": halves, "trials": trials}
+        level, equations, solution = solved(
+            self.unknowns,
+            scales,
+            level=level,
+            image=self._image,
+            prior=prior,
+            counts=self.exposure.counts,
+            pulses=self.exposure.pulses,
+            **given,
+        )
+        is_own = np.array([one.per_pixel for one in self.unknowns])
+        return level, locally_solved(
+            equations,
+            solution,
+            lambda found: solve(found, is_own, prior=prior[1], pull=prior[0]),
+            render=self.render,
+            values=state.values,
+            scales=scales,
+            photons=photons // 2,
+            **given,
+        )
+
+    def _left(self, local: Local) -> float:
+        """What the log-likelihood can still gain after the step.
+
+        Newton's error is the square of the step; of the depth also what the slope changes within its error.
+        """
+        solution = local.solution
         shared = [one for one in self.unknowns if not one.per_pixel]
         if len(shared) < len(self.unknowns):
             return solution.gain
         straight = {"log": 0.5, "depth": self.render.depth_step, "anisotropy": 0.025}
         parts = [step / straight[_kind(one)] for one, step in zip(shared, solution.shared, strict=True)]
+        parts.append(local.bend)
         return solution.gain * min(float(np.max(np.square(parts))), 1.0)
 
     def _step(self, state: _State, solution: Solution) -> None:

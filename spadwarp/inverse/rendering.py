@@ -14,7 +14,7 @@ from spadwarp.frames import InstrumentResponse, Receiver, detector_response
 from spadwarp.frames.window import Window
 from spadwarp.inverse.derivatives import DepthDifference
 from spadwarp.inverse.shifting import shifted
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, with_values
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
 from spadwarp.scene import noise_rate
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import ExpectedLight, LightTracer
@@ -114,8 +114,7 @@ class Renderer:
 
     def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
         """Groups of `photons` · `batches` photons each, which are independent of each other."""
-        shared = {name: float(np.mean(value)) for name, value in values.items()}
-        scene = self._with_focus(with_values(self.scene, shared))
+        shared, scene = self._at(values)
         names = [one.name for one in self.unknowns if one.is_light]
         scored = self._tracer(scene, photons, names)
         plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
@@ -138,6 +137,21 @@ class Renderer:
             rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
             groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
         return groups
+
+    def depth_slope(self, values: Values, *, shift: float, step: float, photons: int) -> Rows:
+        """dλ/d(depth) `[pixel, bin]` by a difference over `shift` ± `step` [m], of photons of its own."""
+        shared, scene = self._at(values)
+        difference = DepthDifference(moved(scene, shift), step, photons=photons, kept=self._kept, **self._choices)
+        receiver = self._receiver(scene, values)
+        place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
+        depth = [one for one in self.unknowns if one.name == DEPTH]
+        rows: Rows = _slopes(receiver, {DEPTH: difference(self._take(photons), photons)}, depth, place)[0]
+        return rows
+
+    def _at(self, values: Values) -> tuple[dict[str, float], Scene]:
+        """One number for each unknown, and the scene with them."""
+        shared = {name: float(np.mean(value)) for name, value in values.items()}
+        return shared, self._with_focus(with_values(self.scene, shared))
 
     @property
     def _limits(self) -> Rows:
