@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ from spadwarp.inverse.rendering import Half, Renderer, Values
 from spadwarp.inverse.solving import Solution
 from spadwarp.inverse.unknowns import DEPTH
 
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
+
 __all__ = ["Local", "locally_solved"]
 
 Floats = NDArray[np.float64]
@@ -31,7 +35,9 @@ _CONSISTENT = 1.5  # ratio of the interval that was found to that of the differe
 _LARGEST = 3.0  # ratio of one difference to that before
 _TRIES = 6
 _LEAST = 1e-5  # of the range of the last bin: positions are float32
-_STRAIGHT = 0.75  # ratio of two slopes that are taken for the same
+_STRAIGHT = 0.75  # ratio of two slopes; below, a warning
+_BATCHES = 4  # of photons of a difference
+_SURE = 3.0  # standard errors by which a slope has to differ from the wide one
 _ONE_SIDED = 0.5  # ratio of the slopes of both sides: below, the flatter one decides
 
 
@@ -41,8 +47,8 @@ class Local:
 
     Attributes:
         solution: The step and its covariance.
-        ratio: The depth's slope over that of the renderer's wide difference; 0 where it is not known how far the
-            depth can move without a change of the counts.
+        ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0 where
+            it is not known how far the depth can move without a change of the counts.
     """
 
     solution: Solution
@@ -53,10 +59,26 @@ class Local:
         """How much of the step may be wrong because the slope changes."""
         return abs(1.0 - 1.0 / self.ratio) if self.ratio > 0.0 else 1.0
 
-    @property
-    def is_straight(self) -> bool:
-        """Whether the slope is that of the wide difference, as far as the noise of the simulation shows it."""
-        return _STRAIGHT < self.ratio < 1.0 / _STRAIGHT
+    def warnings(self, scene: Scene) -> list[str]:
+        """Sentences on light that lies in few bins."""
+        if _STRAIGHT < self.ratio < 1.0 / _STRAIGHT:
+            return []
+        bin_width, depth = scene.gate.bin_width_ps, 1e3 * bin_depth(scene)
+        error = (
+            ""
+            if self.ratio > 0.0
+            else f", and its standard error is that of places anywhere in a bin of {depth:.2g} mm"
+        )
+        return [
+            f"depth: before the instrument response, most light of a pixel lies in one or two bins of {bin_width:.4g} "
+            f"ps; the depth moves it over their edges alone{error}. That of measured counts may be off by a part of "
+            f"{depth:.2g} mm: narrower bins"
+        ]
+
+
+def bin_depth(scene: Scene) -> float:
+    """How much deeper a target is whose light comes a bin later [m]."""
+    return 0.5 * scene.medium.pulse_speed * scene.gate.bin_width
 
 
 def locally_solved(
@@ -88,31 +110,35 @@ def locally_solved(
         return Local(solution, 1.0)
     row = sum(not one.per_pixel for one in render.unknowns[:column])
     rates = 0.5 * (halves[0].rates + halves[1].rates)
-    medium, gate = render.scene.medium, render.scene.gate
-    least = _LEAST * 0.5 * medium.pulse_speed * gate.stop
+    least = _LEAST * 0.5 * render.scene.medium.pulse_speed * render.scene.gate.stop
 
     def interval(found: Solution) -> float:
         return max(NORMAL_95 * math.sqrt(max(found.covariance[row, row], 0.0)), least)
 
     def slopes(shift: float, step: float) -> Floats:
-        rows = render.depth_slope(values, shift=shift, step=step, photons=photons)
-        counts = law.slopes(rates, rows[:, None], trials)
-        found: Floats = np.matmul(equations.weights, counts.transpose(0, 2, 1))[..., 0] * scales
+        found = np.empty((_BATCHES, *scales.shape))
+        for batch in found:
+            rows = render.depth_slope(values, shift=shift, step=step, photons=max(photons // _BATCHES, 1))
+            counts = law.slopes(rates, rows[:, None], trials)
+            batch[:] = np.matmul(equations.weights, counts.transpose(0, 2, 1))[..., 0] * scales
         return found * scales[:, column, None]
 
-    def share(slope: Floats) -> float:
-        return float(slope[:, column].sum() / wide)
+    def share(slope: Floats) -> Floats:
+        shares: Floats = slope[..., column].sum(axis=-1) / wide
+        return shares
 
     wide, step = equations.slope[:, column, column].sum(), interval(solution)
     if not step < _WIDE * render.depth_step:
         return Local(solution, 1.0)
     for _ in range(_TRIES):
-        found = slopes(0.0, step)
-        if not _STRAIGHT < share(found) < 1.0 / _STRAIGHT:
-            flat, steep = sorted((slopes(side * step / 2, step / 2) for side in (-1.0, 1.0)), key=share)
-            found = flat if share(flat) < _ONE_SIDED * share(steep) else 0.5 * (flat + steep)
-        slope, ratio = equations.slope.copy(), share(found)
-        slope[:, :, column] = found
+        batches = slopes(0.0, step)
+        shares = share(batches)
+        if abs(shares.mean() - 1.0) < _SURE * shares.std(ddof=1) / math.sqrt(_BATCHES):
+            return Local(solution, 1.0)
+        flat, steep = sorted((slopes(side * step / 2, step / 2).mean(axis=0) for side in (-1.0, 1.0)), key=share)
+        slope = equations.slope.copy()
+        slope[:, :, column] = flat if share(flat) < _ONE_SIDED * share(steep) else batches.mean(axis=0)
+        ratio = float(slope[:, column, column].sum() / wide)
         local = Local(solve(replace(equations, slope=slope)), ratio) if ratio > 0.0 else None
         needed = math.inf if local is None else interval(local.solution)
         if local is not None and (step / _CONSISTENT < needed < step * _CONSISTENT or needed == step == least):
@@ -121,5 +147,5 @@ def locally_solved(
         if not step < _WIDE * render.depth_step:
             break
     covariance = solution.covariance.copy()
-    covariance[row, row] += (0.5 * medium.pulse_speed * gate.bin_width) ** 2 / 6.0
+    covariance[row, row] += bin_depth(render.scene) ** 2 / 6.0
     return Local(replace(solution, covariance=covariance), 0.0)

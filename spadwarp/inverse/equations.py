@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,7 +92,7 @@ class Equations:
     slope: Floats
     noise: Floats
     simulation: list[Floats]
-    weights: Rows | None = field(default=None, repr=False)
+    weights: Rows
 
     def times(self, scales: Floats) -> Equations:
         """The equations for unknowns in other units: each unknown is `scales` `[pixel, unknown]` times the new one."""

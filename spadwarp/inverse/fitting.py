@@ -40,6 +40,7 @@ _FEWEST, _FEWER, _FEW = 128, 32, 16  # divide the photons: of the first coarse r
 BATCHES = 4  # of photons in each half
 _SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
 _CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
+_PATIENCE = 3  # fine renderings, after which the depth's slope is looked at
 _LEFT = 0.01  # gain for each unknown that a further step would bring: a seventh of a standard error
 SIMULATION = 0.1  # of the variance by the counts
 _STEP = {"log": 1.1, "depth": 0.05, "anisotropy": 0.05}
@@ -188,13 +189,13 @@ class Fitter:
         trials = self.exposure.left() if self.law.first_photon else self._all_pulses()
         if not near:
             self._approach(state, trials, report)
-        halves, solution, converged = self._refine(state, trials, report)
+        halves, local, converged = self._refine(state, trials, report)
         return estimates_of(
             scene=self.scene,
             unknowns=self.unknowns,
             values=state.values,
             start=begin,
-            solution=solution,
+            solution=local.solution,
             scales=state.scales(self.unknowns, len(trials)),
             iterations=state.iterations,
             converged=converged,
@@ -205,7 +206,7 @@ class Fitter:
             edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
             photons=self.render.photons - first,
             seconds=time.perf_counter() - began,
-            warnings=self.render.warnings(),
+            warnings=[*self.render.warnings(), *local.warnings(self.scene)],
         )
 
     def _all_pulses(self) -> NDArray[np.float32]:
@@ -259,27 +260,26 @@ class Fitter:
 
     def _refine(
         self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]
-    ) -> tuple[list[Half], Solution, bool]:
+    ) -> tuple[list[Half], Local, bool]:
         """Fisher scoring with fresh photons: few at first, as many as the noise of the simulation asks for at last."""
         shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
-        photons, level = max(self.photons // _FEW, 8000), None
-        for _ in range(_FINE):
+        photons, level, bent = max(self.photons // _FEW, 8000), None, False
+        for number in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
-            level, local = self._solved(state, halves, trials, shared, level, photons // (2 * BATCHES))
-            solution = local.solution
-            gain, left = solution.gain, self._left(local)
-            state.iterations.append(Iteration(values=state.shared(), gain=gain, photons=photons, coarse=False))
+            look = bent or number >= _PATIENCE
+            level, local = self._solved(state, halves, trials, shared, level, look, photons // (2 * BATCHES))
+            bent = bent or local.ratio != 1.0
+            solution, converged, left = local.solution, self._converged(local), self._left(local)
+            state.iterations.append(Iteration(values=state.shared(), gain=solution.gain, photons=photons, coarse=False))
             self._step(state, solution)
             report(", ".join(f"{name} {value:.5g}" for name, value in state.shared().items()))
-            size = max(len(shared), 1)
-            converged = gain <= _CONVERGED * size or left <= _LEFT * size
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
-            more = min(needed, self.photons, needed if left <= _CONVERGED * size else 4 * photons)
+            more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(shared), 1) else 4 * photons)
             noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
             if converged and not noisy:
                 break
             photons = max(photons, more)
-        return halves, solution, converged
+        return halves, local, converged
 
     def _solved(
         self,
@@ -288,21 +288,22 @@ class Fitter:
         trials: NDArray[np.float32],
         shared: Sequence[int],
         level: int | None,
+        look: bool,
         photons: int,
     ) -> tuple[int, Local]:
-        """The step from a rendering, with the depth's slope where the depth is looked for; and the level of cells."""
+        """The level of cells and the step from a rendering.
+
+        Before a fit ends, and with `look`, the depth's slope is that where the depth is, from so many `photons`.
+        """
         scales, prior = state.scales(self.unknowns, len(trials)), self._prior_at(state, shared)
         given: dict[str, Any] = {"law": self.law, "halves": halves, "trials": trials}
+        counted = {"counts": self.exposure.counts, "pulses": self.exposure.pulses}
         level, equations, solution = solved(
-            self.unknowns,
-            scales,
-            level=level,
-            image=self._image,
-            prior=prior,
-            counts=self.exposure.counts,
-            pulses=self.exposure.pulses,
-            **given,
+            self.unknowns, scales, level=level, image=self._image, prior=prior, **given, **counted
         )
+        wide = Local(solution, 1.0)
+        if not (look or self._converged(wide)):
+            return level, wide
         is_own = np.array([one.per_pixel for one in self.unknowns])
         return level, locally_solved(
             equations,
@@ -311,9 +312,14 @@ class Fitter:
             render=self.render,
             values=state.values,
             scales=scales,
-            photons=photons // 2,
+            photons=photons,
             **given,
         )
+
+    def _converged(self, local: Local) -> bool:
+        """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
+        size = max(sum(not one.per_pixel for one in self.unknowns), 1)
+        return local.solution.gain <= _CONVERGED * size or self._left(local) <= _LEFT * size
 
     def _left(self, local: Local) -> float:
         """What the log-likelihood can still gain after the step.

@@ -44,7 +44,8 @@ def test_an_arrow_is_solved_as_the_whole_matrix():
     slope = factor @ factor.transpose(0, 2, 1)
     score = random.normal(size=(pixels, 4))
     batches = [np.zeros((1, pixels, 4))] * 2
-    found = solve(Equations(score, slope, slope, batches), is_own)
+    weights = np.zeros((pixels, 4, 1), np.float32)
+    found = solve(Equations(score, slope, slope, batches, weights), is_own)
     size = 2 + 2 * pixels
     matrix, right = np.zeros((size, size)), np.zeros(size)
     for p in range(pixels):
