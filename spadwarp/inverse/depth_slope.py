@@ -116,9 +116,10 @@ def locally_solved(
         return max(NORMAL_95 * math.sqrt(max(found.covariance[row, row], 0.0)), least)
 
     def slopes(shift: float, step: float) -> Floats:
+        each = max(photons // _BATCHES, 1)
         found = np.empty((_BATCHES, *scales.shape))
-        for batch in found:
-            rows = render.depth_slope(values, shift=shift, step=step, photons=max(photons // _BATCHES, 1))
+        batches = render.depth_slopes(values, shift=shift, step=step, photons=each, batches=_BATCHES)
+        for batch, rows in zip(found, batches, strict=True):
             counts = law.slopes(rates, rows[:, None], trials)
             batch[:] = np.matmul(equations.weights, counts.transpose(0, 2, 1))[..., 0] * scales
         return found * scales[:, column, None]

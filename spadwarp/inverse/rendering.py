@@ -138,15 +138,15 @@ class Renderer:
             groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
         return groups
 
-    def depth_slope(self, values: Values, *, shift: float, step: float, photons: int) -> Rows:
-        """dλ/d(depth) `[pixel, bin]` by a difference over `shift` ± `step` [m], of photons of its own."""
+    def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
+        """dλ/d(depth) `[pixel, bin]` by differences over `shift` ± `step` [m], each of so many photons of its own."""
         shared, scene = self._at(values)
         difference = DepthDifference(moved(scene, shift), step, photons=photons, kept=self._kept, **self._choices)
         receiver = self._receiver(scene, values)
         place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
         depth = [one for one in self.unknowns if one.name == DEPTH]
-        rows: Rows = _slopes(receiver, {DEPTH: difference(self._take(photons), photons)}, depth, place)[0]
-        return rows
+        lights = (difference(self._take(photons), photons) for _ in range(batches))
+        return [_slopes(receiver, {DEPTH: light}, depth, place)[0] for light in lights]
 
     def _at(self, values: Values) -> tuple[dict[str, float], Scene]:
         """One number for each unknown, and the scene with them."""
