@@ -267,7 +267,7 @@ class Fitter:
         for number in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
             look = bent or number >= _PATIENCE
-            level, local = self._solved(state, halves, trials, shared, level, look, photons // (4 * BATCHES))
+            level, local = self._solved(state, halves, trials, shared, level, look, photons // (2 * BATCHES))
             bent = bent or local.ratio != 1.0
             solution, converged, left = local.solution, self._converged(local), self._left(local)
             state.iterations.append(Iteration(values=state.shared(), gain=solution.gain, photons=photons, coarse=False))

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import spadwarp
 from helpers.cli import DEVICE, run, tables
 from helpers.inverse import TRUTH, UNKNOWN, plate
-from spadwarp.inverse import lidar_start, read_exposure
+from spadwarp.frames import Receiver
+from spadwarp.inverse import Fitter, lidar_start, read_exposure
 
 pytestmark = [pytest.mark.physics, pytest.mark.filterwarnings("ignore::spadwarp.errors.SpadwarpWarning")]
 DETECTORS = {
@@ -70,6 +72,44 @@ def test_each_pixel_has_its_depth(light):
     depth = found.maps["depth"]
     normal = (depth.value - 1.5) / depth.standard_error
     assert np.isfinite(normal).all() and np.abs(normal).max() < 6 and found.estimates == {}
+
+
+# Nearly all light of a pixel in one bin before the response. Half of the response is 12 mm, the error below 1 mm.
+IN_ONE_BIN = {
+    "medium.scattering": 0.1,
+    "laser.pulse_fwhm_ps": 500.0,
+    "laser.half_angle_deg": 12.0,
+    "laser.position": [-0.1, 0.0, 0.0],
+    "laser.pulse_energy": 1e-12,
+    "camera.horizontal_fov_deg": 8.0,
+    "gate.start_ns": 7.0,
+    "gate.bin_width_ps": 200.0,
+    "gate.bins": 50,
+}
+
+
+@pytest.mark.parametrize(("depth", "is_inside"), [(1.5, True), (1.506, False)], ids=["inside a bin", "at its edge"])
+def test_no_error_of_the_depth_is_below_its_bound(depth, is_inside):
+    """Light inside a bin hardly changes when its target moves by less; the bound is that of moves by 1 mm."""
+    places = {step: {"targets[0].translation": [0.0, 0.0, depth + step]} for step in (-1e-3, 0.0, 1e-3)}
+    scenes = {step: plate({**IN_ONE_BIN, **place}) for step, place in places.items()}
+    lights = {step: spadwarp.simulate(one, photons=200_000, seed=1, device="cpu") for step, one in scenes.items()}
+    scene, axis = scenes[0.0], (scenes[0.0].gate.start, scenes[0.0].gate.bin_width)
+    shape = lights[0.0].detections.shape
+    receiver = Receiver.of(scene.detector, scene.laser, shape=shape, axis=axis, device="cpu")
+    near, mean, far = (
+        receiver.hazard(wp.array(one.detections.reshape(64, -1), dtype=wp.float32, device="cpu")).numpy()
+        for one in lights.values()
+    )
+    pulses = 20_000
+    information = pulses * np.sum(((far - near).astype(np.float64) / 2e-3) ** 2 / mean)
+    frames = spadwarp.detect(lights[0.0], pulses=pulses, seed=3, device="cpu")
+    fitter = Fitter(scene, "depth", read_exposure(frames, scene), photons=200_000, seed=5, device="cpu")
+    found = fitter.fit(near=True)
+    estimate = found.estimates["depth"]
+    assert estimate.standard_error > 0.95 * information**-0.5
+    assert abs(estimate.value - depth) < 3 * estimate.standard_error
+    assert any("lies in one or two bins" in text for text in found.warnings) == is_inside
 
 
 def test_start_is_that_of_a_lidar(light):
