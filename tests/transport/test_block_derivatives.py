@@ -18,6 +18,7 @@ pytestmark = pytest.mark.physics
 
 KINDS = ("absorption", "scattering", "extinction")
 NAMES = tuple(f"medium.grid.{kind}" for kind in KINDS)
+WITH_TARGET = (*NAMES, "reflectance")  # what most tests ask for, since each list is a kernel of its own
 WATER = ("medium.absorption", "medium.scattering", "medium.anisotropy", "targets[0].reflectance")
 
 
@@ -42,7 +43,7 @@ def test_blocks_share_the_derivatives_of_one_water(estimator, tracking, everywhe
     whole = spadwarp.simulate(scene(transport=transport), photons=60_000, device=device, derivatives=WATER)
     one = scene(medium={"grid": {**everywhere, "tracking": tracking}}, transport=transport)
     plain = spadwarp.simulate(one, photons=60_000, device=device)
-    result = simulated(one, device, [*NAMES, "reflectance"], (4, 3, 5))
+    result = simulated(one, device, WITH_TARGET, (4, 3, 5))
     # On a GPU products are rounded with sums (FMA), in kernels of two texts not the same ones.
     np.testing.assert_allclose(result.tallies, plain.tallies, rtol=0 if device == "cpu" else 1e-6, atol=device != "cpu")
     assert (result.ledger, result.counters) == (plain.ledger, plain.counters)
@@ -68,7 +69,7 @@ def test_ballistic_light_in_closed_form(everywhere, device):
         camera={"aperture_diameter": 0.02},
         transport={"estimator": "guided"},
     )
-    result = simulated(one, device, blocks=(3, 3, 4))
+    result = simulated(one, device, WITH_TARGET, (3, 3, 4))
     light = result.component("ballistic").sum()
     for name in NAMES:
         lengths = -result.derivatives[name][..., 0, :, :, :].sum(axis=(3, 4, 5)) / light
@@ -160,7 +161,7 @@ def test_central_differences_in_a_plume(tmp_path, device):
 
 def test_files_merge_and_resume(everywhere, tmp_path):
     one = scene(medium={"grid": {**everywhere, "tracking": "delta"}}, transport={"estimator": "next_event"})
-    asked = one, "cpu", NAMES, (2, 1, 5)
+    asked = one, "cpu", WITH_TARGET, (2, 1, 5)
     whole = simulated(*asked, 4096, uncertainty=True)
     halves = [simulated(*asked, 4096, uncertainty=True, shard=(k, 2)) for k in (1, 2)]
     resumed = spadwarp.simulate(one, photons=4096, device="cpu", resume=simulated(*asked, 2048))
