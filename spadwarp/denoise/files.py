@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import MARGIN, depth_frames
-from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
+from spadwarp.denoise.histogram_inputs import dim_pixels, features_of_histograms, target_bins
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, weights_metadata
@@ -127,8 +127,7 @@ def denoise_file(
     read = read_depth(path, **reading)
     if gate is not None and read.histograms is not None:
         read = _read_within(read, gate, reading)
-    notes = [read.source]
-    gate = gate or read.gate
+    notes, gate = [read.source], gate or read.gate
     if gate is None:
         valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
         if valid.size == 0:
@@ -301,12 +300,13 @@ def _estimate_depth(
     gate_stop = histograms.gate_start + bins * float(histograms.bin_width or 0.0)
     depth = reduced.values.astype(np.float32)
     depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
+    dim = [] if counted else dim_pixels(histograms)
     return DepthReading(
         depth=depth,
         frames=reduced.frames > 1,
         gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
         profile=_profile(histograms),
-        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes]),
+        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
         histograms=histograms if counted else None,
     )
 

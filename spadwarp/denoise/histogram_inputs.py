@@ -12,8 +12,9 @@ from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.gates import bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.errors import ArgumentError
+from spadwarp.frames.measured import Histograms
 
-__all__ = ["features_of_histograms", "histogram_tensors", "target_bins"]
+__all__ = ["dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
 
 
 def features_of_histograms(
@@ -85,3 +86,23 @@ def target_bins(
     first, stop = bins_of_target(cubes, level, np.asarray(response, np.float32))
     width = (gate[1] - gate[0]) / cubes.shape[-1]
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
+
+
+def dim_pixels(histograms: Histograms) -> list[str]:
+    """A note where pixels of expected histograms receive little light, but more than backscatter; none below 1 %.
+
+    Expected light has no threshold: a pixel beside a target has the depth of the little light that water scattered into
+    it, as smooth as that of the target, where a camera would report nothing.
+    """
+    values, known = histograms.values, histograms.background
+    signal, background = values.sum(axis=-1, dtype=np.float64), np.zeros(())
+    if known is not None and known.ndim and known.shape[-1] == values.shape[-1]:
+        background = known.sum(axis=-1, dtype=np.float64)
+        signal = signal - background
+    dim = float(((signal < 0.05 * np.quantile(signal, 0.9)) & (signal > background)).mean())
+    if dim < 0.01:
+        return []
+    return [
+        f"{100 * dim:.2g} % of the pixels receive less than 5 % of the light of the bright ones: a depth there may be "
+        "that of light scattered from beside, and count as a target; spadwarp detect draws the counts of a camera"
+    ]

@@ -1,4 +1,4 @@
-"""The gate that a user gives with a file."""
+"""What denoising of a file does with the gate that a user gives, and what it notes."""
 
 import numpy as np
 import pytest
@@ -37,3 +37,15 @@ def test_of_histograms_only_the_bins_within_the_gate_count(model, tmp_path):
     assert found.depth == pytest.approx(150.5 * METRES, abs=0.3 * METRES)
     with pytest.raises(ArgumentError, match=r"outside the histograms, 0 to 3.07 m"):
         denoise_file(tmp_path / "counts.npy", tmp_path / "other", gate=(30.0, 32.0), **options)
+
+
+def test_dim_pixels_of_expected_light_are_noted(tmp_path):
+    """Columns beside a target that receive 1 % of its light, at the same time of flight."""
+    rates = np.full((16, 16, 64), 1e-6)
+    rates[..., 30:33] += np.where(np.arange(16) < 4, 0.01, 1.0)[:, None]
+    np.save(tmp_path / "rates.npy", rates)
+    options = {"model": "median", "irf": instrument_response(pulse_fwhm=0.0, jitter_fwhm=200e-12), **KNOWN}
+    found = denoise_file(tmp_path / "rates.npy", tmp_path / "out", **options)
+    assert "25 % of the pixels receive less than 5 % of the light" in found.notes[0]
+    np.save(tmp_path / "rates.npy", rates[:, 4:])
+    assert "of the light" not in denoise_file(tmp_path / "rates.npy", tmp_path / "out", **options).notes[0]
