@@ -200,13 +200,34 @@ def _make_extinction_at(spec: TransportSpec) -> wp.Function:
     return extinction_at
 
 
+@made_once
+def _make_lens_chance(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(u, guiding) -> float``: chance that a water collision guides light that came along u towards
+    the lens.
+
+    With delta tracking, light that already flies back has two chances to be guided: what comes late through a cloud has
+    turned in several steps, and such histories are few and heavy. Other water has one: a grid that repeats layers has
+    their histories.
+    """
+    twice = takes_collisions(spec)
+
+    @wp.func
+    def lens_chance(u: wp.vec3, guiding: Guiding) -> float:
+        chance = guiding.probability
+        if wp.static(twice):
+            chance = wp.where(u[2] < 0.0, chance * (2.0 - chance), chance)
+        return chance
+
+    return lens_chance
+
+
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
     phase_pdf = spec.phase.pdf
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
-    water_at, extinction_at = spec.water.at, _make_extinction_at(spec)
+    water_at, extinction_at, lens_chance = spec.water.at, _make_extinction_at(spec), _make_lens_chance(spec)
     view_of = spec.lens.view
     has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)
@@ -232,7 +253,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
         extinction = extinction_at(here, on_surface, medium, layers, s.x)
         at_surface = guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
-        to_lens_chance = wp.where(on_surface, at_surface, guiding.probability)
+        to_lens_chance = wp.where(on_surface, at_surface, lens_chance(s.u, guiding))
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_direction(s.u, medium.axis_threshold)
         v = toward_centre(camera, s.x)

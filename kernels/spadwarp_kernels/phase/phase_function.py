@@ -11,7 +11,8 @@ class Guiding:
     lowers the probabilities.
 
     Attributes:
-        probability: Chance that a water collision draws its direction from the lobe about the lens, in [0, 1).
+        probability: Chance p that a water collision draws its direction from the lobe about the lens, in [0, 1);
+            with delta tracking 1 - (1 - p)^2 for light that comes back, along u_z < 0.
         surface_probability: The same at a surface.
         anisotropy: g of that Henyey-Greenstein lobe; phase functions with a guide have one of their own.
         return_probability: Chance that an event outside the view draws its direction from a lobe towards the optical
