@@ -23,18 +23,9 @@ from fuzz.cases import CATEGORIES, Case, draw
 from fuzz.command_lines import program
 from fuzz.corpus import Corpus, make_corpus
 from fuzz.executed import run_case
+from helpers.coarse_pictures import coarse_pictures
 
 FINE = ("done", "refused")
-
-
-def coarse_pictures() -> None:
-    """Pictures are drawn whole, with few pixels and in fixed places: most of a case's time else."""
-    from matplotlib.figure import Figure as Picture
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    save = Picture.savefig
-    ConstrainedLayoutEngine.execute = lambda self, picture: None
-    Picture.savefig = lambda self, *where, **options: save(self, *where, **{**options, "dpi": 20})
 
 
 def warm_up(corpus: Path) -> None:

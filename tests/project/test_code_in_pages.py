@@ -12,6 +12,7 @@ import trimesh
 
 import spadwarp
 from helpers.cli import run
+from helpers.coarse_pictures import coarse_pictures
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -82,6 +83,7 @@ def checkout(tmp_path, monkeypatch):
     for name in ("configs", "kernels"):
         (folder / name).symlink_to(ROOT / name)
     monkeypatch.chdir(folder)
+    coarse_pictures(monkeypatch.setattr)
     yield folder
     left = {path.name for path in folder.iterdir()} - {
         "configs",
