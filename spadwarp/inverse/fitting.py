@@ -266,13 +266,16 @@ class Fitter:
         photons, level, bent = max(self.photons // _FEW, 8000), None, False
         for number in range(_FINE):
             halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
-            look = bent or number == _PATIENCE
-            level, local = self._solved(state, halves, trials, shared, level, look, photons)
-            solution, converged, bent = local.solution, self._converged(local), bent or local.ratio != 1.0
+            look = bent or number >= _PATIENCE
+            level, local = self._solved(state, halves, trials, shared, level, look, photons // (2 * BATCHES))
+            bent = bent or local.ratio != 1.0
+            solution, converged, left = local.solution, self._converged(local), self._left(local)
             state.iterations.append(Iteration(values=state.shared(), gain=solution.gain, photons=photons, coarse=False))
             self._step(state, solution)
             report(", ".join(f"{name} {value:.5g}" for name, value in state.shared().items()))
-            more, noisy = self._more(local, photons)
+            needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
+            more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(shared), 1) else 4 * photons)
+            noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
             if converged and not noisy:
                 break
             photons = max(photons, more)
@@ -290,7 +293,7 @@ class Fitter:
     ) -> tuple[int, Local]:
         """The level of cells and the step from a rendering.
 
-        Before a fit ends, and with `look`, the depth's slope is that where the depth is. `photons`: of the rendering.
+        Before a fit ends, and with `look`, the depth's slope is that where the depth is, from so many `photons`.
         """
         scales, prior = state.scales(self.unknowns, len(trials)), self._prior_at(state, shared)
         given: dict[str, Any] = {"law": self.law, "halves": halves, "trials": trials}
@@ -299,7 +302,7 @@ class Fitter:
             self.unknowns, scales, level=level, image=self._image, prior=prior, **given, **counted
         )
         wide = Local(solution, 1.0)
-        if not (look or (self._converged(wide) and not self._more(wide, photons)[1])):
+        if not (look or self._converged(wide)):
             return level, wide
         is_own = np.array([one.per_pixel for one in self.unknowns])
         return level, locally_solved(
@@ -309,16 +312,9 @@ class Fitter:
             render=self.render,
             values=state.values,
             scales=scales,
-            photons=photons // (2 * BATCHES),
+            photons=photons,
             **given,
         )
-
-    def _more(self, local: Local, photons: int) -> tuple[int, bool]:
-        """Photons that the noise of the simulation asks for, and whether they are worth another rendering."""
-        share, size = local.solution.simulation_share, max(sum(not one.per_pixel for one in self.unknowns), 1)
-        needed = int(photons * max(share / (0.8 * SIMULATION), 1.0))
-        more = min(needed, self.photons, needed if self._left(local) <= _CONVERGED * size else 4 * photons)
-        return more, share > SIMULATION and more > 1.2 * photons
 
     def _converged(self, local: Local) -> bool:
         """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
