@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spadwarp.errors import DeviceError
+from spadwarp.errors import DeviceError, need_memory
 from spadwarp.limits import shown
 
 if TYPE_CHECKING:
@@ -116,8 +116,10 @@ def _cpu_model() -> str:
 def start_warp() -> None:
     """`wp.init()` without Warp's start-up text, nor its warning where there is no GPU.
 
-    Raises `DeviceError` where the kernel cache cannot be used; so do kernels when they are loaded.
+    Raises `DeviceError` where the kernel cache cannot be used; so do kernels when they are loaded. Raises `MemoryError`
+    where a limit leaves too little memory to compile kernels.
     """
+    need_memory(1.0, "Warp")
     import warp as wp
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)

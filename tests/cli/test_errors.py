@@ -135,6 +135,8 @@ def _limited(mebibytes, *arguments):
     ("mebibytes", "needed", "arguments"),
     [
         (250, "spadwarp needs 0.5 GiB", ("presets",)),
+        (600, "Warp needs 1 GiB", ("simulate", "plane_5m", "--out", "out")),
+        (720, "Warp needs 1 GiB", ("budget", "plane_5m")),
         (560, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
         (700, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
     ],
@@ -148,7 +150,7 @@ def test_less_memory_than_the_libraries_need(mebibytes, needed, arguments, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mebibytes", [600, 720])
+@pytest.mark.parametrize("mebibytes", [1030, 1100])
 @pytest.mark.parametrize("command", ["simulate", "budget"])
 def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     out = tmp_path / "out"
