@@ -17,6 +17,7 @@ __all__ = [
     "SPEED_OF_LIGHT",
     "UNITS",
     "path_from_time",
+    "percent",
     "pulse_speed",
     "quantity",
     "range_from_time",
@@ -136,6 +137,11 @@ def quantity(text: str, unit: str) -> float:
         return float(Fraction(number) * given_factor / factor)
     except OverflowError:
         raise ValueError("is beyond the largest number, 1.8e308") from None
+
+
+def percent(share: float) -> str:
+    """A share in per cent, to two digits and without an exponent: `percent(1.234)` is "120"."""
+    return f"{float(f'{100.0 * share:.2g}'):g}"
 
 
 def rounded(value: float, error: float) -> str:

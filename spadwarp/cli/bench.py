@@ -13,6 +13,7 @@ from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, fail, say
 from spadwarp.cli._tables import new_table
 from spadwarp.errors import FileError
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -236,7 +237,7 @@ def _comparison_table(found: Sequence[Comparison]) -> Table:
 
 
 def _with_spread(rate: float, spread: float | None) -> str:
-    return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {100 * spread:.2g} %"
+    return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {percent(spread)} %"
 
 
 def _say_summary(results: Sequence[BenchResult], made: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ from spadwarp.cli import _options as opt
 from spadwarp.cli._app import app, complain, say
 from spadwarp.cli._progress import progress
 from spadwarp.errors import ConfigError
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from spadwarp import Result
@@ -194,7 +195,7 @@ def _refused(recording: Recording) -> bool:
 def _bound_noise(recording: Recording, photons: int) -> str:
     """How much of the bound's information was noise, and the photons that would leave a tenth."""
     return (
-        f"{100 * recording.bound_noise:.2g} % of the information in the median pixel was noise of the simulation; the "
+        f"{percent(recording.bound_noise)} % of the information in the median pixel was noise of the simulation; the "
         "Cramér–Rao bound is without it"
         + (", and only roughly known" if recording.bound_noise > 0.3 else "")
         + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"

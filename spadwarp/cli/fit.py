@@ -14,7 +14,7 @@ from spadwarp.cli._app import app, complain, say
 from spadwarp.cli._progress import progress
 from spadwarp.cli._tables import new_table
 from spadwarp.cli._unknowns import Prior, UnknownNames, pairs
-from spadwarp.units import rounded
+from spadwarp.units import percent, rounded
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -139,7 +139,7 @@ def _table(found: Fit) -> Table:
             f"{one.standard_error:.2g}",
             " to ".join(rounded(end, one.standard_error) for end in one.interval),
             f"{one.start:.4g}",
-            f"{100 * one.simulation:.2g} %",
+            f"{percent(one.simulation)} %",
         )
     return table
 

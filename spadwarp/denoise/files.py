@@ -29,7 +29,7 @@ from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
-from spadwarp.units import range_from_time
+from spadwarp.units import percent, range_from_time
 from spadwarp.viz import draw_denoised
 
 __all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
@@ -156,7 +156,7 @@ def denoise_file(
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
-        notes.append(f"{100 * np.isfinite(second).mean():.2g} % of the pixels have a second return")
+        notes.append(f"{percent(np.isfinite(second).mean())} % of the pixels have a second return")
     threshold = target_threshold(model) if mask is None else mask
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
@@ -174,7 +174,7 @@ def _check_gate(gate: tuple[float, float], depth: NDArray[np.float32]) -> None:
     valid = depth[np.isfinite(depth) & (depth > 0)]
     if valid.size and gate[0] < gate[1] and not ((valid >= gate[0] - slack) & (valid <= gate[1] + slack)).any():
         extent = f"{valid.min():.4g} to {valid.max():.4g} m"
-        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds no depth of the file, which are {extent}")
+        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds none of the depths of the file, {extent}")
 
 
 def _write(
@@ -372,9 +372,7 @@ def _read_within(read: DepthReading, gate: tuple[float, float], reading: dict[st
     if stop <= first:
         extent = f"{near.min():.4g} to {far.max():.4g} m"
         raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m lies outside the histograms, {extent}")
-    known = held.background
-    if known is not None and known.ndim and known.shape[-1] == bins:
-        known = known[..., first:stop]
+    known = held.background if held.background_per_bin is None else held.background_per_bin[..., first:stop]
     within = dataclasses.replace(
         held, values=held.values[..., first:stop], gate_start=held.gate_start + first * width, background=known
     )
@@ -393,8 +391,8 @@ def _second(
 
 def _profile(histograms: Histograms) -> NDArray[np.float64] | None:
     """Backscatter of all pixels together over the bins; None where the file does not give it."""
-    background, bins = histograms.background, histograms.values.shape[-1]
-    if background is None or np.ndim(background) == 0 or np.shape(background)[-1] != bins:
+    background = histograms.background_per_bin
+    if background is None:
         return None
-    total = np.asarray(background, np.float64).reshape(-1, bins).sum(axis=0)
+    total = np.asarray(background, np.float64).reshape(-1, background.shape[-1]).sum(axis=0)
     return total if total.sum() > 0 else None

@@ -13,6 +13,7 @@ from spadwarp.denoise.gates import bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.errors import ArgumentError
 from spadwarp.frames.measured import Histograms
+from spadwarp.units import percent
 
 __all__ = ["dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
 
@@ -94,15 +95,15 @@ def dim_pixels(histograms: Histograms) -> list[str]:
     Expected light has no threshold: a pixel beside a target has the depth of the little light that water scattered into
     it, as smooth as that of the target, where a camera would report nothing.
     """
-    values, known = histograms.values, histograms.background
+    values, known = histograms.values, histograms.background_per_bin
     signal, background = values.sum(axis=-1, dtype=np.float64), np.zeros(())
-    if known is not None and known.ndim and known.shape[-1] == values.shape[-1]:
+    if known is not None:
         background = known.sum(axis=-1, dtype=np.float64)
         signal = signal - background
     dim = float(((signal < 0.05 * np.quantile(signal, 0.9)) & (signal > background)).mean())
     if dim < 0.01:
         return []
     return [
-        f"{100 * dim:.2g} % of the pixels receive less than 5 % of the light of the bright ones: a depth there may be "
+        f"{percent(dim)} % of the pixels receive less than 5 % of the light of the bright ones: a depth there may be "
         "that of light scattered from beside, and count as a target; spadwarp detect draws the counts of a camera"
     ]

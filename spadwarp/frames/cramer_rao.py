@@ -14,6 +14,7 @@ from spadwarp.limits import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
+from spadwarp.units import percent
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 
@@ -218,7 +219,7 @@ def bound_of_result(
     if part_of_noise > MOST_NOISE:
         needed = photons_for_noise(result.photons, part_of_noise, 1.0 / 3.0)
         problem = (
-            f"{100 * part_of_noise:.2g} % of the information on the delay in the median pixel is noise of the "
+            f"{percent(part_of_noise)} % of the information on the delay in the median pixel is noise of the "
             f"simulation, and no bound can be had from what is left; about {needed:.1e} photons instead of "
             f"{result.photons:.1e} would make that a third"
         )

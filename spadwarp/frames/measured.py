@@ -61,6 +61,12 @@ class Histograms:
     scene: Scene | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def background_per_bin(self) -> NDArray[np.float32] | None:
+        """The background where it has a value for each bin `[..., T]`, else None."""
+        known = self.background
+        return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Asked:

@@ -20,6 +20,7 @@ from spadwarp.inverse.unknowns import DEPTH, read_unknowns, start_value
 from spadwarp.inverse.weighing import solved
 from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import SceneLike, as_scene
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from spadwarp.inverse.equations import Equations
@@ -170,8 +171,8 @@ def bounds(
         names, covariance, [values[name] > 0 and name != DEPTH for name in names]
     )
     if solution.simulation_share > SIMULATION:
-        share = float(f"{100 * solution.simulation_share:.2g}")
-        warnings.append(f"the noise of the simulation is {share:g} % of that of the counts, above 10 %: more photons")
+        share = percent(solution.simulation_share)
+        warnings.append(f"the noise of the simulation is {share} % of that of the counts, above 10 %: more photons")
     return Bounds(
         bounds=found,
         names=names,

@@ -67,12 +67,12 @@ class Local:
         error = (
             ""
             if self.ratio > 0.0
-            else f", and its standard error is that of places anywhere in a bin of {depth:.2g} mm"
+            else f", and its standard error is that of a place anywhere in a bin of {depth:.2g} mm"
         )
         return [
             f"depth: before the instrument response, most light of a pixel lies in one or two bins of {bin_width:.4g} "
-            f"ps; the depth moves it over their edges alone{error}. That of measured counts may be off by a part of "
-            f"{depth:.2g} mm: narrower bins"
+            f"ps; the counts follow the depth only as this light crosses the edges of bins{error}. The depth of "
+            f"measured counts may be off by a part of {depth:.2g} mm: choose narrower bins"
         ]
 
 

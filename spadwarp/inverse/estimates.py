@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.units import percent
+
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
@@ -152,5 +154,5 @@ def not_identifiable(names: Sequence[str], covariance: Floats, positive: Sequenc
                     "them fixed, or give it a prior"
                 )
         if positive[i] and np.sqrt(covariance[i, i]) > _UNSURE:
-            found.append(f"{name}: the counts say little of it (standard error {100 * covariance[i, i] ** 0.5:.2g} %)")
+            found.append(f"{name}: the counts say little of it (standard error {percent(covariance[i, i] ** 0.5)} %)")
     return found

@@ -293,7 +293,8 @@ class Fitter:
     ) -> tuple[int, Local]:
         """The level of cells and the step from a rendering.
 
-        Before a fit ends, and with `look`, the depth's slope is that where the depth is, from so many `photons`.
+        Where the fit has converged, and with `look`, the depth's slope is traced anew around the present depth with so
+        many `photons`.
         """
         scales, prior = state.scales(self.unknowns, len(trials)), self._prior_at(state, shared)
         given: dict[str, Any] = {"law": self.law, "halves": halves, "trials": trials}

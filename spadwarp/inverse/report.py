@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
 from spadwarp.inverse.unknowns import DEPTH, Unknown, with_values
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from spadwarp.inverse.exposure import Exposure
@@ -131,10 +132,9 @@ def _warnings(
     if not converged:
         found.append("not converged: the last step still promised more likelihood than the noise of the counts")
     if solution.simulation_share > 0.1:
-        share = float(f"{100 * solution.simulation_share:.2g}")
         found.append(
-            f"the noise of the simulation is {share:g} % of that of the counts in the variances, above 10 %: give "
-            "more photons; the standard errors contain it"
+            f"the noise of the simulation is {percent(solution.simulation_share)} % of that of the counts in the "
+            "variances, above 10 %: give more photons; the standard errors contain it"
         )
     free = [name not in prior for name in names]
     found += not_identifiable(names, solution.covariance, [one.is_positive for one in shared]) if any(free) else []

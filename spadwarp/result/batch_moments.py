@@ -12,6 +12,7 @@ import numpy as np
 
 from spadwarp.errors import ConfigError
 from spadwarp.result.signed_tallies import standard_error
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -141,7 +142,7 @@ def dominance_warnings(result: Result) -> list[str]:
         if error.is_dominated:
             texts.append(
                 f"{name}: one of {error.batches} batches has {100 * error.largest_share:.0f} % of the variance of its "
-                f"light (relative standard error {100 * error.relative_error:.2g} %): few heavy photons decide it, and "
+                f"light (relative standard error {percent(error.relative_error)} %): few heavy photons decide it, and "
                 f"errors may be larger than they seem; what helps: {', '.join(ways)}"
             )
     return texts

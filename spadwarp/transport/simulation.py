@@ -31,6 +31,7 @@ from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, make_plan
 from spadwarp.transport.stopping import FIRST_LOOK, StoppingRule
+from spadwarp.units import percent
 
 __all__ = ["Progress", "provenance", "simulate"]
 
@@ -169,7 +170,7 @@ def _warn_of_rounding(result: Result) -> None:
         small = result.counters.get(f"below_unit_{name}", 0)
         total = int(result.tallies[COMPONENTS.index(name)].sum(dtype=np.float64))
         if error > _LARGEST_ROUNDING_ERROR and small > _MANY * max(total, 1):
-            text = f"adds {100 * error:.2g} % to the error of an average lit bin" if total else "left none of it"
+            text = f"adds {percent(error)} % to the error of an average lit bin" if total else "left none of it"
             warnings.warn(
                 f"{name}: rounding to the histogram's unit {text}: {small} contributions of less than one unit came to "
                 f"{total} units in all; more photons help, and a later gate.start or narrower bins make the unit finer",

@@ -15,7 +15,7 @@ METRES = BIN * 299_792_458 / 2  # of a bin
 
 def test_a_gate_without_any_depth_is_refused(tmp_path):
     np.save(tmp_path / "depth.npy", np.full((16, 16), 15.0, np.float32))
-    with pytest.raises(ArgumentError, match=r"gate = \(2, 3\) m holds no depth of the file, which are 15 to 15 m"):
+    with pytest.raises(ArgumentError, match=r"gate = \(2, 3\) m holds none of the depths of the file, 15 to 15 m"):
         denoise_file(tmp_path / "depth.npy", tmp_path / "out", gate=(2.0, 3.0), model="median")
     assert not (tmp_path / "out").exists()
     np.save(tmp_path / "depth.npy", np.full((16, 16), np.nan, np.float32))  # nothing reported: stays empty

@@ -10,7 +10,7 @@ import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
 from spadwarp.scene.quantities import field_unit
-from spadwarp.units import quantity, with_prefix
+from spadwarp.units import percent, quantity, with_prefix
 
 
 @pytest.mark.parametrize(
@@ -212,3 +212,8 @@ def test_an_item_of_a_default_can_be_set_in_a_file(tmp_path):
 def test_an_item_that_is_not_there_is_told(override, words):
     with pytest.raises(spadwarp.ConfigError, match=re.escape(words)):
         make_scene().with_overrides([override])
+
+
+@pytest.mark.parametrize(("share", "text"), [(0.0, "0"), (0.0123, "1.2"), (0.996, "100"), (260.4, "26000")])
+def test_percents_have_two_digits_and_no_exponent(share, text):
+    assert percent(share) == text
