@@ -6,7 +6,8 @@ the way, so that they hold however the flights were drawn and what passes was es
 tracking or ratio tracking.
 
 A thread keeps them in `Blocks.memory`: in the first half of its rows those of the history, in the second half those of
-the contribution that is scored, until it is added or, behind a surface, forgotten.
+the contribution that is scored, until it is added or, behind a surface, forgotten. Of many blocks light meets few, so
+that the thread keeps a list of them.
 """
 
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from spadwarp_kernels.medium.grid import first_place, grid_cell, grid_line, next
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.tally.blocks import Blocks, block_entry
+from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry, score_entry
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
 
@@ -39,6 +40,30 @@ class BlockScores(NamedTuple):
     copy: wp.Function
 
 
+@wp.func
+def _forget(blocks: Blocks, half: int):
+    """No block has been met."""
+    for i in range(met_count(blocks, half)):
+        block = int(blocks.memory[met_entry(blocks, half, i)])
+        blocks.memory[score_entry(blocks, half, 0, block)] = NOT_MET
+    blocks.memory[met_entry(blocks, half, blocks.count)] = 0.0
+
+
+@made_once
+def _make_meet(kinds: int) -> wp.Function:
+    @wp.func
+    def meet(blocks: Blocks, half: int, block: int):
+        """A block that light comes to, for the first time or again."""
+        if blocks.memory[score_entry(blocks, half, 0, block)] == NOT_MET:
+            for q in range(wp.static(kinds)):
+                blocks.memory[score_entry(blocks, half, q, block)] = 0.0
+            number = met_count(blocks, half)
+            blocks.memory[met_entry(blocks, half, number)] = float(block)
+            blocks.memory[met_entry(blocks, half, blocks.count)] = float(number + 1)
+
+    return meet
+
+
 @made_once
 def make_block_scores(spec: TransportSpec) -> BlockScores | None:
     """Of a spec with blocks."""
@@ -48,18 +73,27 @@ def make_block_scores(spec: TransportSpec) -> BlockScores | None:
 
     @wp.func
     def copy(blocks: Blocks):
-        rows = wp.static(kinds) * blocks.count
-        for row in range(rows):
-            blocks.memory[block_entry(blocks, rows + row)] = blocks.memory[block_entry(blocks, row)]
+        _forget(blocks, 1)
+        count = met_count(blocks, 0)
+        for i in range(count):
+            block = blocks.memory[met_entry(blocks, 0, i)]
+            blocks.memory[met_entry(blocks, 1, i)] = block
+            for q in range(wp.static(kinds)):
+                score = blocks.memory[score_entry(blocks, 0, q, int(block))]
+                blocks.memory[score_entry(blocks, 1, q, int(block))] = score
+        blocks.memory[met_entry(blocks, 1, blocks.count)] = float(count)
 
     return BlockScores(_make_fly(kinds), _make_turn(spec), copy)
 
 
 def _make_fly(kinds: int) -> wp.Function:
+    meet = _make_meet(kinds)
+
     @wp.func
     def add(blocks: Blocks, half: int, block: int, value: float):
+        meet(blocks, half, block)
         for q in range(wp.static(kinds)):
-            entry = block_entry(blocks, (wp.static(kinds) * half + q) * blocks.count + block)
+            entry = score_entry(blocks, half, q, block)
             blocks.memory[entry] = blocks.memory[entry] + value
 
     @wp.func
@@ -76,7 +110,7 @@ def _make_fly(kinds: int) -> wp.Function:
 
 
 def _make_turn(spec: TransportSpec) -> wp.Function:
-    kinds, water_at = len(spec.blocks), spec.water.at
+    kinds, water_at, meet = len(spec.blocks), spec.water.at, _make_meet(len(spec.blocks))
     # Bits, since a `wp.static` that reads the index of a loop does not enter the hash of Warp's kernel cache.
     by_scattering, by_extinction = (
         sum(1 << q for q, kind in enumerate(spec.blocks) if kind == name) for name in ("scattering", "extinction")
@@ -86,6 +120,7 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
     def turn(blocks: Blocks, half: int, medium: Medium, layers: Layers, x: wp.vec3):
         block = grid_cell(blocks.grid, x)
         if block >= 0:
+            meet(blocks, half, block)
             water = water_at(medium, layers, x)
             for q in range(wp.static(kinds)):
                 coefficient = float(0.0)
@@ -94,7 +129,7 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
                 if (wp.static(by_extinction) >> q) & 1 == 1:
                     coefficient = water.extinction
                 if coefficient > 0.0:
-                    entry = block_entry(blocks, (wp.static(kinds) * half + q) * blocks.count + block)
+                    entry = score_entry(blocks, half, q, block)
                     blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
 
     return turn
@@ -103,14 +138,12 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
 @made_once
 def make_begin_history(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(derivatives) -> Scores`` of a photon that has met nothing; of blocks too."""
-    kinds = len(spec.blocks)
+    in_blocks = bool(spec.blocks)
 
     @wp.func
     def begin_history(derivatives: Derivatives) -> Scores:
-        if wp.static(kinds > 0):
-            blocks = derivatives.blocks
-            for row in range(wp.static(kinds) * blocks.count):
-                blocks.memory[block_entry(blocks, row)] = 0.0
+        if wp.static(in_blocks):
+            _forget(derivatives.blocks, 0)
         return Scores()
 
     return begin_history

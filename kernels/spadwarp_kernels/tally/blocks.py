@@ -15,6 +15,9 @@ BLOCK_DERIVATIVES = ("absorption", "scattering", "extinction")
 # Derivatives of one run by block, over all kinds.
 MOST_BLOCK_DERIVATIVES = 4096
 
+# In place of the first number of a block that the light has not met.
+NOT_MET = wp.constant(1.0e30)
+
 # Numbers that the threads of a launch remember at most: 1 GiB. Where blocks are many, fewer threads run at a time.
 _LARGEST_MEMORY = 1 << 28
 
@@ -26,13 +29,16 @@ class Blocks:
     Attributes:
         grid: The blocks as if they were the cells: its `turn`, `shift` and `size` alone are read.
         count: Number of blocks.
+        kinds: Number of kinds of derivatives.
         scale: Tally units of the derivative per emitted photon, by kind.
-        memory: Numbers by row and thread, of one launch.
+        memory: Numbers by row and thread, of one launch. Of the history, and once more of what is scored: by kind and
+            block the score; the blocks that the light has met, in that order; how many they are.
         threads, thread: How many there are, and which one this is.
     """
 
     grid: Grid
     count: int
+    kinds: int
     scale: wp.vec3
     memory: wp.array(dtype=float)
     threads: int
@@ -40,9 +46,28 @@ class Blocks:
 
 
 @wp.func
-def block_entry(blocks: Blocks, row: int) -> int:
-    """Index into the memory: neighbouring threads have neighbouring addresses."""
-    return row * blocks.threads + blocks.thread
+def block_entry(blocks: Blocks, half: int, row: int) -> int:
+    """Index into the memory: neighbouring threads have neighbouring addresses. `half`: 0 for the history, 1 for what is
+    scored."""
+    return (half * ((blocks.kinds + 1) * blocks.count + 1) + row) * blocks.threads + blocks.thread
+
+
+@wp.func
+def score_entry(blocks: Blocks, half: int, kind: int, block: int) -> int:
+    """Index of the score of a block."""
+    return block_entry(blocks, half, kind * blocks.count + block)
+
+
+@wp.func
+def met_entry(blocks: Blocks, half: int, number: int) -> int:
+    """Index of the block that the light has met at this place of the order; at `blocks.count`: of how many they are."""
+    return block_entry(blocks, half, blocks.kinds * blocks.count + number)
+
+
+@wp.func
+def met_count(blocks: Blocks, half: int) -> int:
+    """How many blocks the light has met."""
+    return int(blocks.memory[met_entry(blocks, half, blocks.count)])
 
 
 def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blocks:
@@ -71,6 +96,7 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
     made = Blocks()
     made.count = shape[0] * shape[1] * shape[2]
     check_integer("number of derivatives by block", kinds * made.count, 1, MOST_BLOCK_DERIVATIVES)
+    made.kinds = kinds
     made.scale = wp.vec3(*scale, *[0.0] * (3 - kinds))
     factor = np.array(shape) / np.array(list(grid.size))
     made.grid.turn = wp.mat33(*(factor[:, None] * np.array(grid.turn).reshape(3, 3)).ravel().tolist())
@@ -79,6 +105,24 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
     return made
 
 
-def threads_of_blocks(threads: int, numbers: int) -> int:
-    """How many threads of a launch there is memory for, so many numbers each; a multiple of 1024, or `threads`."""
-    return min(threads, max(_LARGEST_MEMORY // max(numbers, 1) // 1024, 1) * 1024)
+def threads_of_blocks(threads: int, blocks: Blocks) -> int:
+    """How many threads of a launch there is memory for; a multiple of 1024, or `threads`."""
+    return min(threads, max(_LARGEST_MEMORY // _numbers(blocks) // 1024, 1) * 1024)
+
+
+def blocks_with_memory(blocks: Blocks, threads: int, device: wp.DeviceLike) -> Blocks:
+    """With memory of so many threads, of which no light has met a block."""
+    found = Blocks()
+    for name in Blocks.vars:
+        setattr(found, name, getattr(blocks, name))
+    found.threads = threads
+    half = _numbers(blocks) // 2 * threads
+    found.memory = wp.full(2 * half, NOT_MET, dtype=float, device=device)
+    for end in (half, 2 * half):
+        found.memory[end - threads : end].zero_()
+    return found
+
+
+def _numbers(blocks: Blocks) -> int:
+    """That a thread remembers."""
+    return 2 * ((blocks.kinds + 1) * blocks.count + 1)

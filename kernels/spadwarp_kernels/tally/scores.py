@@ -12,7 +12,7 @@ import warp as wp
 from spadwarp_kernels.arguments import ArgumentError, check_choice, check_device, check_integer, check_number
 from spadwarp_kernels.math.once import made_once
 
-from .blocks import Blocks, block_entry
+from .blocks import Blocks, met_count, met_entry, score_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
 from .tally import DEPOSIT_LIMIT, Contribution, Scores, deposit
 
@@ -125,12 +125,13 @@ def make_deposit(count: int, kinds: int = 0) -> wp.Function:
                 for p in range(wp.static(count)):
                     units = c.value * c.scores[p] * derivatives.scale[p]
                     deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
-                for q in range(wp.static(kinds)):
-                    for k in range(blocks.count):
-                        row = (wp.static(kinds) + q) * blocks.count + k
-                        units = c.value * blocks.memory[block_entry(blocks, row)] * blocks.scale[q]
-                        p = wp.static(count) + q * blocks.count + k
-                        deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
+                if wp.static(kinds > 0):
+                    for i in range(met_count(blocks, 1)):
+                        k = int(blocks.memory[met_entry(blocks, 1, i)])
+                        for q in range(wp.static(kinds)):
+                            units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
+                            p = wp.static(count) + q * blocks.count + k
+                            deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
         return deposit(tally, ledger, pending, thread, scale, c)
 
     return deposit_derived

@@ -20,7 +20,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.tally.blocks import MOST_BLOCK_DERIVATIVES, Blocks, threads_of_blocks
+from spadwarp_kernels.tally.blocks import MOST_BLOCK_DERIVATIVES, blocks_with_memory, threads_of_blocks
 from spadwarp_kernels.tally.ledger import (
     BOUNDARY_COUNTERS,
     COUNTERS,
@@ -187,8 +187,8 @@ def launch_transport(
     blocks = min(-(-photon_count // BLOCK_SIZE), threads // BLOCK_SIZE)
     threads, derivatives = blocks * BLOCK_SIZE if model.device.is_cuda else 1, model.derivatives
     if spec.blocks:
-        threads = threads_of_blocks(threads, 2 * len(spec.blocks) * derivatives.blocks.count)
-        derivatives = _with_memory(spec, derivatives, threads, model.device)
+        threads = threads_of_blocks(threads, derivatives.blocks)
+        derivatives = _with_memory(derivatives, threads, model.device)
     data.cursor.zero_()
     inputs = [model.medium, model.layers, model.laser, model.camera, model.gate, model.limits, model.guiding]
     inputs += [model.surfaces, model.scan, derivatives, model.polarisation]
@@ -202,16 +202,12 @@ def launch_transport(
     )
 
 
-def _with_memory(spec: TransportSpec, derivatives: Derivatives, threads: int, device: wp.Device) -> Derivatives:
+def _with_memory(derivatives: Derivatives, threads: int, device: wp.Device) -> Derivatives:
     """With memory for the scores of blocks: of each launch its own, since several may run at a time."""
-    found, blocks = Derivatives(), Blocks()
+    found = Derivatives()
     for name in Derivatives.vars:
         setattr(found, name, getattr(derivatives, name))
-    for name in Blocks.vars:
-        setattr(blocks, name, getattr(derivatives.blocks, name))
-    blocks.memory = wp.empty(2 * len(spec.blocks) * blocks.count * threads, dtype=float, device=device)
-    blocks.threads = threads
-    found.blocks = blocks
+    found.blocks = blocks_with_memory(derivatives.blocks, threads, device)
     return found
 
 
