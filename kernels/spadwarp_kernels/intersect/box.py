@@ -64,12 +64,14 @@ def inverse_direction(u: wp.vec3) -> wp.vec3:
     const int x = inverse[0] < 0.0f ? 3 : 0, y = inverse[1] < 0.0f ? 4 : 1, z = inverse[2] < 0.0f ? 5 : 2;
     const float4 x0 = __ldg(box + x), y0 = __ldg(box + y), z0 = __ldg(box + z);
     const float4 x1 = __ldg(box + 3 - x), y1 = __ldg(box + 5 - y), z1 = __ldg(box + 7 - z);
+    // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
+    // negative counts only as that.
     const auto entry = [&](float a, float b, float c, float d, float e, float f) {
-        const float in = fmaxf(fmaxf(a * inverse[0] - shift[0], b * inverse[1] - shift[1]),
-                               fmaxf(c * inverse[2] - shift[2], 0.0f));
-        const float out = fminf(fminf(d * inverse[0] - shift[0], e * inverse[1] - shift[1]),
-                                fminf(f * inverse[2] - shift[2], reach));
-        return in <= out ? in : 1.0e30f;
+        const int in = __vimax3_s32_relu(__float_as_int(a * inverse[0] - shift[0]),
+            __float_as_int(b * inverse[1] - shift[1]), __float_as_int(c * inverse[2] - shift[2]));
+        const int out = __vimin3_s32(__float_as_int(d * inverse[0] - shift[0]),
+            __float_as_int(e * inverse[1] - shift[1]), __float_as_int(f * inverse[2] - shift[2]));
+        return in <= out && in <= __float_as_int(reach) ? __int_as_float(in) : 1.0e30f;
     };
     return wp::vec4(
         entry(x0.x, y0.x, z0.x, x1.x, y1.x, z1.x), entry(x0.y, y0.y, z0.y, x1.y, y1.y, z1.y),

@@ -20,7 +20,7 @@ from spadwarp_kernels.math.bits import bits_of, from_bits
 
 from .box import box_children, box_entries
 from .pairs import DEEPEST, NO_NODE, NOWHERE, read_tree
-from .triangle import box_padding, face_distance, face_in, pack_faces, set_faces
+from .triangle import box_padding, face_distance, face_in, number_in, pack_faces, set_faces
 
 # Nodes that a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
@@ -222,6 +222,12 @@ class TreeWalk:
     found: int
 
 
+@wp.func_native("__builtin_assume(depth >= 0); return depth;")
+def place(depth: int) -> int:
+    """Index into a `Stack`: the compiler knows then that it does not count from the end."""
+    ...
+
+
 @wp.func
 def _first(near: wp.vec2, far: wp.vec2):
     """(entry, bits of the child) of two, the nearer first."""
@@ -229,9 +235,22 @@ def _first(near: wp.vec2, far: wp.vec2):
     return wp.where(swap, far, near), wp.where(swap, near, far)
 
 
+@wp.struct
+class NodeStep:
+    """The children of a node against a ray, the nearest first.
+
+    Attributes:
+        child: Nodes; of no meaning for those that the ray misses.
+        entry: Where it enters their boxes [m]; NOWHERE for those that it misses.
+    """
+
+    child: wp.vec4i
+    entry: wp.vec4
+
+
 @wp.func
-def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4i:
-    """The children of a node that a ray meets, the nearest first: four nodes, `NO_NODE` in place of one that it misses.
+def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
+    """The children of a node that a ray meets.
 
     Args:
         nodes: From `pack_bvh`.
@@ -244,12 +263,10 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
     a, b = _first(wp.vec2(entry[0], child[0]), wp.vec2(entry[1], child[1]))
     c, d = _first(wp.vec2(entry[2], child[2]), wp.vec2(entry[3], child[3]))
     a, c = _first(a, c)
-    return wp.vec4i(
-        wp.where(a[0] < NOWHERE, bits_of(a[1]), NO_NODE),
-        wp.where(b[0] < NOWHERE, bits_of(b[1]), NO_NODE),
-        wp.where(c[0] < NOWHERE, bits_of(c[1]), NO_NODE),
-        wp.where(d[0] < NOWHERE, bits_of(d[1]), NO_NODE),
-    )
+    step = NodeStep()
+    step.child = wp.vec4i(bits_of(a[1]), bits_of(b[1]), bits_of(c[1]), bits_of(d[1]))
+    step.entry = wp.vec4(a[0], b[0], c[0], d[0])
+    return step
 
 
 @wp.struct
@@ -284,5 +301,5 @@ def step_leaf(
     step.slot = -2 - walk.node
     step.distance = face_distance(faces, step.slot, x, u)
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
-    step.node = wp.where(order[step.slot] < 0, walk.node - 1, NO_NODE)
+    step.node = wp.where(number_in(order, step.slot) < 0, walk.node - 1, NO_NODE)
     return step

@@ -34,10 +34,22 @@ def load_plane(faces: wp.array(dtype=wp.vec4), index: int) -> wp.vec4:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ldg(order.data + slot);
+#else
+    return order.data[slot];
+#endif
+""")
+def number_in(order: wp.array(dtype=int), slot: int) -> int:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
+    ...
+
+
 @wp.func
 def face_in(order: wp.array(dtype=int), slot: int) -> int:
     """Index of the face in a slot."""
-    face = order[slot]
+    face = number_in(order, slot)
     return wp.where(face < 0, ~face, face)
 
 

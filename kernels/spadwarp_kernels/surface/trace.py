@@ -3,7 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.intersect.box import inverse_direction
-from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, TreeWalk, step_leaf, step_node
+from spadwarp_kernels.intersect.bvh import NO_NODE, NOWHERE, Stack, TreeWalk, place, step_leaf, step_node
 from spadwarp_kernels.intersect.triangle import face_distance, face_in, face_normal
 from spadwarp_kernels.intersect.wide import walk_wide
 from spadwarp_kernels.math.bits import bits_of
@@ -115,10 +115,12 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
     while walk.node != NO_NODE:
         if walk.node > NO_NODE:
             met = step_node(surfaces.nodes, walk, inverse, shift)
-            walk.node = met[0]
+            walk.node = NO_NODE
+            if met.entry[0] < NOWHERE:
+                walk.node = met.child[0]
             for k in range(3):
-                if met[3 - k] != NO_NODE:
-                    stack[walk.depth] = met[3 - k]
+                if met.entry[3 - k] < NOWHERE:
+                    stack[place(walk.depth)] = met.child[3 - k]
                     walk.depth += 1
         else:
             step = step_leaf(surfaces.faces, surfaces.order, walk, x, u)
@@ -130,7 +132,7 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
                     walk.depth = 1
         if walk.node == NO_NODE and walk.depth > 0:
             walk.depth -= 1
-            walk.node = stack[walk.depth]
+            walk.node = stack[place(walk.depth)]
     return surface_hit(surfaces, walk, u)
 
 
