@@ -4,31 +4,47 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, queue_scores, queue_size, queue_vector
+from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, count_lanes_before, make_queue_vectors, queue_size
 
 from .contribution import Request
 
-# A request's 24 bits for the tally share a word with its component and slot.
+# A request's 24 bits for the tally share a word with its component.
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
+
+
+@wp.func
+def _lane(lane: int, takes: bool) -> int:
+    return lane
+
+
+@wp.func
+def _among_takers(lane: int, takes: bool) -> int:
+    return count_lanes_before(takes)
 
 
 @made_once
 def make_queue(
-    flights: bool, used: bool, derivatives: int = 0, polarised: bool = False
+    flights: bool, used: bool, traces: bool, confocal: bool, derivatives: int = 0, polarised: bool = False
 ) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(index, size) -> Request``, for any lane.
+    """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(lane, takes, size, count) -> Request``, the last
+    ones for the so many lanes that take one.
 
     Args:
         flights: Whether requests have an interval and a point of the lens.
         used: Whether there is a queue at all; else `push` does nothing.
+        traces: Whether there are lanes that take none, since they wait for a shadow ray.
+        confocal: Whether they have a target.
         derivatives: How many scores requests have.
         polarised: Whether they have a Stokes vector.
     """
+    more, rank_of = flights or confocal, _among_takers if traces else _lane
     score_vectors = -(-derivatives // 4)
+    first_score = 4 if more else 3
+    queue_vector = make_queue_vectors(first_score + (1 if polarised else score_vectors))
 
     @wp.func
     def write(entry: int, request: Request):
-        packed = request.component + 4 * (request.slot + 1) + int(request.rounding_sample & _UPPER_24)
+        packed = request.component + int(request.rounding_sample & _UPPER_24)
         queue_vector(True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         queue_vector(True, entry + QUEUE_ENTRIES, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
         queue_vector(
@@ -38,21 +54,23 @@ def make_queue(
                 from_bits(int(request.first)),
                 from_bits(int(request.second)),
                 from_bits(packed),
-                from_bits(request.target),
+                from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
             ),
         )
-        if wp.static(flights):
+        if wp.static(more):
+            lens = wp.vec2(request.lens[0], request.lens[1])
+            if request.interval[0] >= request.interval[1]:
+                lens[0] = from_bits(request.slot)  # an event has no point of the lens yet
             queue_vector(
-                True,
-                entry + 3 * QUEUE_ENTRIES,
-                wp.vec4(request.interval[0], request.interval[1], request.lens[0], request.lens[1]),
+                True, entry + 3 * QUEUE_ENTRIES, wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1])
             )
         for i in range(wp.static(score_vectors)):
             a = request.scores
             part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
-            queue_scores(True, entry + i * QUEUE_ENTRIES, part)
+            queue_vector(True, entry + (wp.static(first_score) + i) * QUEUE_ENTRIES, part)
         if wp.static(polarised):
-            queue_scores(True, entry, request.stokes)  # which goes without derivatives
+            # Which goes without derivatives.
+            queue_vector(True, entry + wp.static(first_score) * QUEUE_ENTRIES, request.stokes)
 
     @wp.func
     def push(request: Request):
@@ -61,9 +79,10 @@ def make_queue(
                 write(queue_size(ADD_ENTRY, 0), request)
 
     @wp.func
-    def pop(index: int, size: int) -> Request:
+    def pop(lane: int, takes: bool, size: int, count: int) -> Request:
         request = Request()
-        request.wanted = index < size
+        index = wp.max(size - count, 0) + rank_of(lane, takes)
+        request.wanted = takes and index < size
         entry = wp.min(index, size - 1)
         a = queue_vector(False, entry, wp.vec4())
         b = queue_vector(False, entry + QUEUE_ENTRIES, wp.vec4())
@@ -76,19 +95,22 @@ def make_queue(
         request.second = wp.uint32(bits_of(c[1]))
         packed = bits_of(c[2])
         request.component = packed & 3
-        request.slot = ((packed >> 2) & 63) - 1
         request.rounding_sample = wp.uint32(packed)
-        request.target = bits_of(c[3])
-        if wp.static(flights):
+        request.target = -1
+        request.slot = bits_of(c[3])
+        if wp.static(more):
             d = queue_vector(False, entry + 3 * QUEUE_ENTRIES, wp.vec4())
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
+        if wp.static(confocal):
+            request.target = bits_of(c[3])
+            request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
         for i in range(wp.static(score_vectors)):
-            part = queue_scores(False, entry + i * QUEUE_ENTRIES, wp.vec4())
+            part = queue_vector(False, entry + (wp.static(first_score) + i) * QUEUE_ENTRIES, wp.vec4())
             for k in range(4):
                 request.scores[4 * i + k] = part[k]
         if wp.static(polarised):
-            request.stokes = queue_scores(False, entry, wp.vec4())
+            request.stokes = queue_vector(False, entry + wp.static(first_score) * QUEUE_ENTRIES, wp.vec4())
         return request
 
     return push, pop

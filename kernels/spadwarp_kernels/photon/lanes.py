@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from spadwarp_kernels.math.once import made_once
+
 # Threads of a block of the transport kernel on CUDA.
 BLOCK_SIZE = 128
 
@@ -69,39 +71,31 @@ def take_photons(cursor: wp.array(dtype=int)) -> int:
 
 
 # Entries of a warp's queue: 31 requests that wait and 32 that come.
-QUEUE_ENTRIES = wp.constant(64)
+QUEUE_ENTRIES = wp.constant(63)
 
-
-@wp.func_native(f"""
+_QUEUE = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 queue[4 * 64 * {BLOCK_SIZE // 32}];
-    float4* mine = queue + 256u * (threadIdx.x >> 5u);
+    __shared__ float4 queue[%d];
+    float4* mine = queue + %du * (threadIdx.x >> 5u);
     if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
     const float4 held = mine[entry];
     return wp::vec4(held.x, held.y, held.z, held.w);
 #else
     return value;
 #endif
-""")
-def queue_vector(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
-    """Writes or reads one of the 4 x QUEUE_ENTRIES vectors of the warp's queue; CUDA alone."""
-    ...
+"""
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    __shared__ float4 scores[2 * 64 * {BLOCK_SIZE // 32}];
-    float4* mine = scores + 128u * (threadIdx.x >> 5u);
-    if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
-    const float4 held = mine[entry];
-    return wp::vec4(held.x, held.y, held.z, held.w);
-#else
-    return value;
-#endif
-""")
-def queue_scores(put: bool, entry: int, value: wp.vec4) -> wp.vec4:
-    """As `queue_vector`, for the 2 x QUEUE_ENTRIES vectors of scores."""
-    ...
+@made_once
+def make_queue_vectors(vectors: int) -> wp.Function:
+    """The Warp function ``(put, entry, value) -> vec4`` that writes or reads one of the vectors x QUEUE_ENTRIES of the
+    warp's queue; CUDA alone. Kernels take no more shared memory than they need, since the cache has the rest."""
+    of_warp = vectors * QUEUE_ENTRIES
+
+    @wp.func_native(_QUEUE % (of_warp * BLOCK_SIZE // 32, of_warp))
+    def queue_vector(put: bool, entry: int, value: wp.vec4) -> wp.vec4: ...
+
+    return queue_vector
 
 
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))

@@ -9,11 +9,11 @@ from spadwarp_kernels.surface.trace import SurfaceHit
 from spadwarp_kernels.tally.ledger import to_ledger
 from spadwarp_kernels.tally.tally import Contribution, Scores
 
-# What a thread does next: a flight, the event at its end, the scattering there, a photon of its own, the end of one; or
-# no photons are left.
-FLIGHT, EVENT, SCATTER, START, END, DONE = (wp.constant(i) for i in range(6))
+# What a thread does next: a flight, the ray that looks for a surface along it, the event at its end, the scattering
+# there, a photon of its own, the end of one; or no photons are left.
+FLIGHT, RAY, EVENT, SCATTER, START, END, DONE = (wp.constant(i) for i in range(7))
 
-# The ray that waits to be traced.
+# The ray that a thread traces.
 NO_RAY, SURFACE_RAY, SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
@@ -23,13 +23,12 @@ class Weight:
 
     Attributes:
         value: Fraction of the photon that is left.
-        ledger: The same in ledger units, as the ledger last saw it.
         taken: By which the last change lowered it, in ledger units.
-        absorbed_water: Sum over the thread's photons of what water took, in ledger units.
+        absorbed_water: Sum over the thread's photons of what water took, in ledger units: what they had, less what
+            others took and what was left.
     """
 
     value: float
-    ledger: wp.int64
     taken: wp.int64
     absorbed_water: wp.int64
 
@@ -41,10 +40,9 @@ def reweigh(w: Weight, factor: float) -> Weight:
     The ledger is written where weight changes hands; water takes what is missing there.
     """
     before = to_ledger(w.value)
-    w.absorbed_water += w.ledger - before
     w.value *= factor
-    w.ledger = to_ledger(w.value)
-    w.taken = before - w.ledger
+    w.taken = before - to_ledger(w.value)
+    w.absorbed_water -= w.taken
     return w
 
 
@@ -52,7 +50,7 @@ def reweigh(w: Weight, factor: float) -> Weight:
 def full_weight(w: Weight) -> Weight:
     """That of a photon that has just been emitted."""
     w.value = 1.0
-    w.ledger = to_ledger(1.0)
+    w.absorbed_water += to_ledger(1.0)
     return w
 
 
@@ -66,7 +64,7 @@ class Flight:
         distance: To the event [m].
         reach: How far to look for surfaces [m].
         interval: The part that an estimator wants to score [m]; empty for none.
-        lens: The point of the lens by which the flight is scored, and where a shadow ray leads [m].
+        lens: The point of the lens by which the flight is scored [m].
         lens_weight: Its density if it were uniform, over that of the draw.
     """
 
@@ -158,8 +156,8 @@ class PhotonState:
         albedo: Of the water there.
         ray: NO_RAY, SURFACE_RAY or SHADOW_RAY.
         walk: Of the ray down the tree.
-        origin: The point that is scored, from which a shadow ray leads to the lens [m].
-        pending: The contribution that waits for the shadow ray.
+        hidden: Whether a contribution, of any photon, waits for its shadow ray.
+        pending, origin, lens: That contribution, the scored point, and the point to which the ray leads [m].
         pending_add: On the CPU the voxel and value that are still to be added, see `add_pending`.
         absorbed_surface, directed: Sums for the ledger, in its units.
         water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
@@ -187,11 +185,13 @@ class PhotonState:
     flight: Flight
     hit: SurfaceHit
     albedo: float
-    # The ray to trace, and the contribution that waits for it:
+    # The ray that is traced, and the contribution that waits for one:
     ray: int
     walk: TreeWalk
-    origin: wp.vec3
+    hidden: bool
     pending: Contribution
+    origin: wp.vec3
+    lens: wp.vec3
     pending_add: wp.vec2l
     # Sums for the ledger, and counters:
     absorbed_surface: wp.int64

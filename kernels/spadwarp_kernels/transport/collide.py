@@ -15,8 +15,9 @@ from spadwarp_kernels.medium.limits import (
     is_outside_rotated,
 )
 from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.lanes import QUEUE_ENTRIES
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import EVENT, NO_RAY, SHADOW_RAY, PhotonState
+from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
 from spadwarp_kernels.surface.trace import offset_from_surface
 from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
 
@@ -97,15 +98,34 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
 
 
 @made_once
-def make_arrives(flights: bool) -> wp.Function:
-    """The Warp function ``s -> bool``: whether the photon is at the end of its flight, and free to collide.
+def make_arrives(flights: bool, traces: bool, queues: bool) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions ``(s, queued) -> bool``: whether the photon's flight is to be scored, and whether, that being
+    done, it is at the end of its flight and free to collide.
 
-    A scored flight may wait for its shadow ray: without a surface nothing more is scored.
+    Args:
+        flights: Whether flights are scored; then collisions in the water are not.
+        traces: Whether what is scored may wait for a shadow ray.
+        queues: Whether it waits in the warp's queue before; else the thread's last one must have been traced.
     """
 
     @wp.func
-    def arrives(s: PhotonState) -> bool:
-        scored = wp.static(flights) and s.ray == SHADOW_RAY and s.hit.face < 0
-        return s.stage == EVENT and (s.ray == NO_RAY or scored)
+    def has_room(s: PhotonState, queued: int) -> bool:
+        room = bool(True)
+        if wp.static(traces and queues):
+            room = queued <= QUEUE_ENTRIES - 32
+        if wp.static(traces and not queues):
+            room = not s.hidden
+        return room
 
-    return arrives
+    @wp.func
+    def flown(s: PhotonState, queued: int) -> bool:
+        return s.stage == EVENT and is_planned(s.flight) and has_room(s, queued)
+
+    @wp.func
+    def arrives(s: PhotonState, queued: int) -> bool:
+        room = has_room(s, queued)
+        if wp.static(flights):
+            room = (room or (wp.static(not queues) and s.hit.face < 0)) and not is_planned(s.flight)
+        return s.stage == EVENT and room
+
+    return flown, arrives

@@ -42,7 +42,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
                 out.scores[s.photon, p] = s.scores[p]
         weight = s.weight
         rest = to_ledger(weight.value)
-        weight.absorbed_water += weight.ledger - rest
+        weight.absorbed_water -= rest
         add_to_ledger(ledger, thread, s.reason, rest)
         return weight
 

@@ -42,12 +42,12 @@ from spadwarp_kernels.photon.state import (
     EVENT,
     FLIGHT,
     NO_RAY,
+    RAY,
     SCATTER,
     SHADOW_RAY,
     START,
     SURFACE_RAY,
     first_state,
-    is_planned,
     next_bounce,
     shorten,
     sum_bounces,
@@ -72,11 +72,14 @@ from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
 from .flight import make_draw_albedo, make_fly
 from .scatter import make_flies, make_scatter
-from .traverse import make_aim, make_begin_walk, make_look
+from .traverse import make_aim, make_begin_walk, make_counts, make_look, next_ray
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
 # in the water.
 RAY_LANES = 20
+
+# It scores what its queue holds when so many have room for a contribution that waits for its shadow ray.
+FREE_LANES = 12
 
 # It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
 WALKING_LANES = 8
@@ -106,15 +109,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
     has_bvh = has_mesh and not brute_force
     in_blocks = bool(spec.blocks)
-    queues = scores and cuda and not has_bvh and not in_blocks  # scores of blocks stay with the thread
+    queues = scores and cuda and not in_blocks  # scores of blocks stay with the thread
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
-    arrives, flies = make_arrives(flights), make_flies(crosses)
-    scatter = make_scatter(spec, estimator.direct, crosses)
+    scatter, flies = make_scatter(spec, estimator.direct, crosses), make_flies(crosses)
+    flown, arrives = make_arrives(flights, has_bvh, queues)
+    free_lanes, count_waiting = make_counts(has_bvh)
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
-    push, pop = make_queue(flights, queues, len(spec.derivatives), spec.polarised)
+    push, pop = make_queue(flights, queues, has_bvh, confocal, len(spec.derivatives), spec.polarised)
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
     score_images = make_score_images(spec, flights, brute_force)
@@ -172,7 +176,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         if wp.static(queues):
             queued = queue_size(SET_SIZE, 0)
 
-        while count_lanes(s.stage == DONE) < 32:
+        while count_lanes(s.stage == DONE and not s.hidden) < 32 or (wp.static(has_bvh and queues) and queued > 0):
             # ---- Water: until enough lanes of the warp wait for a ray
             waiting = int(0)
             while waiting < wp.static(ray_lanes):
@@ -183,8 +187,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     s.stage = EVENT
                     s.albedo = draw_albedo(s, medium, keys, id)
                     if wp.static(has_bvh):
-                        meets = meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper)
-                        s.ray = wp.where(meets, SURFACE_RAY, NO_RAY)
+                        if meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper):
+                            s.stage = RAY
                     if wp.static(brute_force):
                         hit = intersect_faces(surfaces, s.x, s.u, s.flight.reach)
                         s.surface_queries += 1
@@ -197,11 +201,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                 while round < 2:
                     asked = Asked()
                     if wp.static(flights):
-                        if round == 0 and s.stage == EVENT and s.ray == NO_RAY and is_planned(s.flight):
+                        if round == 0 and flown(s, queued):
                             asked.request = request_flight(s)
                             push(asked.request)
                             s.flight.interval = wp.vec2(0.0, 0.0)
-                    if round == 1 and arrives(s):
+                    if round == 1 and arrives(s, queued):
                         if wp.static(crosses):
                             crossing = cross(s, camera, gate, limits, layers, derivatives, polarisation)
                             if wp.static(reflecting):
@@ -233,12 +237,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         ready = asked.request.wanted
                         if wp.static(queues):
                             queued = queue_size(READ_SIZE, 0)
-                            ready = queued >= 32 or (done == 32 and queued > 0)
+                            free = free_lanes(s)
+                            ready = (queued >= 32 or (done == 32 and queued > 0)) and free >= wp.static(FREE_LANES)
                         if ready:
                             if wp.static(queues):
-                                first = wp.max(queued - 32, 0)
-                                asked.request = pop(first + lane, queued)
-                                queued = queue_size(SET_SIZE, first)
+                                asked.request = pop(lane, not s.hidden, queued, free)
+                                queued = queue_size(SET_SIZE, wp.max(queued - free, 0))
                             found = score(
                                 asked.request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation
                             )
@@ -253,9 +257,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                             tally, gradients, ledger, s.pending_add, thread, scale, derivatives, c
                                         )
                                 else:
-                                    s.ray = SHADOW_RAY
+                                    s.hidden = True
                                     s.origin = found.origin
-                                    s.flight.lens = found.lens
+                                    s.lens = found.lens
                                     s.pending = found.contribution
                             if wp.static(reflecting):
                                 more = score_images(
@@ -265,7 +269,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
                 # The score took the photon as it arrived; now its weight, its end or its new direction.
-                if s.stage == SCATTER and s.ray == NO_RAY:
+                if s.stage == SCATTER:
                     new = scatter(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
                                   keys, base + wp.uint64(s.photon), ledger, thread)  # fmt: skip
                     s.u = new.u
@@ -281,7 +285,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
 
                 # ---- The next photon for those that have ended
                 if count_lanes(s.stage >= START) >= START_LANES:
-                    if s.stage == END and s.ray == NO_RAY:
+                    if s.stage == END:
                         s.weight = finish(s, out, ledger, thread)
                         s.water_collisions += s.collisions - s.surface_count - s.bounces.count
                         s.bounces = sum_bounces(s.bounces)
@@ -319,14 +323,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.scores = begin_history(derivatives)
                             s.stokes = first_stokes(polarisation, laser, scan, s.target, emitted, s.x, s.u)
 
-                if wp.static(has_bvh):
-                    waiting = count_lanes(s.ray != NO_RAY or s.stage >= START)
-                else:
-                    done = count_lanes(s.stage == DONE)
-                    waiting = wp.where(queued > 0, 0, done)
+                done = count_lanes(s.stage == DONE)
+                waiting = count_waiting(s, done, queued)
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_bvh):
+                s.ray = next_ray(s)
                 ray = aim(s)
                 if s.ray != NO_RAY and s.walk.node == NO_NODE:
                     s.walk = begin_walk(surfaces, ray, s.ray == SHADOW_RAY)
@@ -370,8 +372,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if s.walk.nearest < s.flight.distance:
                                 s.hit = surface_hit(surfaces, s.walk, s.u)
                             s.flight = shorten(s.flight, s.walk.nearest)
+                        s.stage = EVENT
                     else:
                         s.shadow_queries += 1
+                        s.hidden = False
                         if s.walk.found < 0:
                             s.pending_add = deposit(
                                 tally, gradients, ledger, s.pending_add, thread, scale, derivatives, s.pending

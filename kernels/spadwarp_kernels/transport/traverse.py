@@ -6,8 +6,9 @@ from spadwarp_kernels.estimators.contribution import Scored
 from spadwarp_kernels.intersect.box import segment_meets_box
 from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.photon.lanes import count_lanes
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import SHADOW_RAY, PhotonState
+from spadwarp_kernels.photon.state import FLIGHT, NO_RAY, RAY, SHADOW_RAY, SURFACE_RAY, PhotonState
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import may_be_hidden
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -36,8 +37,8 @@ def make_aim(spec: TransportSpec, scores: bool) -> wp.Function:
         if wp.static(scores):
             if s.ray == SHADOW_RAY:
                 ray.origin = s.origin
-                ray.direction = wp.normalize(s.flight.lens - s.origin)
-                ray.length = wp.length(s.flight.lens - s.origin)
+                ray.direction = wp.normalize(s.lens - s.origin)
+                ray.length = wp.length(s.lens - s.origin)
         return ray
 
     return aim
@@ -96,3 +97,35 @@ def make_begin_walk(spec: TransportSpec, cuda: bool) -> wp.Function:
         return walk
 
     return begin_walk
+
+
+@wp.func
+def next_ray(s: PhotonState) -> int:
+    """The ray that a thread traces: that which it has begun, that of its photon, or a shadow ray."""
+    ray = s.ray
+    if ray == NO_RAY:
+        ray = wp.where(s.stage == RAY, SURFACE_RAY, wp.where(s.hidden, SHADOW_RAY, NO_RAY))
+    return ray
+
+
+@made_once
+def make_counts(traces: bool) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions that all lanes call together: ``s -> int``, how many have room for a contribution that waits
+    for its shadow ray; ``(s, done, queued) -> int``, how many wait for a ray or for others. `traces`: whether rays wait
+    at all."""
+
+    @wp.func
+    def free_lanes(s: PhotonState) -> int:
+        free = int(32)
+        if wp.static(traces):
+            free = count_lanes(not s.hidden)
+        return free
+
+    @wp.func
+    def count_waiting(s: PhotonState, done: int, queued: int) -> int:
+        waiting = wp.where(queued > 0, 0, done)
+        if wp.static(traces):
+            waiting = count_lanes(s.stage != FLIGHT)
+        return waiting
+
+    return free_lanes, count_waiting
