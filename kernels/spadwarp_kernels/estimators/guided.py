@@ -42,7 +42,7 @@ LARGEST_WEIGHT_RATIO = wp.constant(64.0)
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
     request_flight, request_event = make_requests(spec)
-    registers = (96, 72)
+    registers = (96, 96)
     if spec.polarised:
         registers = (128, 96)
     elif spec.grid is not None:

@@ -9,7 +9,7 @@ from .estimator import Estimator
 def make_next_event(spec: TransportSpec) -> Estimator:
     """A contribution from every collision and surface, by way of a uniform point of the lens."""
     return Estimator(
-        max_registers=(96, 80) if spec.polarised else (64, 64),
+        max_registers=(96, 96) if spec.polarised else (64, 80),
         request_event=make_event_request(spec),
         score=make_score(spec),
     )

@@ -82,7 +82,7 @@ RAY_LANES = 20
 FREE_LANES = 12
 
 # It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
-WALKING_LANES = 8
+WALKING_LANES = 6
 
 # It takes new photons when this many lanes have ended.
 START_LANES = 3
