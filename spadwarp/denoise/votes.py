@@ -55,8 +55,12 @@ def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
         return values[..., y : y + height, x : x + width]
 
     agreeing: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # of all pixels with those so many rows, columns away
+    # All images as one line, in which a neighbour is a fixed number of places away; what crosses a border is not used.
+    line, row, pixels = image.flatten(), image.shape[3], image.numel()
+    line = torch.cat([line, line[: 2 * row + 2]])
     for step in ((y, x) for y in range(3) for x in range(-2, 3) if (y, x) > (0, 0)):
-        apart = (image - image.roll((-step[0], -step[1]), (2, 3))).abs_()
+        places = step[0] * row + step[1]
+        apart = (line[:pixels] - line[places : places + pixels]).abs_().view_as(image)
         fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
         agreeing[step] = fine, coarse
 
