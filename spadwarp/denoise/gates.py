@@ -23,7 +23,7 @@ _ROUNDS = 3
 _KEPT = 0.7  # a gate is narrowed only to less than this part of its width
 
 
-def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The part of the gate in which depths agree with those around them more often than backscatter would.
 
     Args:
@@ -32,41 +32,43 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Its start and its width, with a margin, in widths of the gate, each `[N]`; 0 and 1, the whole gate, where
-        nothing agrees, or where little would be gained.
+        nothing agrees, or where little would be gained. And the largest part of the frame that a target can take,
+        `[N]`: 1, unless depths agree only as often as those of backscatter would by chance, and more would be noticed.
     """
     import torch
 
     start, width = depth.new_zeros(len(depth)), depth.new_ones(len(depth))
     frames = torch.arange(len(depth), device=depth.device)
-    for _ in range(_ROUNDS):
+    part = torch.ones_like(start)
+    for turn in range(_ROUNDS):
         begin, extent = start[frames], width[frames]
-        low, high = _narrowed((depth - begin[:, None, None]) / extent[:, None, None], density * extent[:, None, None])
+        scaled = (depth - begin[:, None, None]) / extent[:, None, None]
+        low, high, most = _narrowed(scaled, density * extent[:, None, None])
+        part = most if turn == 0 else part  # by the whole gate
         narrower = high - low < _KEPT
         start[frames] = torch.where(narrower, begin + low * extent, begin)
         width[frames] = torch.where(narrower, (high - low) * extent, extent)
         frames, depth, density = (values[narrower] for values in (frames, depth, density))
         if len(frames) == 0:
             break
-    return start, width
+    return start, width, part
 
 
-def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Input of PyramidNet `[N, 3, H, W]` over the part of the gate that holds the target, and start and width of it.
-
-    Arguments are those of `gates_of_target`. Depths beyond `MARGIN` around that part count as not reported.
-    """
+def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Input of PyramidNet `[N, 3, H, W]` over the part of the gate that holds the target, and what `gates_of_target`
+    returns, with the same arguments. Depths beyond `MARGIN` around that part count as not reported."""
     import torch
 
-    start, width = gates_of_target(depth, density)
+    start, width, part = gates_of_target(depth, density)
     scaled = (depth - start[:, None, None]) / width[:, None, None]
     reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
     log_density = density.log().clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
     channels = torch.where(reported, scaled, 1.0), reported.to(scaled.dtype), torch.where(reported, log_density, 0.0)
-    return torch.stack(channels, dim=1), start, width
+    return torch.stack(channels, dim=1), start, width, part
 
 
-def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
-    """Start and stop as parts of the gate, `[N]`."""
+def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Start and stop as parts of the gate, and the largest part of the frame that a target can take, `[N]`."""
     import torch
 
     reported = (scaled >= 0.0) & (scaled < 1.0)
@@ -84,7 +86,15 @@ def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
     found = significant.any(dim=1) & (reported.flatten(1).sum(dim=1) >= 50)
     first, last = significant.int().argmax(dim=1), _BINS - 1 - significant.int().flip(1).argmax(dim=1)
     low, high = ((first - 1.5) / _BINS).clamp_min(0.0), ((last + 2.5) / _BINS).clamp_max(1.0)
-    return torch.where(found, low, 0.0), torch.where(found, high, 1.0)
+    # Pairs of pixels within two of each other, those that chance makes agree, and how many more would be noticed.
+    rows, columns = scaled.shape[1:]
+    around = ((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
+    pairs = sum(max(0, rows - abs(y)) * max(0, columns - abs(x)) for y, x in around)
+    expected = by_chance.sum(dim=1) * (pairs / (rows * columns))
+    noticed = 4.0 * (2.0 * expected).sqrt() + 12.0
+    agrees = agreeing.flatten(1).sum(dim=1) > expected + noticed
+    most = torch.where(agrees, 1.0, (noticed / (pairs * share.square() + 1.0)).clamp_max(1.0))
+    return torch.where(found, low, 0.0), torch.where(found, high, 1.0), most.to(scaled.dtype)
 
 
 def _agreeing(values: Tensor) -> Tensor:

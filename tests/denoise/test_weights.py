@@ -10,11 +10,12 @@ import torch
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
-from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth
+from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth, water_profile
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.gates import bins_of_target, gates_of_target
 from spadwarp.denoise.network_files import WEIGHTS
 from spadwarp.denoise.recipe import MODELS
+from spadwarp.denoise.target_probability import corrected_target
 from spadwarp.io.exr import read_exr
 
 OF_DEPTH = [name for name in MODELS if name != "histograms"]
@@ -80,6 +81,34 @@ def test_backscatter_alone_is_no_target(share, decay):
     depth = GATE[0] + (GATE[1] - GATE[0]) * place / 64
     depth[generator.random(depth.shape) >= share] = np.nan
     assert np.isfinite(denoised(depth, profile=profile, mask=0.5)).mean() < 0.01
+
+
+@pytest.mark.parametrize("water", ["near-range", "uniform"])
+def test_rare_backscatter_alone_is_no_target(water):
+    """Nor where so few pixels report that they could be those of a target that hardly reports."""
+    frames = depth_frames(
+        noisy_depth(evaluation_scene("nothing", "open water"), water=water, level=0.042, seed=3),
+        gate=GATE, profile=water_profile(water),
+    )  # fmt: skip
+    assert inference.denoise_frames(frames, model="pyramid", device="cpu")[1].mean() < 0.01
+
+
+def test_pixels_that_reported_outside_the_part_of_the_gate_are_more_likely_target_than_those_that_did_not():
+    """All pixels of the target report, a tenth of those of the water: a frame whose answer Bayes' rule gives."""
+    generator = np.random.default_rng(4)
+    hit = np.arange(100 * 100).reshape(100, 100) % 100 < 50
+    beyond = generator.random(hit.shape) < np.where(hit, 0.3, 0.1)
+    absent = ~hit & ~beyond
+    sure = generator.random(hit.shape) < 0.9
+    logit = torch.from_numpy(np.where(sure, np.where(hit, 3.0, -5.0), -1.0))[None]
+    depth, given = np.where(absent, np.nan, 0.5), ~absent & ~beyond
+    found = corrected_target(logit, torch.from_numpy(depth)[None], torch.from_numpy(given)[None].float(), torch.ones(1))
+    change = (found - logit)[0].numpy()
+    assert np.all(change[given] == 0.0) and np.all(change[absent] == -3.0)  # the largest correction
+    # Reported outside that part: 1 of the target's pixels without a depth in it, 0.1 of the water's.
+    assert np.allclose(change[beyond], np.log(1.0 / 0.1), atol=0.1)
+    less = corrected_target(logit, torch.zeros_like(logit), torch.ones_like(logit), torch.tensor([0.1]))
+    assert torch.allclose(less, logit + np.log(0.1))
 
 
 def test_every_pixel_has_a_depth_and_the_mask_is_a_choice():
@@ -171,10 +200,14 @@ def test_the_gate_is_narrowed_to_where_depths_agree():
     water = evaluation_scene("nothing", "open water")
     noisy = [noisy_depth(scene, water="uniform", level=0.264, seed=1) for scene in (target, water)]
     frames = depth_frames(np.stack(noisy), gate=(12.0, 20.0))
-    starts, widths = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
+    starts, widths, parts = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
     start, stop = 12.0 + 8.0 * starts[0], 12.0 + 8.0 * (starts[0] + widths[0])
     assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
     assert (starts[1], widths[1]) == (0.0, 1.0)
+    assert parts[0] == 1.0
+    frames = depth_frames(noisy[1], gate=GATE)
+    _, _, parts = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
+    assert parts[0] < 0.01  # no target takes more than this part of a frame of water
 
 
 def test_the_bins_of_the_target_are_those_of_the_excess():
