@@ -59,23 +59,28 @@ def inverse_direction(u: wp.vec3) -> wp.vec3:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4* box = reinterpret_cast<const float4*>(nodes.data) + 8 * node;
-    // Of the rows of lower and upper corners, those that a ray in this direction meets first.
-    const int x = inverse[0] < 0.0f ? 3 : 0, y = inverse[1] < 0.0f ? 4 : 1, z = inverse[2] < 0.0f ? 5 : 2;
-    const float4 x0 = __ldg(box + x), y0 = __ldg(box + y), z0 = __ldg(box + z);
-    const float4 x1 = __ldg(box + 3 - x), y1 = __ldg(box + 5 - y), z1 = __ldg(box + 7 - z);
+    const float4* row = reinterpret_cast<const float4*>(nodes.data) + 4 * node;
+    const float4 p = __ldg(row), q = __ldg(row + 1), r = __ldg(row + 2);
+    // A byte k of the boxes becomes the float 1 + k / 32768, so that a slab costs one multiplication and addition.
+    const float mx = p.w * inverse[0], my = q.x * inverse[1], mz = q.y * inverse[2];
+    const float bx = p.x * inverse[0] - shift[0], by = p.y * inverse[1] - shift[1], bz = p.z * inverse[2] - shift[2];
+    const unsigned lx = __float_as_uint(q.z), ly = __float_as_uint(q.w), lz = __float_as_uint(r.x);
+    const unsigned hx = __float_as_uint(r.y), hy = __float_as_uint(r.z), hz = __float_as_uint(r.w);
+    // Of the lower and upper sides, those that a ray in this direction meets first.
+    const bool x = inverse[0] < 0.0f, y = inverse[1] < 0.0f, z = inverse[2] < 0.0f;
+    const unsigned x0 = x ? hx : lx, y0 = y ? hy : ly, z0 = z ? hz : lz;
+    const unsigned x1 = x ? lx : hx, y1 = y ? ly : hy, z1 = z ? lz : hz;
     // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
     // negative counts only as that.
-    const auto entry = [&](float a, float b, float c, float d, float e, float f) {
-        const int in = __vimax3_s32_relu(__float_as_int(a * inverse[0] - shift[0]),
-            __float_as_int(b * inverse[1] - shift[1]), __float_as_int(c * inverse[2] - shift[2]));
-        const int out = __vimin3_s32(__float_as_int(d * inverse[0] - shift[0]),
-            __float_as_int(e * inverse[1] - shift[1]), __float_as_int(f * inverse[2] - shift[2]));
+    const auto at = [](unsigned bytes, int pick, float scale, float start) {
+        return __float_as_int(__uint_as_float(__byte_perm(bytes, 0x3f800000u, pick)) * scale + start);
+    };
+    const auto entry = [&](int pick) {
+        const int in = __vimax3_s32_relu(at(x0, pick, mx, bx), at(y0, pick, my, by), at(z0, pick, mz, bz));
+        const int out = __vimin3_s32(at(x1, pick, mx, bx), at(y1, pick, my, by), at(z1, pick, mz, bz));
         return in <= out && in <= __float_as_int(reach) ? __int_as_float(in) : 1.0e30f;
     };
-    return wp::vec4(
-        entry(x0.x, y0.x, z0.x, x1.x, y1.x, z1.x), entry(x0.y, y0.y, z0.y, x1.y, y1.y, z1.y),
-        entry(x0.z, y0.z, z0.z, x1.z, y1.z, z1.z), entry(x0.w, y0.w, z0.w, x1.w, y1.w, z1.w));
+    return wp::vec4(entry(0x7604), entry(0x7614), entry(0x7624), entry(0x7634));
 #else
     return wp::vec4(1.0e30f);
 #endif
@@ -87,7 +92,7 @@ def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shi
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4 child = __ldg(reinterpret_cast<const float4*>(nodes.data) + 8 * node + 6);
+    const float4 child = __ldg(reinterpret_cast<const float4*>(nodes.data) + 4 * node + 3);
     return wp::vec4(child.x, child.y, child.z, child.w);
 #else
     return wp::vec4(-1.0f);

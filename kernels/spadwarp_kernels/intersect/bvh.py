@@ -8,9 +8,13 @@ leaves, and new rays join while old ones still walk (Aila & Laine, High-Performa
 steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
 
 A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice. It is
-eight vec4, a line of a GPU's cache: lower x, y, z and upper x, y, z of the four, and their bits: the index of a node,
--2 - slot of a leaf's first face, or NO_NODE; the last is not used. Faces are three vec4 each, see `face_distance`, in
-the order of the leaves.
+four vec4, half a line of a GPU's cache, with boxes in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017):
+
+- origin x, y, z, and scale x; scale y, z, then lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child,
+  the first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
+- the bits of the children: the index of a node, -2 - slot of a leaf's first face, or NO_NODE.
+
+Faces are three vec4 each, see `face_distance`, in the order of the leaves.
 """
 
 import numpy as np
@@ -34,16 +38,85 @@ def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
     return wp.where(bits_of(nodes[2 * node][3]) >= 0, area, -1.0)
 
 
-@wp.func
-def _set_box(nodes: wp.array(dtype=wp.vec4), node: int, k: int, low: wp.vec3, high: wp.vec3):
-    for axis in range(3):
-        nodes[8 * node + axis][k] = low[axis]
-        nodes[8 * node + 3 + axis][k] = high[axis]
+# Corners of four boxes, a row each.
+Corners = wp.types.matrix(shape=(4, 3), dtype=float)
+
+# Bytes of a box are this part of a node's scale apart.
+_BYTE = wp.constant(1.0 / 32768.0)
+
+# A box is wider by this part of a byte than it is, for what a step rounds, which is a 256th.
+_SLACK = wp.constant(1.0 / 64.0)
 
 
 @wp.func
 def _child(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
-    return bits_of(nodes[8 * node + 6][k])
+    return bits_of(nodes[4 * node + 3][k])
+
+
+@wp.func
+def _byte(bits: int, k: int) -> int:
+    return (bits >> (8 * k)) & 255
+
+
+@wp.func
+def _set_boxes(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, low: Corners, high: Corners):
+    """Writes a node."""
+    origin = wp.vec3()
+    scale = wp.vec3()
+    lower = wp.vec3i()
+    upper = wp.vec3i()
+    for axis in range(3):
+        least = float(NOWHERE)
+        most = float(-NOWHERE)
+        for k in range(4):
+            if children[k] != NO_NODE:
+                least = wp.min(least, low[k, axis])
+                most = wp.max(most, high[k, axis])
+        step = wp.max((most - least) / 250.0, 2.0e-7 * wp.max(wp.abs(least), wp.abs(most)))
+        scale[axis] = step / _BYTE
+        origin[axis] = (least - step) - scale[axis]
+        zero = origin[axis] + scale[axis]
+        for k in range(4):
+            first = int(255)  # of a child that is not there the sides stand the wrong way round
+            last = int(0)
+            if children[k] != NO_NODE:
+                first = wp.clamp(int(wp.floor((low[k, axis] - zero) / step - _SLACK)), 0, 255)
+                last = wp.clamp(int(wp.ceil((high[k, axis] - zero) / step + _SLACK)), 0, 255)
+            lower[axis] = lower[axis] | (first << (8 * k))
+            upper[axis] = upper[axis] | (last << (8 * k))
+    nodes[4 * node] = wp.vec4(origin[0], origin[1], origin[2], scale[0])
+    nodes[4 * node + 1] = wp.vec4(scale[1], scale[2], from_bits(lower[0]), from_bits(lower[1]))
+    nodes[4 * node + 2] = wp.vec4(from_bits(lower[2]), from_bits(upper[0]), from_bits(upper[1]), from_bits(upper[2]))
+    nodes[4 * node + 3] = wp.vec4(
+        from_bits(children[0]), from_bits(children[1]), from_bits(children[2]), from_bits(children[3])
+    )
+
+
+@wp.func
+def _box_of(nodes: wp.array(dtype=wp.vec4), node: int):
+    """Lower and upper corner of a box around all children of a node."""
+    p = nodes[4 * node]
+    q = nodes[4 * node + 1]
+    r = nodes[4 * node + 2]
+    origin = wp.vec3(p[0], p[1], p[2])
+    scale = wp.vec3(p[3], q[0], q[1])
+    lower = wp.vec3i(bits_of(q[2]), bits_of(q[3]), bits_of(r[0]))
+    upper = wp.vec3i(bits_of(r[1]), bits_of(r[2]), bits_of(r[3]))
+    low = wp.vec3()
+    high = wp.vec3()
+    for axis in range(3):
+        first = int(255)
+        last = int(0)
+        for k in range(4):
+            if _child(nodes, node, k) != NO_NODE:
+                first = wp.min(first, _byte(lower[axis], k))
+                last = wp.max(last, _byte(upper[axis], k))
+        zero = origin[axis] + scale[axis]
+        a = zero + float(first) * (_BYTE * scale[axis])
+        b = zero + float(last) * (_BYTE * scale[axis])
+        low[axis] = a - 2.0e-7 * wp.abs(a)
+        high[axis] = b + 2.0e-7 * wp.abs(b)
+    return low, high
 
 
 @wp.kernel(enable_backward=False)
@@ -64,16 +137,18 @@ def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4))
             opened = bits_of(pairs[2 * held[best]][3])
             held[best] = 2 * opened
             held[count] = 2 * opened + 1
+    children = wp.vec4i(NO_NODE)
+    low = Corners()
+    high = Corners()
     for k in range(4):
-        low = wp.vec4(NOWHERE)
-        high = wp.vec4(NOWHERE)
-        child = int(NO_NODE)
         if held[k] >= 0:
-            low = pairs[2 * held[k]]
-            high = pairs[2 * held[k] + 1]
-            child = bits_of(low[3])
-        _set_box(nodes, pair, k, wp.vec3(low[0], low[1], low[2]), wp.vec3(high[0], high[1], high[2]))
-        nodes[8 * pair + 6][k] = from_bits(child)
+            corner = pairs[2 * held[k]]
+            other = pairs[2 * held[k] + 1]
+            children[k] = bits_of(corner[3])
+            for axis in range(3):
+                low[k, axis] = corner[axis]
+                high[k, axis] = other[axis]
+    _set_boxes(nodes, pair, children, low, high)
 
 
 @wp.kernel(enable_backward=False)
@@ -89,7 +164,7 @@ def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dt
 
 def node_depths(nodes: wp.array) -> wp.array:
     """How deep in the tree each node of four stands, int32 [nodes], -1 where no other leads to it."""
-    depth = wp.full(nodes.size // 8, -1, dtype=int, device=nodes.device)
+    depth = wp.full(nodes.size // 4, -1, dtype=int, device=nodes.device)
     depth[:1].zero_()
     for level in range(DEEPEST + 2):
         wp.launch(_depth_kernel, depth.size, [nodes, level], outputs=[depth], device=nodes.device)
@@ -109,25 +184,25 @@ def _gather_kernel(
     """The nodes that are used, in their order. Launch: nodes."""
     node = wp.tid()
     if used[node] > 0:
-        for row in range(6):
-            nodes[8 * place[node] + row] = wide[8 * node + row]
+        for row in range(3):
+            nodes[4 * place[node] + row] = wide[4 * node + row]
         for k in range(4):
             child = _child(wide, node, k)
             if child >= 0:
                 child = place[child]
-            nodes[8 * place[node] + 6][k] = from_bits(child)
+            nodes[4 * place[node] + 3][k] = from_bits(child)
 
 
 def _open(pairs: wp.array) -> wp.array:
     """Nodes of four children, as they are described above, from pairs."""
     count, device = pairs.size // 4, pairs.device
-    wide = wp.zeros(2 * pairs.size, dtype=wp.vec4, device=device)
+    wide = wp.zeros(pairs.size, dtype=wp.vec4, device=device)
     wp.launch(_open_kernel, count, [pairs], [wide], device=device)
     used, place = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
     wp.launch(_flag_kernel, count, [node_depths(wide)], [used], device=device)
     wp.utils.array_scan(used, place, inclusive=False)
     kept = int(place[-1:].numpy()[0] + used[-1:].numpy()[0])
-    nodes = wp.zeros(8 * kept, dtype=wp.vec4, device=device)
+    nodes = wp.zeros(4 * kept, dtype=wp.vec4, device=device)
     wp.launch(_gather_kernel, count, [wide, used, place], [nodes], device=device)
     return nodes
 
@@ -140,7 +215,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         extent: Its largest coordinate [m], for the padding of the boxes.
 
     Returns:
-        nodes: vec4 [8 * nodes], see above; boxes are padded against rounding.
+        nodes: vec4 [4 * nodes], see above; boxes are padded against rounding.
         faces: vec4 [3 * slots], see `face_distance`.
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
     """
@@ -162,16 +237,15 @@ def _refit_kernel(
     if depth[node] != level:
         return
     m = wp.mesh_get(mesh)
+    children = wp.vec4i()
+    lows = Corners()
+    highs = Corners()
     for k in range(4):
         child = _child(nodes, node, k)
         low = wp.vec3(NOWHERE)
         high = wp.vec3(-NOWHERE)
         if child >= 0:
-            for i in range(4):
-                if _child(nodes, child, i) != NO_NODE:
-                    for axis in range(3):
-                        low[axis] = wp.min(low[axis], nodes[8 * child + axis][i])
-                        high[axis] = wp.max(high[axis], nodes[8 * child + 3 + axis][i])
+            low, high = _box_of(nodes, child)
         elif child != NO_NODE:
             slot = -2 - child
             more = bool(True)
@@ -183,8 +257,11 @@ def _refit_kernel(
                     high = wp.max(high, p + wp.vec3(padding))
                 more = order[slot] < 0
                 slot += 1
-        if child != NO_NODE:
-            _set_box(nodes, node, k, low, high)
+        children[k] = child
+        for axis in range(3):
+            lows[k, axis] = low[axis]
+            highs[k, axis] = high[axis]
+    _set_boxes(nodes, node, children, lows, highs)
 
 
 def refit_bvh(
@@ -201,7 +278,7 @@ def refit_bvh(
 def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
     """What `pack_bvh` returns, for no faces at all: a root whose four children no ray meets."""
     x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    nodes = wp.array([[x, x, x, bits]] * 8, dtype=wp.vec4, device=device)
+    nodes = wp.array([[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4], dtype=wp.vec4, device=device)
     return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 

@@ -214,7 +214,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     elif not surfaces.levels:
         raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
     elif mesh.device.is_cuda:
-        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 8,), mesh.device)
+        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), mesh.device)
         refit_bvh(*tree, surfaces.depth, surfaces.levels)
     else:
         refit_wide(*tree)
