@@ -12,7 +12,7 @@ four vec4, half a line of a GPU's cache, with boxes in bytes (Ylitie, Karras & L
 
 - origin x, y, z, and scale x; scale y, z, then lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child,
   the first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
-- the bits of the children: the index of a node, -2 - slot of a leaf's first face, or NO_NODE.
+- the bits of the children: the index of a node, NO_NODE, or below it a leaf, see `leaf_at`.
 
 Faces are three vec4 each, see `face_distance`, in the order of the leaves.
 """
@@ -51,6 +51,18 @@ _SLACK = wp.constant(1.0 / 64.0)
 @wp.func
 def _child(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
     return bits_of(nodes[4 * node + 3][k])
+
+
+@wp.func
+def leaf_at(order: wp.array(dtype=int), slot: int) -> int:
+    """The face in a slot and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are
+    more."""
+    return -2 - 2 * slot - wp.where(number_in(order, slot) < 0, 1, 0)
+
+
+@wp.func
+def _slot(leaf: int) -> int:
+    return (-2 - leaf) >> 1
 
 
 @wp.func
@@ -179,7 +191,11 @@ def _flag_kernel(depth: wp.array(dtype=int), used: wp.array(dtype=int)):
 
 @wp.kernel(enable_backward=False)
 def _gather_kernel(
-    wide: wp.array(dtype=wp.vec4), used: wp.array(dtype=int), place: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)
+    wide: wp.array(dtype=wp.vec4),
+    order: wp.array(dtype=int),
+    used: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    nodes: wp.array(dtype=wp.vec4),
 ):
     """The nodes that are used, in their order. Launch: nodes."""
     node = wp.tid()
@@ -190,10 +206,12 @@ def _gather_kernel(
             child = _child(wide, node, k)
             if child >= 0:
                 child = place[child]
+            elif child != NO_NODE:
+                child = leaf_at(order, -2 - child)
             nodes[4 * place[node] + 3][k] = from_bits(child)
 
 
-def _open(pairs: wp.array) -> wp.array:
+def _open(pairs: wp.array, order: wp.array) -> wp.array:
     """Nodes of four children, as they are described above, from pairs."""
     count, device = pairs.size // 4, pairs.device
     wide = wp.zeros(pairs.size, dtype=wp.vec4, device=device)
@@ -203,7 +221,7 @@ def _open(pairs: wp.array) -> wp.array:
     wp.utils.array_scan(used, place, inclusive=False)
     kept = int(place[-1:].numpy()[0] + used[-1:].numpy()[0])
     nodes = wp.zeros(4 * kept, dtype=wp.vec4, device=device)
-    wp.launch(_gather_kernel, count, [wide, used, place], [nodes], device=device)
+    wp.launch(_gather_kernel, count, [wide, order, used, place], [nodes], device=device)
     return nodes
 
 
@@ -220,7 +238,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array
         order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
     """
     pairs, order = read_tree(mesh, extent)
-    return _open(pairs), pack_faces(mesh, extent, order), order
+    return _open(pairs, order), pack_faces(mesh, extent, order), order
 
 
 @wp.kernel(enable_backward=False)
@@ -247,7 +265,7 @@ def _refit_kernel(
         if child >= 0:
             low, high = _box_of(nodes, child)
         elif child != NO_NODE:
-            slot = -2 - child
+            slot = _slot(child)
             more = bool(True)
             while more:
                 face = face_in(order, slot)
@@ -331,7 +349,7 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
 
     Args:
         nodes: From `pack_bvh`.
-        walk: Its node is >= 0; a walk begins with node 0. Below `NO_NODE` are leaves: -2 - slot of the first face.
+        walk: Its node is >= 0; a walk begins with node 0. Below `NO_NODE` are leaves, see `leaf_at`.
         inverse: `inverse_direction` of the ray.
         shift: The ray's origin times `inverse`, by components.
     """
@@ -375,8 +393,10 @@ def step_leaf(
         x, u: Origin and unit direction of the ray.
     """
     step = LeafStep()
-    step.slot = -2 - walk.node
+    step.slot = _slot(walk.node)
     step.distance = face_distance(faces, step.slot, x, u)
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
-    step.node = wp.where(number_in(order, step.slot) < 0, walk.node - 1, NO_NODE)
+    step.node = NO_NODE
+    if (walk.node & 1) != 0:
+        step.node = leaf_at(order, step.slot + 1)
     return step
