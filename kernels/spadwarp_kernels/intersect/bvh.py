@@ -84,9 +84,9 @@ def _set_boxes(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, lo
             if children[k] != NO_NODE:
                 least = wp.min(least, low[k, axis])
                 most = wp.max(most, high[k, axis])
-        step = wp.max((most - least) / 250.0, 2.0e-7 * wp.max(wp.abs(least), wp.abs(most)))
+        step = wp.max((most - least) / 254.9, 2.0e-7 * wp.max(wp.abs(least), wp.abs(most)))
         scale[axis] = step / _BYTE
-        origin[axis] = (least - step) - scale[axis]
+        origin[axis] = (least - 2.0 * _SLACK * step) - scale[axis]
         zero = origin[axis] + scale[axis]
         for k in range(4):
             first = int(255)  # of a child that is not there the sides stand the wrong way round
