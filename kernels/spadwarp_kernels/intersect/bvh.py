@@ -10,8 +10,8 @@ steps is worth). `intersect_surfaces` walks a tree with the same steps from its 
 A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice. It is
 four vec4, half a line of a GPU's cache, with boxes in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017):
 
-- origin x, y, z, and scale x; scale y, z, then lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child,
-  the first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
+- origin x, y, z, scale x; scale y, z, lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child, the
+  first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
 - the bits of the children: the index of a node, NO_NODE, or below it a leaf, see `leaf_at`.
 
 Faces are three vec4 each, see `face_distance`, in the order of the leaves.
@@ -44,7 +44,7 @@ Corners = wp.types.matrix(shape=(4, 3), dtype=float)
 # Bytes of a box are this part of a node's scale apart.
 _BYTE = wp.constant(1.0 / 32768.0)
 
-# A box is wider by this part of a byte than it is, for what a step rounds, which is a 256th.
+# A box is wider by this part of a byte, for what a step rounds, which is a 256th.
 _SLACK = wp.constant(1.0 / 64.0)
 
 
@@ -55,8 +55,7 @@ def _child(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
 
 @wp.func
 def leaf_at(order: wp.array(dtype=int), slot: int) -> int:
-    """The face in a slot and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are
-    more."""
+    """A slot's face and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are more."""
     return -2 - 2 * slot - wp.where(number_in(order, slot) < 0, 1, 0)
 
 
@@ -73,10 +72,8 @@ def _byte(bits: int, k: int) -> int:
 @wp.func
 def _set_boxes(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, low: Corners, high: Corners):
     """Writes a node."""
-    origin = wp.vec3()
-    scale = wp.vec3()
-    lower = wp.vec3i()
-    upper = wp.vec3i()
+    origin, scale = wp.vec3(), wp.vec3()
+    lower, upper = wp.vec3i(), wp.vec3i()
     for axis in range(3):
         least = float(NOWHERE)
         most = float(-NOWHERE)
