@@ -7,24 +7,17 @@ a kernel moves on by a step, `step_node` or `step_leaf`: all lanes that are in n
 leaves, and new rays join while old ones still walk (Aila & Laine, High-Performance Graphics 2009, on what the order of
 steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
 
-A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice. It is
-four vec4, half a line of a GPU's cache, with boxes in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017):
-
-- origin x, y, z, scale x; scale y, z, lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child, the
-  first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
-- the bits of the children: the index of a node, NO_NODE, or below it a leaf, see `leaf_at`.
-
-Faces are three vec4 each, see `face_distance`, in the order of the leaves.
+A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; `nodes` says
+how it is kept. Faces are three vec4 each, see `face_distance`, in the order of the leaves.
 """
 
-import numpy as np
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
 
-from .box import box_children, box_entries
+from .nodes import Corners, box_entries, box_of, child_of, children_of, empty_nodes, leaf_at, set_node, slot_of
 from .pairs import DEEPEST, NO_NODE, NOWHERE, read_tree
-from .triangle import box_padding, face_distance, face_in, number_in, pack_faces, set_faces
+from .triangle import box_padding, face_distance, face_in, pack_faces, set_faces
 
 # Nodes that a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
@@ -36,96 +29,6 @@ def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
     size = nodes[2 * node + 1] - nodes[2 * node]
     area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
     return wp.where(bits_of(nodes[2 * node][3]) >= 0, area, -1.0)
-
-
-# Corners of four boxes, a row each.
-Corners = wp.types.matrix(shape=(4, 3), dtype=float)
-
-# Bytes of a box are this part of a node's scale apart.
-_BYTE = wp.constant(1.0 / 32768.0)
-
-# A box is wider by this part of a byte, for what a step rounds, which is a 256th.
-_SLACK = wp.constant(1.0 / 64.0)
-
-
-@wp.func
-def _child(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
-    return bits_of(nodes[4 * node + 3][k])
-
-
-@wp.func
-def leaf_at(order: wp.array(dtype=int), slot: int) -> int:
-    """A slot's face and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are more."""
-    return -2 - 2 * slot - wp.where(number_in(order, slot) < 0, 1, 0)
-
-
-@wp.func
-def _slot(leaf: int) -> int:
-    return (-2 - leaf) >> 1
-
-
-@wp.func
-def _byte(bits: int, k: int) -> int:
-    return (bits >> (8 * k)) & 255
-
-
-@wp.func
-def _set_boxes(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, low: Corners, high: Corners):
-    """Writes a node."""
-    origin, scale = wp.vec3(), wp.vec3()
-    lower, upper = wp.vec3i(), wp.vec3i()
-    for axis in range(3):
-        least = float(NOWHERE)
-        most = float(-NOWHERE)
-        for k in range(4):
-            if children[k] != NO_NODE:
-                least = wp.min(least, low[k, axis])
-                most = wp.max(most, high[k, axis])
-        step = wp.max((most - least) / 254.9, 2.0e-7 * wp.max(wp.abs(least), wp.abs(most)))
-        scale[axis] = step / _BYTE
-        origin[axis] = (least - 2.0 * _SLACK * step) - scale[axis]
-        zero = origin[axis] + scale[axis]
-        for k in range(4):
-            first = int(255)  # of a child that is not there the sides stand the wrong way round
-            last = int(0)
-            if children[k] != NO_NODE:
-                first = wp.clamp(int(wp.floor((low[k, axis] - zero) / step - _SLACK)), 0, 255)
-                last = wp.clamp(int(wp.ceil((high[k, axis] - zero) / step + _SLACK)), 0, 255)
-            lower[axis] = lower[axis] | (first << (8 * k))
-            upper[axis] = upper[axis] | (last << (8 * k))
-    nodes[4 * node] = wp.vec4(origin[0], origin[1], origin[2], scale[0])
-    nodes[4 * node + 1] = wp.vec4(scale[1], scale[2], from_bits(lower[0]), from_bits(lower[1]))
-    nodes[4 * node + 2] = wp.vec4(from_bits(lower[2]), from_bits(upper[0]), from_bits(upper[1]), from_bits(upper[2]))
-    nodes[4 * node + 3] = wp.vec4(
-        from_bits(children[0]), from_bits(children[1]), from_bits(children[2]), from_bits(children[3])
-    )
-
-
-@wp.func
-def _box_of(nodes: wp.array(dtype=wp.vec4), node: int):
-    """Lower and upper corner of a box around all children of a node."""
-    p = nodes[4 * node]
-    q = nodes[4 * node + 1]
-    r = nodes[4 * node + 2]
-    origin = wp.vec3(p[0], p[1], p[2])
-    scale = wp.vec3(p[3], q[0], q[1])
-    lower = wp.vec3i(bits_of(q[2]), bits_of(q[3]), bits_of(r[0]))
-    upper = wp.vec3i(bits_of(r[1]), bits_of(r[2]), bits_of(r[3]))
-    low = wp.vec3()
-    high = wp.vec3()
-    for axis in range(3):
-        first = int(255)
-        last = int(0)
-        for k in range(4):
-            if _child(nodes, node, k) != NO_NODE:
-                first = wp.min(first, _byte(lower[axis], k))
-                last = wp.max(last, _byte(upper[axis], k))
-        zero = origin[axis] + scale[axis]
-        a = zero + float(first) * (_BYTE * scale[axis])
-        b = zero + float(last) * (_BYTE * scale[axis])
-        low[axis] = a - 2.0e-7 * wp.abs(a)
-        high[axis] = b + 2.0e-7 * wp.abs(b)
-    return low, high
 
 
 @wp.kernel(enable_backward=False)
@@ -157,7 +60,7 @@ def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4))
             for axis in range(3):
                 low[k, axis] = corner[axis]
                 high[k, axis] = other[axis]
-    _set_boxes(nodes, pair, children, low, high)
+    set_node(nodes, pair, children, low, high)
 
 
 @wp.kernel(enable_backward=False)
@@ -166,7 +69,7 @@ def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dt
     node = wp.tid()
     if depth[node] == level:
         for k in range(4):
-            child = _child(nodes, node, k)
+            child = child_of(nodes, node, k)
             if child >= 0:
                 depth[child] = level + 1
 
@@ -200,7 +103,7 @@ def _gather_kernel(
         for row in range(3):
             nodes[4 * place[node] + row] = wide[4 * node + row]
         for k in range(4):
-            child = _child(wide, node, k)
+            child = child_of(wide, node, k)
             if child >= 0:
                 child = place[child]
             elif child != NO_NODE:
@@ -256,13 +159,13 @@ def _refit_kernel(
     lows = Corners()
     highs = Corners()
     for k in range(4):
-        child = _child(nodes, node, k)
+        child = child_of(nodes, node, k)
         low = wp.vec3(NOWHERE)
         high = wp.vec3(-NOWHERE)
         if child >= 0:
-            low, high = _box_of(nodes, child)
+            low, high = box_of(nodes, child)
         elif child != NO_NODE:
-            slot = _slot(child)
+            slot = slot_of(child)
             more = bool(True)
             while more:
                 face = face_in(order, slot)
@@ -276,7 +179,7 @@ def _refit_kernel(
         for axis in range(3):
             lows[k, axis] = low[axis]
             highs[k, axis] = high[axis]
-    _set_boxes(nodes, node, children, lows, highs)
+    set_node(nodes, node, children, lows, highs)
 
 
 def refit_bvh(
@@ -291,10 +194,8 @@ def refit_bvh(
 
 
 def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
-    """What `pack_bvh` returns, for no faces at all: a root whose four children no ray meets."""
-    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    nodes = wp.array([[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4], dtype=wp.vec4, device=device)
-    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
+    """What `pack_bvh` returns, for no faces at all."""
+    return empty_nodes(device), wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
 @wp.struct
@@ -351,7 +252,7 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
         shift: The ray's origin times `inverse`, by components.
     """
     entry = box_entries(nodes, walk.node, inverse, shift, walk.nearest)
-    child = box_children(nodes, walk.node)
+    child = children_of(nodes, walk.node)
     a, b = _first(wp.vec2(entry[0], child[0]), wp.vec2(entry[1], child[1]))
     c, d = _first(wp.vec2(entry[2], child[2]), wp.vec2(entry[3], child[3]))
     a, c = _first(a, c)
@@ -390,7 +291,7 @@ def step_leaf(
         x, u: Origin and unit direction of the ray.
     """
     step = LeafStep()
-    step.slot = _slot(walk.node)
+    step.slot = slot_of(walk.node)
     step.distance = face_distance(faces, step.slot, x, u)
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
     step.node = NO_NODE
