@@ -113,13 +113,16 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of, shows = spec.lens.view, port_view(spec.port).shows
     reflecting, tracks, derives = spec.reflecting, spec.grid is not None, bool(spec.derivatives)
-    polarised = spec.polarised
+    polarised, has_mesh = spec.polarised, spec.mesh
 
     @wp.func
     def event_request(s: PhotonState, camera: Camera) -> Request:
         q = Request()
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
         # Mirrored, any point may be seen.
-        if wp.static(not flights or reflecting) or s.hit.face >= 0:
+        if wp.static(not flights or reflecting) or on_surface:
             if wp.static(reflecting) or shows(camera, view_of(camera, s.view), s.x):
                 q.wanted = True
                 if wp.static(reflecting):
@@ -140,13 +143,13 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                     q.scores = s.scores
                 if wp.static(polarised):
                     q.stokes = s.stokes
-                if s.hit.face >= 0:
+                if on_surface:
                     q.slot = s.hit.slot
                     if s.collisions == 1:
                         q.component = BALLISTIC
                 else:
                     q.weight *= s.albedo
-                    if s.surface_count == 0:
+                    if wp.static(not has_mesh) or s.surface_count == 0:
                         q.component = BACKSCATTER
         return q
 

@@ -282,16 +282,18 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         elif on_surface:
             axis = s.hit.normal
         t = sample_angle(s.flight.block[1], to_lens, directed, here, medium, guiding)
-        if on_surface and not directed:
-            t = sample_cosine_law(u01(s.flight.block[1]))
+        # Selected rather than branched to, so that what is left out stays in no register.
+        if wp.static(has_mesh):
+            t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
         new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
         if wp.static(specular):
             if on_surface and not directed:
                 new.u = reflected
         density = phase_pdf(one_minus_cosine(snapped, new.u), here)
-        if on_surface:
-            density = wp.max(wp.dot(new.u, s.hit.normal), 0.0) * 0.3183098861837907
-            if wp.static(specular):
+        if wp.static(has_mesh):
+            density = wp.where(on_surface, wp.max(wp.dot(new.u, s.hit.normal), 0.0) * 0.3183098861837907, density)
+        if wp.static(specular):
+            if on_surface:
                 density = reflection_pdf(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], lobe)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
         mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), medium, guiding)

@@ -21,16 +21,16 @@ _MOST_SLOTS = (2**31 - 1) // 144 * 8
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(faces.data) + index);
+    // With an index of 64 bits all planes of neighbouring faces have one address and offsets.
+    const float4 v = __ldg(reinterpret_cast<const float4*>(faces.data) + 3 * static_cast<int64_t>(slot) + plane);
     return wp::vec4(v.x, v.y, v.z, v.w);
 #else
-    const int slot = index / 3;
-    const float* row = reinterpret_cast<const float*>(faces.data) + 144 * (slot / 8) + 32 * (index % 3) + slot % 8;
+    const float* row = reinterpret_cast<const float*>(faces.data) + 144 * (slot / 8) + 32 * plane + slot % 8;
     return wp::vec4(row[0], row[8], row[16], row[24]);
 #endif
 """)
-def load_plane(faces: wp.array(dtype=wp.vec4), index: int) -> wp.vec4:
-    """A plane of a face, number 3 * slot and the next two; in one load on CUDA."""
+def load_plane(faces: wp.array(dtype=wp.vec4), slot: int, plane: int) -> wp.vec4:
+    """Plane 0, 1 or 2 of the face in a slot; in one load on CUDA."""
     ...
 
 
@@ -162,9 +162,9 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
     own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the
     ray, so that none slips between two faces; more than that beyond the short edges of a sliver, where its box ends it.
     """
-    a = load_plane(faces, 3 * slot)
-    b = load_plane(faces, 3 * slot + 1)
-    n = load_plane(faces, 3 * slot + 2)
+    a = load_plane(faces, slot, 0)
+    b = load_plane(faces, slot, 1)
+    n = load_plane(faces, slot, 2)
     rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
     height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
     distance = height / rate  # infinite or not a number for a ray in the plane, which fails below
@@ -181,6 +181,6 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
 @wp.func
 def face_normal(faces: wp.array(dtype=wp.vec4), slot: int, u: wp.vec3) -> wp.vec3:
     """The unit normal of a face, against u."""
-    n = load_plane(faces, 3 * slot + 2)
+    n = load_plane(faces, slot, 2)
     normal = wp.normalize(wp.vec3(n[0], n[1], n[2]))
     return wp.where(wp.dot(normal, u) > 0.0, -normal, normal)

@@ -67,7 +67,8 @@ def orthonormal_basis(n: wp.vec3):
     s = wp.where(n[2] < 0.0, -1.0, 1.0)
     a = -1.0 / (s + n[2])
     b = n[0] * n[1] * a
-    return wp.vec3(1.0 + s * n[0] * n[0] * a, s * b, -s * n[0]), wp.vec3(b, s + n[1] * n[1] * a, -n[1])
+    # Times -1: Warp's unary minus is 0 - x, an addition, which no multiplication takes in.
+    return wp.vec3(1.0 + s * n[0] * n[0] * a, s * b, (-1.0 * s) * n[0]), wp.vec3(b, s + n[1] * n[1] * a, -1.0 * n[1])
 
 
 @wp.func
@@ -85,6 +86,18 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     return v * (1.5 - 0.5 * wp.dot(v, v))
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float((__float_as_uint(number) & 0x80000000u) | 0x3f800000u);
+#else
+    return wp::sign(number);
+#endif
+""")
+def one_with_sign(number: float) -> float:
+    """1 with the sign of a number that is not 0."""
+    ...
+
+
 @wp.func
 def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
     """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= axis_threshold, else u.
@@ -93,7 +106,7 @@ def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
     function; the flight keeps u. A threshold of 0.9998 drops up to 1.15 degrees of tilt, 1 switches the rule off.
     """
     if axis_threshold < 1.0 and wp.abs(u[2]) >= axis_threshold:
-        return wp.vec3(0.0, 0.0, wp.sign(u[2]))
+        return wp.vec3(0.0, 0.0, one_with_sign(u[2]))
     return u
 
 

@@ -45,11 +45,9 @@ class Limits:
 
 @wp.func
 def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
-    if u > 0.0:
-        return wp.max((upper - x) / u, 0.0)
-    if u < 0.0:
-        return wp.max((lower - x) / u, 0.0)
-    return 1.0e30
+    # Selected rather than branched to: the lanes of a warp go either way.
+    distance = wp.max((wp.where(u > 0.0, upper, lower) - x) / u, 0.0)
+    return wp.where(u > 0.0 or u < 0.0, distance, 1.0e30)
 
 
 @wp.func
@@ -70,8 +68,17 @@ def _to_faces(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     )
 
 
+@wp.struct
+class Exit:
+    """Where a ray leaves the domain: distance [m], and index into EXIT_FACES, 0 for the lateral limit."""
+
+    distance: float
+    face: int
+
+
 @wp.func
-def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
+def _first_exit(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> Exit:
+    first = Exit()
     best = float(to_sides)
     face = int(0)
     for i in range(3):
@@ -79,7 +86,14 @@ def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
         if distance <= best:
             best = distance
             face = 1 + 2 * i + wp.where(u[i] > 0.0, 1, 0)
-    return face
+    first.distance = best
+    first.face = face
+    return first
+
+
+@wp.func
+def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
+    return _first_exit(limits, to_sides, x, u).face
 
 
 @wp.func
@@ -139,3 +153,15 @@ def exit_distance_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
 def exit_face_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
     """As `exit_face`, for a domain with axes of its own; faces are named after them."""
     return _first_face(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)
+
+
+@wp.func
+def first_exit(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
+    """`exit_distance` and `exit_face` at once."""
+    return _first_exit(limits, _to_sides(limits, x, u), x, u)
+
+
+@wp.func
+def first_exit_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
+    """`exit_distance_rotated` and `exit_face_rotated` at once."""
+    return _first_exit(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)

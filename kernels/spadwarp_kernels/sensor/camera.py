@@ -5,6 +5,7 @@ Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangent
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
@@ -143,7 +144,7 @@ def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
     # Selected rather than branched to: half the lanes of a warp go either way. For a flight along the plane the
     # crossing is infinite.
-    crossing = -value / slope
+    crossing = -1.0 * value / slope
     rising = slope >= 0.0
     lower = wp.where(rising, wp.max(interval[0], crossing), interval[0])
     upper = wp.where(rising, interval[1], wp.min(interval[1], crossing))
@@ -156,6 +157,17 @@ def field(camera: Camera) -> wp.vec4:
     half_width = 0.5 * float(camera.width) * camera.pixel_tangent
     half_height = 0.5 * float(camera.height) * camera.pixel_tangent
     return wp.vec4(-half_width, -half_height, half_width, half_height)
+
+
+def with_field(camera: Any) -> Any:
+    """A copy of the camera whose view is its `field`, rounded as there, so that no thread need compute it."""
+    copy = Camera()
+    for name in Camera.vars:
+        setattr(copy, name, getattr(camera, name))
+    tangent = np.float32(camera.pixel_tangent)
+    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
+    copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
+    return copy
 
 
 @wp.func

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, field, project, project_calibrated
+from .camera import Camera, project, project_calibrated
 
 
 class Lens(NamedTuple):
@@ -33,7 +33,7 @@ def _project_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp
 
 @wp.func
 def _view_plain(camera: Camera, view: wp.vec4) -> wp.vec4:
-    return field(camera)
+    return camera.view
 
 
 @wp.func

@@ -11,6 +11,8 @@ from spadwarp_kernels.medium.limits import (
     exit_distance_rotated,
     exit_face,
     exit_face_rotated,
+    first_exit,
+    first_exit_rotated,
     is_outside,
     is_outside_rotated,
 )
@@ -48,10 +50,10 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     bounded = spec.bounded and not reflecting
     local_albedo = spec.varies and not spec.random_albedo
     water_at = spec.water.at
-    to_exit, face_of_exit, outside = (
-        (exit_distance_rotated, exit_face_rotated, is_outside_rotated)
+    to_exit, face_of_exit, exit_of, outside = (
+        (exit_distance_rotated, exit_face_rotated, first_exit_rotated, is_outside_rotated)
         if spec.rotated_domain
-        else (exit_distance, exit_face, is_outside)
+        else (exit_distance, exit_face, first_exit, is_outside)
     )
 
     @wp.func
@@ -66,8 +68,9 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
             c.distance = limit
         if wp.static(bounded):
             if outside(limits, s.x + c.distance * s.u):
-                c.reason = EXIT + face_of_exit(limits, s.x, s.u)
-                c.distance = wp.min(c.distance, to_exit(limits, s.x, s.u))
+                leaves = exit_of(limits, s.x, s.u)
+                c.reason = EXIT + leaves.face
+                c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflecting):
             # By distance: a photon that has been reflected may be outside by a rounding error.
             exit = to_exit(limits, s.x, s.u)

@@ -15,8 +15,9 @@ from spadwarp_kernels.photon.records import Records, make_records
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import round_keys
-from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.camera import Camera, with_field
 from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.sensor.projection import PLAIN
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -190,7 +191,8 @@ def launch_transport(
         threads = threads_of_blocks(threads, derivatives.blocks)
         derivatives = _with_memory(derivatives, threads, model.device)
     data.cursor.zero_()
-    inputs = [model.medium, model.layers, model.laser, model.camera, model.gate, model.limits, model.guiding]
+    camera = with_field(model.camera) if spec.lens == PLAIN else model.camera
+    inputs = [model.medium, model.layers, model.laser, camera, model.gate, model.limits, model.guiding]
     inputs += [model.surfaces, model.scan, derivatives, model.polarisation]
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),
