@@ -4,7 +4,15 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.photon.lanes import ADD_ENTRY, QUEUE_ENTRIES, count_lanes_before, make_queue_vectors, queue_size
+from spadwarp_kernels.photon.lanes import (
+    ADD_ENTRY,
+    LONG_QUEUE_ENTRIES,
+    QUEUE_ENTRIES,
+    count_lanes_before,
+    make_warp_memory,
+    queue_size,
+    queue_vector,
+)
 
 from .contribution import Request
 
@@ -24,14 +32,15 @@ def _among_takers(lane: int, takes: bool) -> int:
 
 @made_once
 def make_queue(
-    flights: bool, used: bool, traces: bool, confocal: bool, derivatives: int = 0, polarised: bool = False
-) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``push(request)`` adds what is wanted; ``pop(lane, takes, size, count) -> Request``, the last
-    ones for the so many lanes that take one.
+    flights: bool, used: bool, long: bool, traces: bool, confocal: bool, derivatives: int = 0, polarised: bool = False
+) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Three Warp functions: ``warp_memory()``, see `make_warp_memory`; ``push(memory, request)`` adds what is wanted;
+    ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take one.
 
     Args:
         flights: Whether requests have an interval and a point of the lens.
         used: Whether there is a queue at all; else `push` does nothing.
+        long: Whether a lane may add two requests, a flight and an event, before the queue is read.
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
         confocal: Whether they have a target.
         derivatives: How many scores requests have.
@@ -40,16 +49,21 @@ def make_queue(
     more, rank_of = flights or confocal, _among_takers if traces else _lane
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
-    queue_vector = make_queue_vectors(first_score + (1 if polarised else score_vectors))
+    entries = int(LONG_QUEUE_ENTRIES if long else QUEUE_ENTRIES)
+    vectors = first_score + (1 if polarised else score_vectors)
+    warp_memory = make_warp_memory(vectors * entries if used else 0)
 
     @wp.func
-    def write(entry: int, request: Request):
+    def write(memory: int, entry: int, request: Request):
         packed = request.component + int(request.rounding_sample & _UPPER_24)
-        queue_vector(True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
-        queue_vector(True, entry + QUEUE_ENTRIES, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
+        queue_vector(memory, True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         queue_vector(
+            memory, True, entry + wp.static(entries), wp.vec4(request.u[0], request.u[1], request.u[2], request.path)
+        )
+        queue_vector(
+            memory,
             True,
-            entry + 2 * QUEUE_ENTRIES,
+            entry + 2 * wp.static(entries),
             wp.vec4(
                 from_bits(int(request.first)),
                 from_bits(int(request.second)),
@@ -62,31 +76,34 @@ def make_queue(
             if request.interval[0] >= request.interval[1]:
                 lens[0] = from_bits(request.slot)  # an event has no point of the lens yet
             queue_vector(
-                True, entry + 3 * QUEUE_ENTRIES, wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1])
+                memory,
+                True,
+                entry + 3 * wp.static(entries),
+                wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1]),
             )
         for i in range(wp.static(score_vectors)):
             a = request.scores
             part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
-            queue_vector(True, entry + (wp.static(first_score) + i) * QUEUE_ENTRIES, part)
+            queue_vector(memory, True, entry + (wp.static(first_score) + i) * wp.static(entries), part)
         if wp.static(polarised):
             # Which goes without derivatives.
-            queue_vector(True, entry + wp.static(first_score) * QUEUE_ENTRIES, request.stokes)
+            queue_vector(memory, True, entry + wp.static(first_score) * wp.static(entries), request.stokes)
 
     @wp.func
-    def push(request: Request):
+    def push(memory: int, request: Request):
         if wp.static(used):
             if request.wanted:
-                write(queue_size(ADD_ENTRY, 0), request)
+                write(memory, queue_size(memory, ADD_ENTRY, 0), request)
 
     @wp.func
-    def pop(lane: int, takes: bool, size: int, count: int) -> Request:
+    def pop(memory: int, lane: int, takes: bool, size: int, count: int) -> Request:
         request = Request()
         index = wp.max(size - count, 0) + rank_of(lane, takes)
         request.wanted = takes and index < size
         entry = wp.min(index, size - 1)
-        a = queue_vector(False, entry, wp.vec4())
-        b = queue_vector(False, entry + QUEUE_ENTRIES, wp.vec4())
-        c = queue_vector(False, entry + 2 * QUEUE_ENTRIES, wp.vec4())
+        a = queue_vector(memory, False, entry, wp.vec4())
+        b = queue_vector(memory, False, entry + wp.static(entries), wp.vec4())
+        c = queue_vector(memory, False, entry + 2 * wp.static(entries), wp.vec4())
         request.x = wp.vec3(a[0], a[1], a[2])
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
@@ -99,18 +116,18 @@ def make_queue(
         request.target = -1
         request.slot = bits_of(c[3])
         if wp.static(more):
-            d = queue_vector(False, entry + 3 * QUEUE_ENTRIES, wp.vec4())
+            d = queue_vector(memory, False, entry + 3 * wp.static(entries), wp.vec4())
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
             request.target = bits_of(c[3])
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
         for i in range(wp.static(score_vectors)):
-            part = queue_vector(False, entry + (wp.static(first_score) + i) * QUEUE_ENTRIES, wp.vec4())
+            part = queue_vector(memory, False, entry + (wp.static(first_score) + i) * wp.static(entries), wp.vec4())
             for k in range(4):
                 request.scores[4 * i + k] = part[k]
         if wp.static(polarised):
-            request.stokes = queue_vector(False, entry + wp.static(first_score) * QUEUE_ENTRIES, wp.vec4())
+            request.stokes = queue_vector(memory, False, entry + wp.static(first_score) * wp.static(entries), wp.vec4())
         return request
 
-    return push, pop
+    return warp_memory, push, pop

@@ -33,16 +33,57 @@ def count_lanes_before(condition: bool) -> int:
     ...
 
 
-@wp.func_native(f"""
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ float vectors[6 * {BLOCK_SIZE}];
-    float* mine = vectors + 6u * (threadIdx.x & ~31u);
-    if (put) {{
+    const unsigned int lanes = __ballot_sync(0xffffffffu, condition);
+    return wp::vec2i(__popc(lanes & ((1u << (threadIdx.x & 31u)) - 1u)), __popc(lanes));
+#else
+    return wp::vec2i(0, condition ? 32 : 0);
+#endif
+""")
+def vote(condition: bool) -> wp.vec2i:
+    """`count_lanes_before` and `count_lanes` of one vote."""
+    ...
+
+
+# A warp's shared memory, in units of 16 bytes: 32 vectors of six numbers, the size of its queue, and that.
+_SIZE = 48
+_QUEUE = 49
+
+_MEMORY = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 memory[%d];
+    unsigned int begin = __cvta_generic_to_shared(memory + %du * (threadIdx.x >> 5u));
+    // Out of the compiler's sight, which else computes it anew, in six instructions, wherever it is used.
+    asm volatile("" : "+r"(begin));
+    return begin;
+#else
+    return 0;
+#endif
+"""
+
+
+@made_once
+def make_warp_memory(vectors: int) -> wp.Function:
+    """The Warp function ``() -> int``: where the shared memory of a warp begins, with so many vec4 in its queue; CUDA
+    alone. Kernels take no more than they need, since the cache has the rest."""
+    of_warp = _QUEUE + vectors
+
+    @wp.func_native(_MEMORY % (of_warp * BLOCK_SIZE // 32, of_warp))
+    def warp_memory() -> int: ...
+
+    return warp_memory
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float* mine = static_cast<float*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory)));
+    if (put) {
         __syncwarp();
         for (int i = 0; i < 6; ++i) mine[32 * i + entry] = value[i];
         __syncwarp();
         return value;
-    }}
+    }
     wp::spatial_vector taken;
     for (int i = 0; i < 6; ++i) taken[i] = mine[32 * i + entry];
     return taken;
@@ -50,7 +91,7 @@ def count_lanes_before(condition: bool) -> int:
     return value;
 #endif
 """)
-def exchange(put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
+def exchange(memory: int, put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
     """32 vectors that a warp shares: every lane puts one, and later any lane takes any; CUDA alone."""
     ...
 
@@ -70,32 +111,24 @@ def take_photons(cursor: wp.array(dtype=int)) -> int:
     ...
 
 
-# Entries of a warp's queue: 31 requests that wait and 32 that come.
+# Entries of a warp's queue: 31 requests that wait and 32 that come, or 64, a flight and an event of each lane.
 QUEUE_ENTRIES = wp.constant(63)
+LONG_QUEUE_ENTRIES = wp.constant(95)
 
-_QUEUE = """
+
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 queue[%d];
-    float4* mine = queue + %du * (threadIdx.x >> 5u);
+    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE};
     if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
     const float4 held = mine[entry];
     return wp::vec4(held.x, held.y, held.z, held.w);
 #else
     return value;
 #endif
-"""
-
-
-@made_once
-def make_queue_vectors(vectors: int) -> wp.Function:
-    """The Warp function ``(put, entry, value) -> vec4`` that writes or reads one of the vectors x QUEUE_ENTRIES of the
-    warp's queue; CUDA alone. Kernels take no more shared memory than they need, since the cache has the rest."""
-    of_warp = vectors * QUEUE_ENTRIES
-
-    @wp.func_native(_QUEUE % (of_warp * BLOCK_SIZE // 32, of_warp))
-    def queue_vector(put: bool, entry: int, value: wp.vec4) -> wp.vec4: ...
-
-    return queue_vector
+""")
+def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
+    """Writes or reads one of the vectors of the warp's queue; CUDA alone."""
+    ...
 
 
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
@@ -103,8 +136,7 @@ ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ int sizes[{BLOCK_SIZE // 32}];
-    int* size = sizes + (threadIdx.x >> 5u);
+    int* size = static_cast<int*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + 4 * {_SIZE};
     if (act == 0) return atomicAdd(size, 1);
     __syncwarp();
     if (act == 1) return __shfl_sync(0xffffffffu, *size, 0);
@@ -113,7 +145,7 @@ ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 #endif
     return number;
 """)
-def queue_size(act: int, number: int) -> int:
+def queue_size(memory: int, act: int, number: int) -> int:
     """The number of entries of the warp's queue; CUDA alone.
 
     ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see

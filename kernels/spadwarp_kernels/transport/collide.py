@@ -101,14 +101,15 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
 
 
 @made_once
-def make_arrives(flights: bool, traces: bool, queues: bool) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions ``(s, queued) -> bool``: whether the photon's flight is to be scored, and whether, that being
-    done, it is at the end of its flight and free to collide.
+def make_arrives(flights: bool, traces: bool, queues: bool, at_once: bool) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions ``(s, queued, flies) -> bool``: whether the photon's flight is to be scored, and whether, that
+    being done, it is at the end of its flight and free to collide.
 
     Args:
         flights: Whether flights are scored; then collisions in the water are not.
         traces: Whether what is scored may wait for a shadow ray.
         queues: Whether it waits in the warp's queue before; else the thread's last one must have been traced.
+        at_once: Whether nothing is waited for: a photon that has flown arrives.
     """
 
     @wp.func
@@ -121,11 +122,15 @@ def make_arrives(flights: bool, traces: bool, queues: bool) -> tuple[wp.Function
         return room
 
     @wp.func
-    def flown(s: PhotonState, queued: int) -> bool:
+    def flown(s: PhotonState, queued: int, flies: bool) -> bool:
+        if wp.static(at_once):
+            return flies and is_planned(s.flight)
         return s.stage == EVENT and is_planned(s.flight) and has_room(s, queued)
 
     @wp.func
-    def arrives(s: PhotonState, queued: int) -> bool:
+    def arrives(s: PhotonState, queued: int, flies: bool) -> bool:
+        if wp.static(at_once):
+            return flies
         room = has_room(s, queued)
         if wp.static(flights):
             room = (room or (wp.static(not queues) and s.hit.face < 0)) and not is_planned(s.flight)

@@ -87,9 +87,11 @@ def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
     emit = make_emit(spec)
 
     @wp.func
-    def take_emitted(laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64, entry: int) -> wp.spatial_vector:
+    def take_emitted(
+        memory: int, laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64, entry: int
+    ) -> wp.spatial_vector:
         if wp.static(cuda):
-            return exchange(False, entry, wp.spatial_vector())
+            return exchange(memory, False, entry, wp.spatial_vector())
         return emit(laser, scan, seed, id)
 
     return take_emitted

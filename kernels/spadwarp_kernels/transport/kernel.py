@@ -25,15 +25,7 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
-from spadwarp_kernels.photon.lanes import (
-    READ_SIZE,
-    SET_SIZE,
-    count_lanes,
-    count_lanes_before,
-    exchange,
-    queue_size,
-    take_photons,
-)
+from spadwarp_kernels.photon.lanes import READ_SIZE, SET_SIZE, count_lanes, exchange, queue_size, take_photons, vote
 from spadwarp_kernels.photon.records import Records
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
@@ -71,7 +63,7 @@ from .collide import make_arrives, make_collide
 from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
 from .flight import make_draw_albedo, make_fly
-from .scatter import make_flies, make_scatter
+from .scatter import make_leave, make_scatter
 from .traverse import make_aim, make_begin_walk, make_counts, make_look, next_ray
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
@@ -102,23 +94,28 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     cross, score = make_derived_cross(spec, estimator.cross), make_derived_score(spec, estimator.score)
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = estimator.cross is not None, request_flight is not None, estimator.score is not None
-    has_mesh, confocal, draw_albedo = spec.mesh, spec.confocal, make_draw_albedo(spec)
-    reflecting = spec.reflecting
+    has_mesh, reflecting, confocal, draw_albedo = spec.mesh, spec.reflecting, spec.confocal, make_draw_albedo(spec)
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
     has_bvh = has_mesh and not brute_force
     in_blocks = bool(spec.blocks)
     queues = scores and cuda and not in_blocks  # scores of blocks stay with the thread
+    # Where nothing waits for a shadow ray, a photon flies, collides and scatters in one branch, so that a warp pays for
+    # these once. Otherwise a new direction comes before the score, or after it: measured, which of the two is faster.
+    at_once = cuda and not has_bvh and ((queues and flights) or not scores)
+    early = at_once or (has_bvh and queues and not flights)
     ray_lanes = RAY_LANES if has_bvh else 32
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
-    scatter, flies = make_scatter(spec, estimator.direct, crosses), make_flies(crosses)
-    flown, arrives = make_arrives(flights, has_bvh, queues)
+    scatter, leave = make_scatter(spec, estimator.direct, crosses), make_leave(crosses)
+    flown, arrives = make_arrives(flights, has_bvh, queues, at_once)
     free_lanes, count_waiting = make_counts(has_bvh)
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
-    push, pop = make_queue(flights, queues, has_bvh, confocal, len(spec.derivatives), spec.polarised)
+    warp_memory, push, pop = make_queue(
+        flights, queues, at_once, has_bvh, confocal, len(spec.derivatives), spec.polarised
+    )
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
     score_images = make_score_images(spec, flights, brute_force)
@@ -171,16 +168,18 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             words = cursor  # any: it is not used
         else:
             words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
+        memory = warp_memory()
         done = int(0)
         queued = int(0)
         if wp.static(queues):
-            queued = queue_size(SET_SIZE, 0)
+            queued = queue_size(memory, SET_SIZE, 0)
 
         while count_lanes(s.stage == DONE and not s.hidden) < 32 or (wp.static(has_bvh and queues) and queued > 0):
             # ---- Water: until enough lanes of the warp wait for a ray
             waiting = int(0)
             while waiting < wp.static(ray_lanes):
-                if s.stage == FLIGHT:
+                flying = s.stage == FLIGHT
+                if flying:
                     id = base + wp.uint64(s.photon)
                     s.flight = fly(s, medium, layers, camera, gate, limits, keys, id, words)
                     s.hit.face = -1
@@ -197,15 +196,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.hit = hit
                             s.flight = shorten(s.flight, hit.distance)
                 # Round 0 scores the flight, round 1 the event at its end.
-                round = int(wp.static(0 if flights else 1))
+                round = int(wp.static(0 if flights and not at_once else 1))
                 while round < 2:
                     asked = Asked()
                     if wp.static(flights):
-                        if round == 0 and flown(s, queued):
+                        if (wp.static(at_once) or round == 0) and flown(s, queued, flying):
                             asked.request = request_flight(s)
-                            push(asked.request)
+                            push(memory, asked.request)
                             s.flight.interval = wp.vec2(0.0, 0.0)
-                    if round == 1 and arrives(s, queued):
+                    if round == 1 and arrives(s, queued, flying):
                         if wp.static(crosses):
                             crossing = cross(s, camera, gate, limits, layers, derivatives, polarisation)
                             if wp.static(reflecting):
@@ -230,19 +229,25 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.albedo = end.albedo
                             if wp.static(scores):
                                 asked.request = request_event(s, camera)
-                                push(asked.request)
+                                push(memory, asked.request)
+                            if wp.static(early):
+                                new = scatter(
+                                    s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
+                                    keys, base + wp.uint64(s.photon), ledger, thread)  # fmt: skip
+                                leave(s, new)
                     round += 1
                     # ---- Scores: each lane its own or, from a queue, 32 together
                     if wp.static(scores):
-                        ready = asked.request.wanted
+                        ready = bool(asked.request.wanted)
                         if wp.static(queues):
-                            queued = queue_size(READ_SIZE, 0)
+                            queued = queue_size(memory, READ_SIZE, 0)
                             free = free_lanes(s)
                             ready = (queued >= 32 or (done == 32 and queued > 0)) and free >= wp.static(FREE_LANES)
-                        if ready:
+                        while ready:
                             if wp.static(queues):
-                                asked.request = pop(lane, not s.hidden, queued, free)
-                                queued = queue_size(SET_SIZE, wp.max(queued - free, 0))
+                                asked.request = pop(memory, lane, not s.hidden, queued, free)
+                                queued = queue_size(memory, SET_SIZE, wp.max(queued - free, 0))
+                            ready = wp.static(at_once) and queued >= 32
                             found = score(
                                 asked.request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation
                             )
@@ -268,20 +273,11 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 s.contributions += more.contributions
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
-                # The score took the photon as it arrived; now its weight, its end or its new direction.
-                if s.stage == SCATTER:
+                # Now the photon's weight, its end or its new direction; a score of its own took it as it arrived.
+                if wp.static(not early) and s.stage == SCATTER:
                     new = scatter(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation,
                                   keys, base + wp.uint64(s.photon), ledger, thread)  # fmt: skip
-                    s.u = new.u
-                    s.weight = new.weight
-                    s.analog_weight = new.analog_weight
-                    s.surface_count = new.surface_count
-                    s.scores = new.scores
-                    s.stokes = new.stokes
-                    s.absorbed_surface += new.absorbed_surface
-                    s.directed += new.directed
-                    s.reason = new.reason
-                    s.stage = wp.where(flies(s.reason), FLIGHT, END)
+                    leave(s, new)
 
                 # ---- The next photon for those that have ended
                 if count_lanes(s.stage >= START) >= START_LANES:
@@ -292,15 +288,16 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.surface_events += s.surface_count
                         s.stage = START
                     wanting = s.stage == START
-                    entry = count_lanes_before(wanting)
+                    votes = vote(wanting)
+                    entry = votes[0]
                     if wp.static(cuda):
                         # All lanes emit a photon each, which those that have ended take one by one.
                         if s.taken >= 32:
                             s.first = take_photons(cursor)
                             s.taken = 0
-                            exchange(True, lane, emit(laser, scan, seed, base + wp.uint64(s.first + lane)))
+                            exchange(memory, True, lane, emit(laser, scan, seed, base + wp.uint64(s.first + lane)))
                         entry += s.taken
-                        s.taken += count_lanes(wanting)
+                        s.taken += votes[1]
                     elif wanting:
                         s.first += 1
                     if wanting and entry < 32:
@@ -311,7 +308,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(confocal):
                                 s.target = int(id % wp.uint64(scan.count))
                                 s.view = scan.view[s.target]
-                            emitted = take_emitted(laser, scan, seed, id, entry)
+                            emitted = take_emitted(memory, laser, scan, seed, id, entry)
                             start = enter(laser, emitted, s, ledger, thread)
                             s.x = start.x
                             s.u = start.u
@@ -323,7 +320,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.scores = begin_history(derivatives)
                             s.stokes = first_stokes(polarisation, laser, scan, s.target, emitted, s.x, s.u)
 
-                done = count_lanes(s.stage == DONE)
+                    done = count_lanes(s.stage == DONE)
                 waiting = count_waiting(s, done, queued)
 
             # ---- Surfaces: the warp traces its rays together

@@ -13,7 +13,7 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState, Weight, reweigh
+from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState, Weight, reweigh
 from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
 from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
@@ -135,6 +135,30 @@ def make_flies(flies_on: bool) -> wp.Function:
         return reason < 0 or (wp.static(flies_on) and reason != ROULETTE)
 
     return flies
+
+
+@made_once
+def make_leave(flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, new)`` that takes what an event has made of a photon into its state.
+
+    `flies_on`: see `make_flies`.
+    """
+    flies = make_flies(flies_on)
+
+    @wp.func
+    def leave(s: wp.ref[PhotonState], new: Scattering):
+        s.u = new.u
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.surface_count = new.surface_count
+        s.scores = new.scores
+        s.stokes = new.stokes
+        s.absorbed_surface += new.absorbed_surface
+        s.directed += new.directed
+        s.reason = new.reason
+        s.stage = wp.where(flies(s.reason), FLIGHT, END)
+
+    return leave
 
 
 @made_once
