@@ -222,8 +222,8 @@ def place(depth: int) -> int:
 
 
 @wp.func
-def _first(near: wp.vec2, far: wp.vec2):
-    """(entry, bits of the child) of two, the nearer first."""
+def _first(near: wp.vec2ui, far: wp.vec2ui):
+    """(entry, child) of two, the nearer first."""
     swap = far[0] < near[0]
     return wp.where(swap, far, near), wp.where(swap, near, far)
 
@@ -234,11 +234,13 @@ class NodeStep:
 
     Attributes:
         child: Nodes; of no meaning for those that the ray misses.
-        entry: Where it enters their boxes [m]; NOWHERE for those that it misses.
+        entry: Bits of the distances at which it enters their boxes [m]; 2^31 more for those that it misses.
+        reach: Bits of the largest distance that counts.
     """
 
     child: wp.vec4i
-    entry: wp.vec4
+    entry: wp.vec4ui
+    reach: wp.uint32
 
 
 @wp.func
@@ -251,14 +253,15 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
         inverse: `inverse_direction` of the ray.
         shift: The ray's origin times `inverse`, by components.
     """
-    entry = box_entries(nodes, walk.node, inverse, shift, walk.nearest)
+    entry = box_entries(nodes, walk.node, inverse, shift)
     child = children_of(nodes, walk.node)
-    a, b = _first(wp.vec2(entry[0], child[0]), wp.vec2(entry[1], child[1]))
-    c, d = _first(wp.vec2(entry[2], child[2]), wp.vec2(entry[3], child[3]))
+    a, b = _first(wp.vec2ui(entry[0], child[0]), wp.vec2ui(entry[1], child[1]))
+    c, d = _first(wp.vec2ui(entry[2], child[2]), wp.vec2ui(entry[3], child[3]))
     a, c = _first(a, c)
     step = NodeStep()
-    step.child = wp.vec4i(bits_of(a[1]), bits_of(b[1]), bits_of(c[1]), bits_of(d[1]))
-    step.entry = wp.vec4(a[0], b[0], c[0], d[0])
+    step.child = wp.vec4i(int(a[1]), int(b[1]), int(c[1]), int(d[1]))
+    step.entry = wp.vec4ui(a[0], b[0], c[0], d[0])
+    step.reach = wp.uint32(bits_of(walk.nearest))
     return step
 
 

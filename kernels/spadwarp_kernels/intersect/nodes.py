@@ -115,7 +115,7 @@ def empty_nodes(device: wp.DeviceLike) -> wp.array:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4* row = reinterpret_cast<const float4*>(nodes.data) + 4 * node;
+    const float4* row = reinterpret_cast<const float4*>(nodes.data) + 4 * static_cast<int64_t>(node);
     const float4 p = __ldg(row), q = __ldg(row + 1), r = __ldg(row + 2);
     // A byte k of the boxes becomes the float 1 + k / 32768, so that a slab costs one multiplication and addition.
     const float mx = p.w * inverse[0], my = q.x * inverse[1], mz = q.y * inverse[2];
@@ -127,33 +127,34 @@ def empty_nodes(device: wp.DeviceLike) -> wp.array:
     const unsigned x0 = x ? hx : lx, y0 = y ? hy : ly, z0 = z ? hz : lz;
     const unsigned x1 = x ? lx : hx, y1 = y ? ly : hy, z1 = z ? lz : hz;
     // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
-    // negative counts only as that.
+    // negative counts only as that. A ray that leaves a box before it enters misses it: its sign is put in front.
     const auto at = [](unsigned bytes, int pick, float scale, float start) {
         return __float_as_int(__uint_as_float(__byte_perm(bytes, 0x3f800000u, pick)) * scale + start);
     };
     const auto entry = [&](int pick) {
         const int in = __vimax3_s32_relu(at(x0, pick, mx, bx), at(y0, pick, my, by), at(z0, pick, mz, bz));
         const int out = __vimin3_s32(at(x1, pick, mx, bx), at(y1, pick, my, by), at(z1, pick, mz, bz));
-        return in <= out && in <= __float_as_int(reach) ? __int_as_float(in) : 1.0e30f;
+        return in | (__float_as_uint(__int_as_float(out) - __int_as_float(in)) & 0x80000000u);
     };
-    return wp::vec4(entry(0x7604), entry(0x7614), entry(0x7624), entry(0x7634));
+    return wp::vec4ui(entry(0x7604), entry(0x7614), entry(0x7624), entry(0x7634));
 #else
-    return wp::vec4(1.0e30f);
+    return wp::vec4ui(0xffffffffu);
 #endif
 """)
-def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shift: wp.vec3, reach: float) -> wp.vec4:
-    """Where a ray enters the boxes of four children, within [0, reach]; 1e30 for those that it misses. CUDA alone."""
+def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
+    """Bits of the distances at which a ray enters the boxes of four children; 2^31 more for those that it misses. CUDA
+    alone."""
     ...
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4 child = __ldg(reinterpret_cast<const float4*>(nodes.data) + 4 * node + 3);
-    return wp::vec4(child.x, child.y, child.z, child.w);
+    const uint4 child = __ldg(reinterpret_cast<const uint4*>(nodes.data) + 4 * static_cast<int64_t>(node) + 3);
+    return wp::vec4ui(child.x, child.y, child.z, child.w);
 #else
-    return wp::vec4(-1.0f);
+    return wp::vec4ui(0xffffffffu);
 #endif
 """)
-def children_of(nodes: wp.array(dtype=wp.vec4), node: int) -> wp.vec4:
+def children_of(nodes: wp.array(dtype=wp.vec4), node: int) -> wp.vec4ui:
     """The bits of the four children of a node. CUDA alone."""
     ...

@@ -3,7 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.intersect.box import inverse_direction
-from spadwarp_kernels.intersect.bvh import NO_NODE, NOWHERE, Stack, TreeWalk, place, step_leaf, step_node
+from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
 from spadwarp_kernels.intersect.triangle import face_distance, face_in, face_normal
 from spadwarp_kernels.intersect.wide import walk_wide
 from spadwarp_kernels.math.bits import bits_of
@@ -116,10 +116,10 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
         if walk.node > NO_NODE:
             met = step_node(surfaces.nodes, walk, inverse, shift)
             walk.node = NO_NODE
-            if met.entry[0] < NOWHERE:
+            if met.entry[0] <= met.reach:
                 walk.node = met.child[0]
             for k in range(3):
-                if met.entry[3 - k] < NOWHERE:
+                if met.entry[3 - k] <= met.reach:
                     stack[place(walk.depth)] = met.child[3 - k]
                     walk.depth += 1
         else:

@@ -19,7 +19,7 @@ from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
-from spadwarp_kernels.intersect.bvh import NO_NODE, NOWHERE, Stack, place, step_leaf, step_node
+from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, place, step_leaf, step_node
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -343,10 +343,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                 met = step_node(surfaces.nodes, s.walk, inverse, shift)
                                 s.walk.node = met.child[0]
                                 for k in range(3):
-                                    if met.entry[3 - k] < NOWHERE:
+                                    if met.entry[3 - k] <= met.reach:
                                         stack[place(s.walk.depth)] = met.child[3 - k]
                                         s.walk.depth += 1
-                                if met.entry[0] >= NOWHERE:
+                                if met.entry[0] > met.reach:
                                     s.walk.depth -= 1
                                     s.walk.node = stack[place(s.walk.depth)]
                         elif s.walk.node < NO_NODE:
