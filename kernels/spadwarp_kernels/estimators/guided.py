@@ -38,6 +38,10 @@ from .link import make_toward
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
 
+# With delta tracking, of the flights of backscattered light that pass the lens far aside one in so many is scored, a
+# power of two.
+ASIDE_SCORED_IN = 8
+
 
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
@@ -90,10 +94,22 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     return plan_flight
 
 
+@wp.func
+def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
+    """Whether light has to turn by more than 37 degrees (cosine 0.8) to reach the lens from any point of the flight from
+    x along u: the angle is least at its first point.
+
+    After a collision in the water such flights are a third of what is scored; they bring weak, even scores, and next to
+    nothing of the variance of bins where it is large.
+    """
+    return wp.dot(x, u) > -0.8 * wp.length(x)
+
+
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
     local_albedo, derives, polarised = spec.varies and not spec.random_albedo, bool(spec.derivatives), spec.polarised
     collides = takes_collisions(spec)
+    spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
     @wp.func
     def request_flight(s: PhotonState) -> Request:
@@ -118,6 +134,11 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
             else:
                 q.weight *= wp.where(collision, 2.0, 1.0)
                 q.first = (q.first << wp.uint32(1)) >> wp.uint32(1)
+        if wp.static(spares):
+            if s.collisions > 0 and s.surface_count == 0 and leads_aside(s.x, s.u):
+                # By bits that neither the flight nor its score depends on.
+                q.wanted = (s.flight.block[3] & wp.uint32(wp.static(ASIDE_SCORED_IN - 1))) == wp.uint32(0)
+                q.weight *= wp.static(float(ASIDE_SCORED_IN))
         q.rounding_sample = s.flight.block[1]  # of the direction to come
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1
