@@ -19,19 +19,25 @@ JUMPS = (4.0, 2.5, 8.0)
 """Penalties of any other depth [nats]: the usual one; one for thin things; one for few photons and second returns."""
 
 _SLOPE = 0.5  # penalty of the next bin [nats]
+_LEAST = 0.5  # penalty at an edge of the counts [nats]
 _ROUNDS = 3  # more of them change little
 
 
-def beliefs(score: Tensor, jump: Tensor) -> Tensor:
+def beliefs(score: Tensor, jump: Tensor, more: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """Log-likelihood of each depth of each pixel together with the best depths of all others, `[B, H, W, T]`.
 
     Args:
         score: Log-likelihood of a return in each bin, of each pixel, `[B, H, W, T]` [nats].
         jump: Penalty of any other depth `[B, 1, 1, 1]` [nats].
+        more: Added to it between neighbours in rows and in columns, see `spadwarp.denoise.guide`.
     """
+    ahead = beside = jump
+    if more is not None:
+        ahead = (jump + more[0][..., None]).clamp_min(_LEAST)
+        beside = (jump + more[1].transpose(1, 2)[..., None]).clamp_min(_LEAST)
     rows = columns = score.new_zeros(())
     for _ in range(_ROUNDS):
-        along = messages(score + columns, slope=_SLOPE, jump=jump)
-        across = messages((score + rows).transpose(1, 2), slope=_SLOPE, jump=jump).transpose(1, 2)
+        along = messages(score + columns, slope=_SLOPE, jump=ahead)
+        across = messages((score + rows).transpose(1, 2), slope=_SLOPE, jump=beside).transpose(1, 2)
         rows, columns = along, across
     return (rows + columns).add_(score)

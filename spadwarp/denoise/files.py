@@ -342,7 +342,7 @@ def _from_counts(
         depth = to_depth(place).astype(np.float32).reshape(read.depth.shape)
         found = Estimate(depth, np.ones_like(depth), np.full_like(depth, np.nan))
         return found, _second(found.depth, to_depth, given)
-    features = features_of_histograms(**given, to_depth=to_depth)
+    features = features_of_histograms(**given, total=histograms.values.sum(axis=-1), to_depth=to_depth)
     if profile is None or values.shape[-1] < shape[-1]:
         profile = _profile(dataclasses.replace(histograms, values=values, background=known[..., first:stop]))
     with warnings.catch_warnings():

@@ -29,7 +29,7 @@ LOG_DENSITY_LIMIT = 4.0
 MARGIN = 0.25
 """Depths this part of the gate's width before or behind it are still taken: a gate in range is not one in depth."""
 
-POOLED = 9
+POOLED = 10
 """Number of depths among the features of histograms: see `spadwarp.denoise.histogram_features`."""
 
 SCORED = 4

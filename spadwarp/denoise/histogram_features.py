@@ -16,6 +16,8 @@ from torch import Tensor
 
 from spadwarp.denoise.belief_propagation import JUMPS, beliefs
 from spadwarp.denoise.frames import POOLED, SCORED
+from spadwarp.denoise.guide import GUIDES, edge_penalties, guide_channels
+from spadwarp.denoise.marginals import mean_depth
 from spadwarp.denoise.total_variation import total_variation
 
 __all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
@@ -33,7 +35,7 @@ TAIL = 0.04
 MOST = 20.0
 """Differences of log-likelihoods are clipped at this."""
 
-SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2
+SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 """Number of channels of `extract_features` that go through the network's layers."""
 
 FEATURES = SEEN + POOLED
@@ -44,7 +46,7 @@ _UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that ph
 _MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
 
 
-def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
+def extract_features(counts: Tensor, background: Tensor, response: Tensor, total: Tensor | None = None) -> Tensor:
     """Candidates for depth, their log-likelihoods and the shape of the return.
 
     The score of a return in bin k is its log-likelihood ratio less what background alone gives on average,
@@ -57,16 +59,19 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
         counts: Histograms over the gate, `[B, H, W, T]`.
         background: Expected background counts, > 0, of each pixel `[B, H, W, T]` or the same for all `[B, 1, 1, T]`.
         response: Instrument response per bin centred on its time zero, sum 1, `[B, 2 r + 1]`.
+        total: Counts of each pixel, also beyond the bins given here, `[B, H, W]`; default: those in them.
 
     Returns:
         `[B, FEATURES, H, W]`. `POOLED` depths over the gate: of the highest score of the pixel, of its highest score
         elsewhere, of belief propagation with the usual penalty, of the highest scores over `WINDOWS`, of belief
-        propagation with the other `JUMPS`, and the total variation of the first. Then `SCORED` times `POOLED` scores at
+        propagation with the other `JUMPS`, the total
+        variation of the first, and the mean of sum-product beliefs. Then `SCORED` times `POOLED` scores at
         these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to `MOST`: of the
         pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around the
         depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in
-        7 × 7. Last, beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
+        7 × 7; and `GUIDES` channels of the counts. Last, beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
     """
+    total = counts.sum(dim=-1) if total is None else total
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
     if merged > 1:
         counts, background, response = _rebinned(counts, background, response, merged)
@@ -75,7 +80,8 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
     background = background.mean(dim=(1, 2))  # scores are sums over pixels: these have one template
     narrow = toeplitz(response, bins)
     score = torch.bmm(above.flatten(1, 2), _template(above, background, narrow)).view_as(counts)
-    usual, *connected = _connected(score)
+    more = edge_penalties(total)
+    usual, *connected = _connected(score, more)
     cubes = [score, *(pooled(score, side) * side**2 for side in WINDOWS[:-1]), usual]
     found = [highest(score), _elsewhere(score, response), *(highest(cube) for cube in (usual, *cubes[1:-1]))]
     delays = torch.arange(bins, device=counts.device)
@@ -88,6 +94,7 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
     anchor, peak = found[-1], score.amax(dim=-1).clamp(0.0, MOST)
     weight = peak / peak.mean(dim=(1, 2), keepdim=True).clamp_min(1e-9)
     found += [*connected, total_variation(found[0], weight, strength=_SMOOTHED, iterations=_STEPS, isotropic=False)]
+    found.append(mean_depth(score, *more))
     places = torch.stack(found, dim=-1)
     near = [_near(cube, places) for cube in cubes]
     tops = [cube.amax(dim=-1, keepdim=True) for cube in cubes]
@@ -95,7 +102,9 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor) -> Te
     peaks = [0.1 * top.clamp(0.0, MOST) for top in tops]
     shares = _shape(above, background, anchor)
     places = places * (merged * bins / given)  # the last of merged bins may reach beyond the gate
-    return torch.cat([places, *scores, *peaks, *shares, 0.1 * near[0]], dim=-1).movedim(-1, 1)
+    return torch.cat(
+        [places, *scores, *peaks, *shares, torch.stack(guide_channels(total), dim=-1), 0.1 * near[0]], dim=-1
+    ).movedim(-1, 1)
 
 
 def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
@@ -113,13 +122,14 @@ def _template(above: Tensor, background: Tensor, response: Tensor) -> Tensor:
     return torch.log1p(signal[:, None, None] / (background + floor)[:, :, None] * response)
 
 
-def _connected(score: Tensor) -> list[Tensor]:
+def _connected(score: Tensor, more: tuple[Tensor, Tensor]) -> list[Tensor]:
     """Beliefs with the usual penalty `[B, H, W, T]`, and depths over the gate with the other `JUMPS`."""
     jumps = [torch.full((len(score), 1, 1, 1), jump, device=score.device) for jump in JUMPS]
     if score.is_cuda:  # all at once: many small steps
-        usual, *others = beliefs(score.repeat(len(JUMPS), 1, 1, 1), torch.cat(jumps)).chunk(len(JUMPS))
+        all_more = more[0].repeat(len(JUMPS), 1, 1), more[1].repeat(len(JUMPS), 1, 1)
+        usual, *others = beliefs(score.repeat(len(JUMPS), 1, 1, 1), torch.cat(jumps), all_more).chunk(len(JUMPS))
         return [usual, *map(highest, others)]
-    return [beliefs(score, jumps[0]), *(highest(beliefs(score, jump)) for jump in jumps[1:])]
+    return [beliefs(score, jumps[0], more), *(highest(beliefs(score, jump, more)) for jump in jumps[1:])]
 
 
 def _elsewhere(score: Tensor, response: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ def features_of_histograms(
     background: ArrayLike,
     response: ArrayLike,
     device: str | None = None,
+    total: ArrayLike | None = None,
     to_depth: Callable[[NDArray[np.float32]], NDArray[Any]] | None = None,
 ) -> NDArray[np.float32]:
     """Features of histograms over the gate, as `spadwarp.denoise.histogram_features` makes them, frame by frame.
@@ -33,6 +34,7 @@ def features_of_histograms(
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
         device: torch device.
+        total: Counts of each pixel, also beyond the bins given here, `[H, W]` or `[N, H, W]`.
         to_depth: Converts parts of the gate `[N, POOLED, H, W]` to depths [m].
 
     Returns:
@@ -46,7 +48,12 @@ def features_of_histograms(
 
     with torch.inference_mode():
         parts = histogram_tensors(counts, background, response, device)
-        features = np.concatenate([extract_features(*part).cpu().numpy() for part in parts])
+        images = None if total is None else np.asarray(total, np.float32).reshape(-1, *np.shape(counts)[-3:-1])
+        found = []
+        for number, part in enumerate(parts):
+            image = None if images is None else torch.from_numpy(images[number : number + 1]).to(part[0].device)
+            found.append(extract_features(*part, image).cpu().numpy())
+        features = np.concatenate(found)
     if to_depth is not None:
         features[:, :POOLED] = to_depth(features[:, :POOLED])
     return features

@@ -159,7 +159,7 @@ def _from_histograms(
     if model in CLASSICAL:
         found = to_depth(classical_depth(method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
         return Estimate(found, np.ones_like(found), np.full_like(found, np.nan))
-    features = features_of_histograms(**given, to_depth=to_depth)
+    features = features_of_histograms(**given, total=counts.sum(axis=-1), to_depth=to_depth)
     if profile is not None and (first, stop) != (0, counts.shape[-1]):
         bins = np.asarray(profile)
         profile = bins[int(first / counts.shape[-1] * len(bins)) : max(1, int(stop / counts.shape[-1] * len(bins)))]

@@ -75,6 +75,7 @@ class Noise(_Table):
     )
     spread: Positive = Field((0.5, 20.0), description="its spread over the image [pixels], uniform in the logarithm")
     roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
+    ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
     sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
     tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")

@@ -40,16 +40,16 @@ def aggregate(score: Tensor, *, jump: Tensor, slope: float = SLOPE) -> Tensor:
 def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
     """What the pixels of a row before and behind each tell it of its depth, the sum of both, `[B, H, W, T]`.
 
-    Arguments are those of `aggregate`. The best depth has 0 in each of the two.
+    Arguments are those of `aggregate`; `jump` may differ between neighbours, `[B, H, W - 1, 1]`. The best depth has 0 in each of the two.
     """
     lines = score.flatten(0, 1)
-    most = jump.expand(-1, score.shape[1], 1, 1).flatten(0, 1)[:, 0]
+    most = jump.expand(-1, score.shape[1], max(1, score.shape[2] - 1), 1).flatten(0, 1)
     received, last = torch.zeros_like(lines), lines.shape[1] - 1
     ahead = lines.new_zeros(2, len(lines), lines.shape[2])  # the message sent last, forwards and backwards
     for place in range(last):
         known = torch.stack([lines[:, place], lines[:, last - place]]).add_(ahead)
         best = known.amax(dim=-1, keepdim=True)
-        ahead = torch.maximum(known, best - most)
+        ahead = torch.maximum(known, best - torch.stack([most[:, place], most[:, last - place - 1]]))
         known -= slope
         torch.maximum(ahead[..., 1:], known[..., :-1], out=ahead[..., 1:])
         torch.maximum(ahead[..., :-1], known[..., 1:], out=ahead[..., :-1])

@@ -64,6 +64,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
     depth = _background(side, random)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
+    paint = 0.5 * random.normal(torch.Size((count, 1, 1))) * torch.ones_like(depth)  # ln of reflectance, negative
     number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
     for slot in range(_THINGS):
         apart = random.between((-0.6, 0.6), 2) * side
@@ -78,8 +79,9 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
                 surface = z[chosen, None, None] + surface
                 drawn = inside & (surface > -0.1) & ~(surface >= depth[chosen])
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
+                paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
-    texture = torch.exp(0.5 * smooth_noise(count, side, generator) + 0.3 * _pattern(side, random))
+    texture = torch.exp(0.5 * smooth_noise(count, side, generator) + 0.3 * _pattern(side, random) + paint)
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
     low = torch.where(torch.isfinite(metres), metres, math.inf).flatten(1).amin(dim=1)
     high = torch.where(torch.isfinite(metres), metres, -math.inf).flatten(1).amax(dim=1)

@@ -100,7 +100,9 @@ def draw_batch(
         photons, sbr = random.log_between(noise.photons)[:counted], random.log_between(noise.sbr)[:counted]
         some = _Crops(*(values[:counted] for values in crops))
         counts = _draw_counts(some, photons, photons / sbr, noise, generator)
-        reported[:counted], present[:counted], features = _estimate(*counts, photons, histograms=histograms)
+        reported[:counted], present[:counted], features = _estimate(
+            *counts[:3], photons, counts[3] if histograms else None
+        )
     reported, present = _defects(reported, present, noise, random)
     clean, hit, profile = crops.clean, crops.hit, crops.profile
     reported = torch.where(present, reported, 1.0)
@@ -235,8 +237,9 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
 
 def _draw_counts(
     crops: _Crops, photons: Tensor, background: Tensor, noise: Noise, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Poisson counts `[B, h, w, T]`, expected background per bin `[B, T]`, and σ of the response `[B, 1]` [bins]."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Poisson counts `[B, h, w, T]`, expected background per bin `[B, T]`, σ of the response `[B, 1]` [bins], and the
+    counts of each pixel, also those beyond the gate, `[B, h, w]`."""
     clean, sigma, hit, reach, profile, _ = crops
     bins, device = _COUNT_BINS, clean.device
     random = Random(len(clean), generator)
@@ -248,7 +251,11 @@ def _draw_counts(
 
     edges = torch.arange(bins + 1, device=device, dtype=torch.float32)
     level = torch.nn.functional.interpolate(profile[:, None], size=bins, mode="nearest")[:, 0]
+    ambient = random.coin(noise.ambient)
+    level = torch.where(ambient[:, None], 1.0, level)
     level = background[:, None] * level / bins + 1e-4
+    mean = torch.where(hit, shade, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
+    bright = torch.where(ambient[:, None, None] & hit, shade / mean.clamp_min(1e-3)[:, None, None], 1.0)
 
     def returns(depth: Tensor, signal: Tensor) -> Tensor:
         phase = (edges - (depth * bins)[..., None]).div_(width[:, None, None])
@@ -260,8 +267,12 @@ def _draw_counts(
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], noise, generator)
-    rate += level[:, None, None] * (edges[:-1] < (reach * bins)[..., None])
-    return torch.poisson(rate.add_(1e-4), generator=generator), level, width
+    from_before = (edges[:-1] < (reach * bins)[..., None]) | ambient[:, None, None, None]
+    rate += level[:, None, None] * bright[..., None] * from_before
+    counts = torch.poisson(rate.add_(1e-4), generator=generator)
+    wider = random.log_between((1.0, 12.0), 1, 1) - 1.0  # the camera's gate beyond this one
+    beyond = torch.poisson(wider * background[:, None, None] * bright, generator=generator)
+    return counts, level, width, counts.sum(dim=-1) + beyond
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
@@ -280,9 +291,9 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
 
 
 def _estimate(
-    counts: Tensor, level: Tensor, width: Tensor, photons: Tensor, *, histograms: bool
+    counts: Tensor, level: Tensor, width: Tensor, photons: Tensor, total: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Maximum-likelihood depth over the gate, where there are counts, and with `histograms` the features."""
+    """Maximum-likelihood depth over the gate, where there are counts, and with `total` the features."""
     bins, device = counts.shape[-1], counts.device
     # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once as a product of matrices.
     apart = torch.arange(-_TAPS, _TAPS + 1, device=device)
@@ -291,7 +302,7 @@ def _estimate(
     gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
     best = score.argmax(dim=-1, keepdim=True)
-    features = extract_features(counts, level[:, None, None], response) if histograms else None
+    features = extract_features(counts, level[:, None, None], response, total) if total is not None else None
 
     # Centroid of the counts within 2σ around the best bin.
     offsets = torch.arange(-6, 7, device=device)
