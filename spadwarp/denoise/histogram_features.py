@@ -69,7 +69,8 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
         these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to `MOST`: of the
         pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around the
         depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in
-        7 × 7; and `GUIDES` channels of the counts. Last, beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
+        7 × 7; and `GUIDES` channels of the counts. Last,
+        beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
     """
     total = counts.sum(dim=-1) if total is None else total
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]

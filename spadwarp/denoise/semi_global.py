@@ -40,7 +40,8 @@ def aggregate(score: Tensor, *, jump: Tensor, slope: float = SLOPE) -> Tensor:
 def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
     """What the pixels of a row before and behind each tell it of its depth, the sum of both, `[B, H, W, T]`.
 
-    Arguments are those of `aggregate`; `jump` may differ between neighbours, `[B, H, W - 1, 1]`. The best depth has 0 in each of the two.
+    Arguments are those of `aggregate`; `jump` may differ between neighbours, `[B, H, W − 1, 1]`. The best depth
+    has 0 in each of the two.
     """
     lines = score.flatten(0, 1)
     most = jump.expand(-1, score.shape[1], max(1, score.shape[2] - 1), 1).flatten(0, 1)
