@@ -9,6 +9,7 @@ from scipy.stats import exponnorm, norm
 from helpers.stepped_frames import denoised
 from spadwarp import ArgumentError
 from spadwarp.denoise import histogram_inputs, synthetic_noise
+from spadwarp.denoise.guide import GUIDES
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features
 from spadwarp.denoise.recipe import Noise
 
@@ -67,7 +68,7 @@ def test_the_shape_of_the_return_is_that_of_its_light():
     found = features_of(counts, level)
     anchor = BINS * found[5, 16, 16]
     expected = np.diff(law.cdf(anchor - 60.0 + BINS * np.array(EDGES)))
-    shares = found[SEEN - len(EDGES) - 1 : SEEN - 2, 16, 16]
+    shares = found[SEEN - GUIDES - len(EDGES) - 1 : SEEN - GUIDES - 2, 16, 16]
     assert np.abs(shares - expected / expected.sum()).max() < 0.03
     assert abs(anchor - 60.0) < delay  # the template has a tail of its own
 
