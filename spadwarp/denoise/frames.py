@@ -17,6 +17,7 @@ __all__ = [
     "MARGIN",
     "POOLED",
     "SCORED",
+    "SIDES",
     "SMALLEST_SIDE",
     "DepthFrames",
     "depth_frames",
@@ -35,6 +36,9 @@ POOLED = 10
 SCORED = 4
 """Volumes whose log-likelihood of each of these depths is among the features: of three windows, and beliefs."""
 
+SIDES = 8
+"""Number of depths that are the last of these features: see `spadwarp.denoise.sides`."""
+
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
 
@@ -49,7 +53,7 @@ class DepthFrames:
         density: Density of the water's backscatter at each depth, relative to a flat one over the gate, float32 of
             `depth`'s shape; 1 everywhere if it is not known.
         features: Features of the histograms behind them, float32 `[N, FEATURES, H, W]` as
-            `spadwarp.denoise.histogram_features` makes them, but with pooled depths in metres; None without histograms.
+            `spadwarp.denoise.histogram_features` makes them, but with its depths in metres; None without histograms.
     """
 
     depth: NDArray[np.float32]
@@ -87,8 +91,8 @@ class DepthFrames:
             return frame
         assert self.features is not None
         start, stop = self.gate
-        pooled = (self.features[:, :POOLED] - start) / (stop - start) - 0.5
-        return np.concatenate([frame, pooled, self.features[:, POOLED:]], axis=1, dtype=np.float32)
+        pooled, sides = ((part - start) / (stop - start) for part in (self.features[:, :POOLED], self.features[:, -SIDES:]))
+        return np.concatenate([frame, pooled - 0.5, self.features[:, POOLED:-SIDES], sides], axis=1, dtype=np.float32)
 
 
 def depth_frames(

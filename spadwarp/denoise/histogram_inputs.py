@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.frames import POOLED
+from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.gates import bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.errors import ArgumentError
@@ -35,7 +35,7 @@ def features_of_histograms(
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
         device: torch device.
         total: Counts of each pixel, also beyond the bins given here, `[H, W]` or `[N, H, W]`.
-        to_depth: Converts parts of the gate `[N, POOLED, H, W]` to depths [m].
+        to_depth: Converts parts of the gate `[N, n, H, W]` to depths [m].
 
     Returns:
         float32 `[N, FEATURES, H, W]`; first the pooled depths, as parts of the gate where `to_depth` is not given.
@@ -55,7 +55,8 @@ def features_of_histograms(
             found.append(extract_features(*part, image).cpu().numpy())
         features = np.concatenate(found)
     if to_depth is not None:
-        features[:, :POOLED] = to_depth(features[:, :POOLED])
+        for part in (slice(0, POOLED), slice(-SIDES, None)):
+            features[:, part] = to_depth(features[:, part])
     return features
 
 

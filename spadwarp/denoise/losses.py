@@ -41,7 +41,8 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
         square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1 : 2 + POOLED], dim=1)
         error = error + 0.5 * _depth_error(square.sum(dim=1, keepdim=True), batch.hit, weight, kind, floor)
     if chosen.shape[1] > 2 + POOLED:  # the same of the selection, which changes nothing before it
-        candidates, scores = chosen[:, 2 + POOLED :].chunk(2, dim=1)
+        candidates, scores = chosen[:, 2 + POOLED : -1].chunk(2, dim=1)
+        error = error + _depth_error((chosen[:, -1:] - batch.clean).square(), batch.hit, weight, kind, floor)
         square = (candidates - batch.clean).square() * torch.softmax(scores, dim=1)
         error = error + 0.5 * _depth_error(square.sum(dim=1, keepdim=True), batch.hit, weight, kind, floor)
     return error

@@ -8,9 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from spadwarp.denoise.context import Context, answer
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import SEEN
-from spadwarp.denoise.selection import Selection, selected_depth
+from spadwarp.denoise.selection import Selection, selected, selected_depth
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
 from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
@@ -61,9 +62,10 @@ class PyramidNet(nn.Module):
     With `histograms` it also sees the channels of `spadwarp.denoise.histogram_features`. Each pixel then first gets a
     depth from the candidates among them, which replaces the reported one in all that follows: the most probable one,
     never the mean of two returns. The delay of scattered light, which the shape of the return shows, is subtracted from
-    the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate. A fifth output is the depth of
+    the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate, and `spadwarp.denoise.context`
+    weighs them with the view of a wide surrounding. A fifth output is the depth of
     the candidates, and one for each candidate its logit. While it learns, there are also the candidates of the
-    selection and their scores, and the depth is that before the selection.
+    selection and their scores, and the last answer; the depth is that before the selection.
     """
 
     radius = 2
@@ -125,6 +127,7 @@ class PyramidNet(nn.Module):
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
             self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
             self.select = Selection()
+            self.context = Context()
             with torch.no_grad():
                 assert self.choose.bias is not None
                 self.enter_features.weight.mul_(0.3)
@@ -163,9 +166,12 @@ class PyramidNet(nn.Module):
             seen = found.detach(), others.detach(), frame[:, 3:].float()
             if torch.is_grad_enabled():
                 candidates, scores = self.select(*seen)
-                extra += [candidates - delay.detach(), scores]
+                before = selected(candidates, scores).detach()
+                wide = answer(*self.context(before, *seen[1:]), seen[2])
+                extra += [candidates - delay.detach(), scores, wide - delay.detach()]
             else:
-                found = selected_depth(self.select, *seen)
+                before = selected_depth(self.select, *seen)
+                found = answer(*self.context(before, *seen[1:]), seen[2])
             found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 

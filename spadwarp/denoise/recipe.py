@@ -77,6 +77,9 @@ class Noise(_Table):
     roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
+    resampled: Share = Field(
+        0.0, description="samples whose depth was resampled, so that pixels at edges lie between both surfaces"
+    )
     sparse: Share = Field(0.25, description="samples in which only 3 to 100 % of the pixels report anything")
     tail: Share = Field(0.15, description="samples whose jitter has a late tail, as avalanche photodiodes have")
     hot: Share = Field(0.01, description="highest part of the pixels that report any depth because they are defective")

@@ -169,6 +169,10 @@ def _draw_crops(scenes: CleanScenes, noise: Noise, crop: int, random: Random) ->
     """Crops of random scenes, each with a gate and a water."""
     index = random.integer(len(scenes.depth))
     depth, sigma = _cut(scenes, index, crop, random)
+    if noise.resampled > 0.0:
+        chosen = random.coin(noise.resampled, 1, 1)
+        shift = 0.5 * random.uniform(2, 1, 1) * chosen[:, None]
+        depth, sigma = (_resampled(image, shift) for image in (depth, sigma))
     hit = torch.isfinite(depth) & torch.isfinite(sigma)
     gate = scenes.gate[index]
     own = random.coin(noise.own_gate)
@@ -210,6 +214,14 @@ def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random) -> tuple
     depth, sigma = scenes.depth[where], scenes.sigma[where]
     transposed = random.coin(0.5)[:, None, None]
     return torch.where(transposed, depth.mT, depth), torch.where(transposed, sigma.mT, sigma)
+
+
+def _resampled(image: Tensor, shift: Tensor) -> Tensor:
+    """An image `[B, h, w]` shifted by parts of a pixel `[B, 2, 1, 1]`, by bilinear interpolation of what is there."""
+    for axis in (1, 2):
+        moved = torch.lerp(image, torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, -1, 1)], axis), shift[:, axis - 1])
+        image = torch.where(torch.isfinite(moved), moved, image)
+    return image
 
 
 def _extent(depth: Tensor, hit: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
