@@ -8,6 +8,8 @@ log-likelihoods of all, and a pyramid of features weighs them.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -23,7 +25,7 @@ ANSWERS = 1 + POOLED + SIDES
 
 _SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + 3 + 3 + 2
 _LEAST = 0.01  # added to the way between both sides [gate widths]
-_SURE = 8.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
+_SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
 _SPREAD = 0.004  # candidates this near to the one chosen count, too [gate widths]
 
 
@@ -49,7 +51,7 @@ class Context(nn.Module):
         super().__init__()
         self.pixel = nn.Sequential(nn.Conv2d(_SEEN, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 1), nn.ReLU())
         self.enter = SymmetricConv(hidden, widths[0], 3, lifts=True)
-        pairs = list(zip(widths[:-1], widths[1:], strict=True))
+        pairs = list(pairwise(widths))
         self.first = _Residual(widths[0])
         self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
         self.before = nn.ModuleList(_Residual(width) for width in widths[1:])
@@ -93,7 +95,7 @@ class Context(nn.Module):
 
 
 def answer(depths: Tensor, scores: Tensor, features: Tensor) -> Tensor:
-    """Mean of the depths where photons are few; else that with the highest score and what is very near, `[B, 1, H, W]`."""
+    """Mean of the depths where photons are few; else the one with the highest score, `[B, 1, H, W]`."""
     weight = torch.softmax(scores, dim=1)
     best = depths.gather(1, weight.argmax(dim=1, keepdim=True))
     peak = 10.0 * features[:, POOLED + SCORED * POOLED :][:, :1]

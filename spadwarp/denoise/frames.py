@@ -91,7 +91,9 @@ class DepthFrames:
             return frame
         assert self.features is not None
         start, stop = self.gate
-        pooled, sides = ((part - start) / (stop - start) for part in (self.features[:, :POOLED], self.features[:, -SIDES:]))
+        pooled, sides = (
+            (part - start) / (stop - start) for part in (self.features[:, :POOLED], self.features[:, -SIDES:])
+        )
         return np.concatenate([frame, pooled - 0.5, self.features[:, POOLED:-SIDES], sides], axis=1, dtype=np.float32)
 
 

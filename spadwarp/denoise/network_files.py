@@ -52,6 +52,8 @@ def load_network(
     try:
         network: Any = build_network(model)
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
+        if model == "histograms" and not any(name.startswith("context.") for name in values):
+            network.context = None  # older files have none
         network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")

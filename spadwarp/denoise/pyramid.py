@@ -127,7 +127,7 @@ class PyramidNet(nn.Module):
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
             self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
             self.select = Selection()
-            self.context = Context()
+            self.context: Context | None = Context()
             with torch.no_grad():
                 assert self.choose.bias is not None
                 self.enter_features.weight.mul_(0.3)
@@ -167,13 +167,17 @@ class PyramidNet(nn.Module):
             if torch.is_grad_enabled():
                 candidates, scores = self.select(*seen)
                 before = selected(candidates, scores).detach()
-                wide = answer(*self.context(before, *seen[1:]), seen[2])
-                extra += [candidates - delay.detach(), scores, wide - delay.detach()]
+                extra += [candidates - delay.detach(), scores, self._last(before, *seen[1:]) - delay.detach()]
             else:
-                before = selected_depth(self.select, *seen)
-                found = answer(*self.context(before, *seen[1:]), seen[2])
+                found = self._last(selected_depth(self.select, *seen), *seen[1:])
             found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
+
+    def _last(self, before: Tensor, logits: Tensor, features: Tensor) -> Tensor:
+        """The answer with the view of a wide surrounding; the one before with weights of older files, without it."""
+        if self.context is None:
+            return before
+        return answer(*self.context(before, logits, features), features)
 
     def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""

@@ -219,7 +219,8 @@ def _cut(scenes: CleanScenes, index: Tensor, crop: int, random: Random) -> tuple
 def _resampled(image: Tensor, shift: Tensor) -> Tensor:
     """An image `[B, h, w]` shifted by parts of a pixel `[B, 2, 1, 1]`, by bilinear interpolation of what is there."""
     for axis in (1, 2):
-        moved = torch.lerp(image, torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, -1, 1)], axis), shift[:, axis - 1])
+        next_one = torch.cat([image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, -1, 1)], dim=axis)
+        moved = torch.lerp(image, next_one, shift[:, axis - 1])
         image = torch.where(torch.isfinite(moved), moved, image)
     return image
 

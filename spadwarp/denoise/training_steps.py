@@ -117,7 +117,7 @@ class Run:
         torch.manual_seed(recipe.seed)
         network: Any = build_network(recipe.model)
         if recipe.start is not None:
-            network.load_state_dict(load_network(recipe.start).state_dict())
+            network.load_state_dict(load_network(recipe.start).state_dict(), strict=False)
         self.network = network.to(workers.device).to(memory_format=torch.channels_last)
         self.learner = self.network
         if workers.size > 1:

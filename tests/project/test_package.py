@@ -54,6 +54,7 @@ def test_kernels_import_warp_numpy_and_the_standard_library_only():
 # Themselves loaded when there are pictures to draw, or a network to run.
 LOADED_LATE = {
     "denoise/belief_propagation.py",
+    "denoise/context.py",
     "denoise/histogram_features.py",
     "denoise/losses.py",
     "denoise/networks.py",
@@ -61,6 +62,7 @@ LOADED_LATE = {
     "denoise/selection.py",
     "denoise/semi_global.py",
     "denoise/shapes.py",
+    "denoise/sides.py",
     "denoise/symmetric.py",
     "denoise/synthetic_noise.py",
     "denoise/total_variation.py",
