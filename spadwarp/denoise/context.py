@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
 from spadwarp.denoise.histogram_features import SEEN
+from spadwarp.denoise.sides import LIKENESS
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv
 
 __all__ = ["ANSWERS", "Context", "answer"]
@@ -23,7 +24,7 @@ __all__ = ["ANSWERS", "Context", "answer"]
 ANSWERS = 1 + POOLED + SIDES
 """Candidates: the network's answer before, the depths among the features, and those of both sides."""
 
-_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + 3 + 3 + 2
+_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + LIKENESS + 3 + 3 + 2
 _LEAST = 0.01  # added to the way between both sides [gate widths]
 _SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
 _SPREAD = 0.004  # candidates this near to the one chosen count, too [gate widths]

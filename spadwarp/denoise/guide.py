@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["GUIDES", "edge_penalties", "guide_channels"]
+__all__ = ["GUIDES", "counts_level", "edge_penalties", "guide_channels"]
 
 GUIDES = 2
 """Number of channels of `guide_channels`."""
@@ -27,7 +27,7 @@ def guide_channels(total: Tensor) -> list[Tensor]:
     """
     from spadwarp.denoise.histogram_features import pooled
 
-    level = _level(total)[..., None]
+    level = counts_level(total)[..., None]
     around = pooled(level, 15)
     differences = 0.3 * (level - around), 0.6 * (pooled(level, 3) - around)
     return [torch.asinh(difference)[..., 0] for difference in differences]
@@ -40,7 +40,7 @@ def edge_penalties(total: Tensor) -> tuple[Tensor, Tensor]:
     variance 2; those at jumps and at edges of texture have an excess, which the mean of the frame gives. Where there is
     none, nothing is added.
     """
-    level = _level(total)
+    level = counts_level(total)
     across, down = level.diff(dim=2), level.diff(dim=1)
     number = across[0].numel() + down[0].numel()
     mean = (across.square().sum(dim=(1, 2)) + down.square().sum(dim=(1, 2))) / number
@@ -54,6 +54,6 @@ def edge_penalties(total: Tensor) -> tuple[Tensor, Tensor]:
     return added(across), added(down)
 
 
-def _level(total: Tensor) -> Tensor:
+def counts_level(total: Tensor) -> Tensor:
     """Counts with noise of deviation 1."""
     return 2.0 * (total + 0.375).sqrt()

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from spadwarp.denoise.belief_propagation import JUMPS, beliefs
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.guide import GUIDES, edge_penalties, guide_channels
+from spadwarp.denoise.guide import GUIDES, counts_level, edge_penalties, guide_channels
 from spadwarp.denoise.marginals import mean_depth
-from spadwarp.denoise.sides import beside_edges
+from spadwarp.denoise.sides import LIKENESS, beside_edges
 from spadwarp.denoise.total_variation import total_variation
 
 __all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
@@ -39,7 +39,7 @@ MOST = 20.0
 SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 """Number of channels of `extract_features` that go through the network's layers."""
 
-FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES
+FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS
 """Number of channels that `extract_features` gives."""
 
 _SMOOTHED, _STEPS = 0.75, 120  # strength and steps of the total variation among the depths
@@ -103,13 +103,13 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     scores = [0.1 * (one - top).clamp_min(-MOST) for one, top in zip(near, tops, strict=True)]
     peaks = [0.1 * top.clamp(0.0, MOST) for top in tops]
     shares = _shape(above, background, anchor)
-    sides = beside_edges(score, found[2])
+    sides, likeness = beside_edges(score, found[2], counts_level(total))
     beside = [_near(cube, sides) for cube in cubes]
     beside = [0.1 * beside[0], *(0.1 * (one - top).clamp_min(-MOST) for one, top in zip(beside, tops, strict=True))]
     scale = merged * bins / given  # the last of merged bins may reach beyond the gate
     guides = torch.stack(guide_channels(total), dim=-1)
     return torch.cat(
-        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, scale * sides], dim=-1
+        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, likeness, scale * sides], dim=-1
     ).movedim(-1, 1)
 
 
