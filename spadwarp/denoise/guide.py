@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from spadwarp.denoise.volumes import pooled
+
 __all__ = ["GUIDES", "counts_level", "edge_penalties", "guide_channels"]
 
 GUIDES = 2
@@ -25,8 +27,6 @@ def guide_channels(total: Tensor) -> list[Tensor]:
 
     `total`: counts of each pixel over all times, `[B, H, W]`.
     """
-    from spadwarp.denoise.histogram_features import pooled
-
     level = counts_level(total)[..., None]
     around = pooled(level, 15)
     differences = 0.3 * (level - around), 0.6 * (pooled(level, 3) - around)

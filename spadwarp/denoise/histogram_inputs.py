@@ -55,8 +55,8 @@ def features_of_histograms(
             found.append(extract_features(*part, image).cpu().numpy())
         features = np.concatenate(found)
     if to_depth is not None:
-        for part in (slice(0, POOLED), slice(-SIDES, None)):
-            features[:, part] = to_depth(features[:, part])
+        for channels in (slice(0, POOLED), slice(-SIDES, None)):
+            features[:, channels] = to_depth(features[:, channels])
     return features
 
 

@@ -177,7 +177,8 @@ class PyramidNet(nn.Module):
         """The answer with the view of a wide surrounding; the one before with weights of older files, without it."""
         if self.context is None:
             return before
-        return answer(*self.context(before, logits, features), features)
+        depths, scores = self.context(before, logits, features)
+        return answer(depths, scores, features)
 
     def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""

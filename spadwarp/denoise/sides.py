@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spadwarp.denoise.semi_global import aggregate
+from spadwarp.denoise.volumes import highest
 
 __all__ = ["LIKENESS", "REACHES", "beside_edges"]
 
@@ -37,8 +38,6 @@ def beside_edges(score: Tensor, usual: Tensor, level: Tensor) -> tuple[Tensor, T
         usual: Depth over the gate by belief propagation, `[B, H, W]`.
         level: Counts of each pixel, with noise of deviation 1, `[B, H, W]`.
     """
-    from spadwarp.denoise.histogram_features import highest
-
     found, like = _nearer_and_farther(usual, level)
     inside = [_between(score, *found[place : place + 2]) for place in range(0, len(found), 2)]
     rigid = aggregate(score, jump=score.new_full((len(score), 1, 1, 1), _RIGID))
@@ -90,8 +89,6 @@ def _between(score: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
     `score`: log-likelihood of a return in each bin, `[B, H, W, T]`. Depth maps that were scaled down, and steep slopes,
     have depths between the surfaces on both sides.
     """
-    from spadwarp.denoise.histogram_features import highest
-
     bins = score.shape[-1]
     place = torch.arange(bins, device=score.device) + 0.5
     inside = (place >= near[..., None] * bins - 1.0) & (place <= far[..., None] * bins + 1.0)

@@ -68,6 +68,7 @@ LOADED_LATE = {
     "denoise/total_variation.py",
     "denoise/training.py",
     "denoise/training_steps.py",
+    "denoise/volumes.py",
     "denoise/votes.py",
     "transport/device_worker.py",
     "transport/polarisation.py",
