@@ -66,7 +66,7 @@ class Context(nn.Module):
         with torch.no_grad():
             final.weight.mul_(0.1)  # type: ignore[operator]
             final.bias.zero_()  # type: ignore[operator]
-            final.bias[0] = 2.0  # type: ignore[index, operator]
+            final.bias[0] = 3.0  # type: ignore[index, operator]
 
     def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Depths over the gate and their scores, each `[B, ANSWERS, H, W]`.
