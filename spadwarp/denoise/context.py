@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
 from spadwarp.denoise.histogram_features import SEEN
+from spadwarp.denoise.scattered_light import LIGHT
 from spadwarp.denoise.sides import LIKENESS
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv
 
@@ -51,6 +52,7 @@ class Context(nn.Module):
     def __init__(self, widths: tuple[int, ...] = (8, 12, 16, 24), hidden: int = 64) -> None:
         super().__init__()
         self.pixel = nn.Sequential(nn.Conv2d(_SEEN, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 1), nn.ReLU())
+        self.light = nn.Conv2d(LIGHT, hidden, 1, bias=False)
         self.enter = SymmetricConv(hidden, widths[0], 3, lifts=True)
         pairs = list(pairwise(widths))
         self.first = _Residual(widths[0])
@@ -61,27 +63,30 @@ class Context(nn.Module):
         self.after = nn.ModuleList(_Residual(width) for width in widths[:-1])
         self.last = SymmetricConv(widths[0], 8, 1)
         self.head = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, ANSWERS, 1))
+        self.target = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, 1, 1))
         self.stride = 2 ** len(pairs)
-        final = self.head[-1]
+        final, target = self.head[-1], self.target[-1]
         with torch.no_grad():
+            for one in (self.light.weight, target.weight, target.bias):
+                one.zero_()  # type: ignore[operator]
             final.weight.mul_(0.1)  # type: ignore[operator]
             final.bias.zero_()  # type: ignore[operator]
             final.bias[0] = 3.0  # type: ignore[index, operator]
 
-    def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Depths over the gate and their scores, each `[B, ANSWERS, H, W]`.
+    def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depths over the gate and their scores, each `[B, ANSWERS, H, W]`; what is added to the target's logit.
 
         Args:
             found: The answer before, over the gate, `[B, 1, H, W]`.
             logits: The network's three logits `[B, 3, H, W]`.
             features: See `spadwarp.denoise.histogram_features`, with 0.5 subtracted from the first depths.
         """
-        depths, seen = _seen(found, logits, features)
+        depths, seen, light = _seen(found, logits, features)
         height, width = found.shape[-2:]
         bottom, right = -height % self.stride, -width % self.stride
         if bottom or right:
-            seen = F.pad(seen, (0, right, 0, bottom), mode="replicate")
-        pixel = self.pixel(seen)
+            seen, light = (F.pad(image, (0, right, 0, bottom), mode="replicate") for image in (seen, light))
+        pixel = self.pixel[1:](self.pixel[0](seen) + self.light(light))
         x = self.first(self.enter(pixel))
         skipped = []
         for down, before in zip(self.down, self.before, strict=True):
@@ -91,8 +96,9 @@ class Context(nn.Module):
         for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
             x = after(skip + F.interpolate(up(x), scale_factor=2.0, mode="bilinear", align_corners=False))
         x = F.relu(self.last(F.relu(x))).unflatten(1, (-1, GROUP))
-        scores = self.head(torch.cat([x.mean(dim=2), x.amax(dim=2), pixel], dim=1)).float()
-        return depths, scores[..., :height, :width]
+        x = torch.cat([x.mean(dim=2), x.amax(dim=2), pixel], dim=1)
+        scores, target = (head(x).float()[..., :height, :width] for head in (self.head, self.target))
+        return depths, scores, target
 
 
 def answer(depths: Tensor, scores: Tensor, features: Tensor) -> Tensor:
@@ -105,10 +111,10 @@ def answer(depths: Tensor, scores: Tensor, features: Tensor) -> Tensor:
     return (weight * depths).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
 
 
-def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-    """Candidates, and what the layers see."""
+def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates, and what the layers see; the last part of it apart."""
     rest, own = features[:, POOLED:SEEN], features[:, SEEN : SEEN + POOLED]
-    beside, sides = features[:, SEEN + POOLED :].tensor_split([-SIDES], dim=1)
+    beside, light, sides = features[:, SEEN + POOLED :].tensor_split([-SIDES - LIGHT, -SIDES], dim=1)
     depths = torch.cat([found, 0.5 + features[:, :POOLED], sides], dim=1)
     front, back = sides[:, 2:3], sides[:, 3:4]
     parts = ((depths - front) / (back - front + _LEAST)).clamp(-1.0, 2.0)
@@ -117,4 +123,4 @@ def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tens
     places = 2.0 * torch.cat([found, front, back], dim=1) - 1.0
     peak = rest[:, SCORED * POOLED : SCORED * POOLED + 2]
     level = peak.mean(dim=(2, 3), keepdim=True).expand_as(peak)
-    return depths, torch.cat([parts, steps, rest, scores, 0.25 * logits, places, level], dim=1)
+    return depths, torch.cat([parts, steps, rest, scores, 0.25 * logits, places, level], dim=1), light

@@ -18,6 +18,7 @@ from spadwarp.denoise.belief_propagation import JUMPS, beliefs
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
 from spadwarp.denoise.guide import GUIDES, counts_level, edge_penalties, guide_channels
 from spadwarp.denoise.marginals import mean_depth
+from spadwarp.denoise.scattered_light import LIGHT, light_channels
 from spadwarp.denoise.sides import LIKENESS, beside_edges
 from spadwarp.denoise.total_variation import total_variation
 from spadwarp.denoise.volumes import highest, pooled
@@ -40,7 +41,7 @@ MOST = 20.0
 SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 """Number of channels of `extract_features` that go through the network's layers."""
 
-FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS
+FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS + LIGHT
 """Number of channels that `extract_features` gives."""
 
 _SMOOTHED, _STEPS = 0.75, 120  # strength and steps of the total variation among the depths
@@ -109,8 +110,10 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     beside = [0.1 * beside[0], *(0.1 * (one - top).clamp_min(-MOST) for one, top in zip(beside, tops, strict=True))]
     scale = merged * bins / given  # the last of merged bins may reach beyond the gate
     guides = torch.stack(guide_channels(total), dim=-1)
+    light = torch.stack(light_channels(above, background, found[2], response), dim=-1)
     return torch.cat(
-        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, likeness, scale * sides], dim=-1
+        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, likeness, light, scale * sides],
+        dim=-1,
     ).movedim(-1, 1)
 
 

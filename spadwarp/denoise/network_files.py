@@ -54,6 +54,7 @@ def load_network(
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
         if model == "histograms" and not any(name.startswith("context.") for name in values):
             network.context = None  # older files have none
+        values = {**_new_layers(network), **values}
         network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")
@@ -61,6 +62,12 @@ def load_network(
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
     network = network.to(torch.device(device), getattr(torch, precision)).to(memory_format=torch.channels_last)
     return network.eval().requires_grad_(False)
+
+
+def _new_layers(network: Any) -> dict[str, Any]:
+    """Layers that older files of a network lack; as they begin, they change nothing."""
+    new = "context.light.", "context.target."
+    return {name: value for name, value in network.state_dict().items() if name.startswith(new)}
 
 
 def fast_precision(device: str) -> Precision:

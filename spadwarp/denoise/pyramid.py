@@ -166,19 +166,22 @@ class PyramidNet(nn.Module):
             seen = found.detach(), others.detach(), frame[:, 3:].float()
             if torch.is_grad_enabled():
                 candidates, scores = self.select(*seen)
-                before = selected(candidates, scores).detach()
-                extra += [candidates - delay.detach(), scores, self._last(before, *seen[1:]) - delay.detach()]
+                last, target = self._last(selected(candidates, scores).detach(), *seen[1:])
+                extra += [candidates - delay.detach(), scores, last - delay.detach()]
             else:
-                found = self._last(selected_depth(self.select, *seen), *seen[1:])
-            found = found - delay
+                found, target = self._last(selected_depth(self.select, *seen), *seen[1:])
+            found, others = found - delay, torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 
-    def _last(self, before: Tensor, logits: Tensor, features: Tensor) -> Tensor:
-        """The answer with the view of a wide surrounding; the one before with weights of older files, without it."""
+    def _last(self, before: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """The answer with the view of a wide surrounding, and what it adds to the logit of "sees a target".
+
+        With weights of older files, which have no such view, the answer before and 0.
+        """
         if self.context is None:
-            return before
-        depths, scores = self.context(before, logits, features)
-        return answer(depths, scores, features)
+            return before, torch.zeros_like(before)
+        depths, scores, target = self.context(before, logits, features)
+        return answer(depths, scores, features), target
 
     def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""

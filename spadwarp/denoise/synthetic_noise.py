@@ -359,5 +359,7 @@ def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor
     rough = random.between(noise.roughness, 1, 1)[..., None]
     if noise.roughness[1] > 0:
         light *= random.normal(rate.shape).mul_(rough).sub_(0.5 * rough.square()).exp_()
-    share = torch.where(random.coin(0.5, 1, 1), random.uniform(1, 1), 0.95 + 0.05 * random.uniform(1, 1))[..., None]
-    return torch.lerp(rate, light, share)
+    share = torch.where(random.coin(0.5, 1, 1), random.uniform(1, 1), 0.95 + 0.05 * random.uniform(1, 1))
+    if noise.halo > 0.0:
+        share = torch.where(random.coin(noise.halo, 1, 1), random.log_between((0.01, 0.7), 1, 1), share)
+    return torch.lerp(rate, light, share[..., None])
