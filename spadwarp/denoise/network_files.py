@@ -54,8 +54,7 @@ def load_network(
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
         if model == "histograms" and not any(name.startswith("context.") for name in values):
             network.context = None  # older files have none
-        values = {**_new_layers(network), **values}
-        network.load_state_dict(values)
+        network.load_state_dict(_in_present_shapes(values, network.state_dict()))
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
@@ -64,10 +63,33 @@ def load_network(
     return network.eval().requires_grad_(False)
 
 
-def _new_layers(network: Any) -> dict[str, Any]:
-    """Layers that older files of a network lack; as they begin, they change nothing."""
+def _in_present_shapes(values: dict[str, Any], present: dict[str, Any]) -> dict[str, Any]:
+    """Weights of the network for histograms with the layers and inputs that older files lack; others as they are.
+
+    New layers begin as they do in a training, where they change nothing. Files from before the last candidate, the mean
+    of beliefs, and the two channels of the counts give that candidate the weights of belief propagation.
+    """
     new = "context.light.", "context.target."
-    return {name: value for name, value in network.state_dict().items() if name.startswith(new)}
+    values = {**{name: value for name, value in present.items() if name.startswith(new)}, **values}
+    entering = values.get("enter_features.weight")
+    if entering is None or entering.shape[1] != 59:
+        return values
+    channels = present["enter_features.weight"].new_zeros(len(entering), 66, entering.shape[2])
+    kept = [place for place in range(64) if place not in (9, 19, 29, 39, 49)]  # without the scores of the candidate
+    channels[:, kept] = entering
+    values["enter_features.weight"] = channels
+    pixel = values["select.pixel.weight"]
+    wider = pixel.new_zeros(len(pixel), 25)
+    wider[:, :18], wider[:, 20:] = pixel[:, :18], pixel[:, 18:]
+    values["select.pixel.weight"] = wider
+    for layer, alike, at, less in (
+        ("choose.weight", 3, 10, 0.0), ("choose.bias", 3, 10, 2.0),
+        ("select.kind", 5, 12, 0.0), ("select.bias", 5, 12, 1.0),
+    ):  # fmt: skip
+        rows = values[layer][[*range(at), alike, *range(at, len(values[layer]))]]
+        rows[at] -= less  # chosen more seldom than what it is like
+        values[layer] = rows
+    return values
 
 
 def fast_precision(device: str) -> Precision:

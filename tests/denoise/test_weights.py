@@ -314,7 +314,7 @@ def test_exports_of_an_engine_are_denoised_as_well_as_other_frames(name):
 def test_where_pixels_see_two_surfaces_the_network_is_better_than_the_tuned_classical_estimates():
     vase = evaluation_scene("vase", "wall", size=(64, 64))
     found = evaluate_histograms(
-        photons=(10,), sbr=(1.0,), backgrounds=("flat",), returns=(2,), scenes=[vase], device="cpu"
+        photons=(3,), sbr=(1.0,), backgrounds=("flat",), returns=(2,), scenes=[vase], device="cpu"
     )
     (rmse,) = found.rmse.values()
-    assert rmse["histograms"] < 0.9 * min(value for name, value in rmse.items() if name != "histograms")
+    assert rmse["histograms"] < 0.8 * min(value for name, value in rmse.items() if name != "histograms")

@@ -55,10 +55,13 @@ def test_kernels_import_warp_numpy_and_the_standard_library_only():
 LOADED_LATE = {
     "denoise/belief_propagation.py",
     "denoise/context.py",
+    "denoise/guide.py",
     "denoise/histogram_features.py",
     "denoise/losses.py",
+    "denoise/marginals.py",
     "denoise/networks.py",
     "denoise/pyramid.py",
+    "denoise/scattered_light.py",
     "denoise/selection.py",
     "denoise/semi_global.py",
     "denoise/shapes.py",

@@ -1,0 +1,180 @@
+"""Both sides of depth edges, the wide view that weighs them, and what tells scattered light from a target."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from scipy.stats import expon, norm
+
+from spadwarp.denoise import estimate
+from spadwarp.denoise.context import ANSWERS, Context, answer
+from spadwarp.denoise.frames import POOLED, SCORED, SIDES
+from spadwarp.denoise.histogram_features import FEATURES
+from spadwarp.denoise.network_files import WEIGHTS, load_network
+from spadwarp.denoise.scattered_light import light_channels
+from spadwarp.denoise.sides import REACHES, beside_edges
+
+BINS = 96
+TAPS = np.diff(norm.cdf(np.arange(-4.5, 5.0), scale=1.2))
+RESPONSE = TAPS / TAPS.sum()
+GATE = (10.0, 12.4)
+TURNS = [(0, True), (1, False), (3, True)]
+
+
+def turned(image, turn, mirrored, axes=(0, 1)):
+    """One of the eight turns and reflections of the axes."""
+    return np.rot90(np.flip(image, axes[1]) if mirrored else image, turn, axes)
+
+
+def counts_of(bin_of, photons, background, seed, share=1.0, second=0.0):
+    """Poisson counts of returns at `bin_of`, and of a part 1 − share of them `second` bins later, `[H, W, BINS]`."""
+    edges = np.arange(BINS + 1.0)
+    first, late = (np.diff(norm.cdf(edges - (bin_of + apart)[..., None], scale=1.2)) for apart in (0.0, second))
+    rate = photons * (share * first + (1.0 - share) * late) + background / BINS
+    return np.random.default_rng(seed).poisson(rate).astype(np.float32)
+
+
+def found_in(counts, background, gate=GATE, weights=None):
+    """Depth and probabilities of the network; the depths given are those of the most counts."""
+    depth = gate[0] + (gate[1] - gate[0]) * (counts.argmax(axis=-1) + 0.5) / counts.shape[-1]
+    flat = np.full(counts.shape[-1], background / BINS)
+    given = {"counts": counts, "background": flat, "response": RESPONSE, "weights": weights, "device": "cpu"}
+    return estimate(depth, gate=gate, model="histograms", **given)
+
+
+def stepped(height=48, width=48, bins=(30.5, 60.5)):
+    """A step of depth along a column, in bins."""
+    return np.where(np.arange(width) < width // 2, *bins) + np.zeros((height, 1))
+
+
+def test_both_sides_of_a_step_are_named_up_to_the_reach():
+    """Beside the edge the two surfaces, elsewhere the same depth twice; the nearer one always first."""
+    usual = torch.from_numpy(stepped() / BINS).float()[None]
+    depths, _ = beside_edges(torch.zeros(1, 48, 48, BINS), usual, torch.zeros_like(usual))
+    for number, reach in enumerate(REACHES):
+        front, back = depths[0, 20, :, 2 * number].numpy() * BINS, depths[0, 20, :, 2 * number + 1].numpy() * BINS
+        beside = slice(24 - reach, 24 + reach)
+        np.testing.assert_allclose(front[beside], 30.5, atol=1e-3)
+        np.testing.assert_allclose(back[beside], 60.5, atol=1e-3)
+        elsewhere = np.r_[0 : 24 - reach, 24 + reach : 48]
+        np.testing.assert_allclose(front[elsewhere], back[elsewhere], atol=1e-4)
+
+
+def test_a_pixel_is_like_the_side_whose_counts_it_has():
+    """Of two surfaces with 4 and 40 counts a pixel, each pixel beside the edge is nearer to its own side's counts."""
+    shape = stepped()
+    level = torch.from_numpy(2.0 * np.sqrt(np.where(shape < 50, 4.0, 40.0) + 0.375)).float()[None]
+    _, like = beside_edges(torch.zeros(1, 48, 48, BINS), torch.from_numpy(shape / BINS).float()[None], level)
+    which = like[0, 20, 22:26, 2].numpy()  # larger square: that of the farther side, less that of the nearer
+    assert (which[:2] > 0.3).all() and (which[2:] < -0.3).all()
+
+
+@pytest.mark.parametrize("turn, mirrored", TURNS)
+def test_turned_frames_give_the_turned_answer(turn, mirrored):
+    """To rounding: the depth, and both probabilities."""
+    counts = counts_of(stepped(), 4.0, 4.0, seed=3)
+    plain, other = found_in(counts, 4.0), found_in(np.ascontiguousarray(turned(counts, turn, mirrored)), 4.0)
+    apart = np.abs(turned(plain.depth, turn, mirrored) - other.depth)
+    assert np.quantile(apart, 0.99) < 1e-5 * (GATE[1] - GATE[0])  # of ties between candidates either may be taken
+    for name in ("target_probability", "confidence"):
+        one = turned(getattr(plain, name), turn, mirrored)
+        assert np.quantile(np.abs(one - getattr(other, name)), 0.99) < 1e-3
+
+
+def test_the_answer_moves_with_the_gate():
+    counts = counts_of(stepped(), 5.0, 4.0, seed=4)
+    plain, moved = found_in(counts, 4.0), found_in(counts, 4.0, gate=(110.0, 112.4))
+    np.testing.assert_allclose(moved.depth - 100.0, plain.depth, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (9, 30), (33, 17)])
+def test_any_size_and_any_number_of_bins(shape):
+    counts = counts_of(stepped(*shape), 20.0, 4.0, seed=5)
+    found = found_in(counts, 4.0)
+    assert found.depth.shape == shape and np.isfinite(found.depth).all()
+
+
+def test_with_many_photons_one_candidate_is_the_answer_and_with_few_their_mean():
+    depths = torch.full((1, ANSWERS, 8, 8), 0.3)
+    depths[:, 1::2] = 0.6
+    scores = torch.zeros(1, ANSWERS, 8, 8)
+    scores[:, 1] = 0.1
+    features = torch.zeros(1, FEATURES, 8, 8)
+    place = POOLED + SCORED * POOLED  # a tenth of the highest log-likelihood of the pixel
+    features[:, place] = 2.0
+    many = answer(depths, scores, features)
+    assert torch.allclose(many, torch.tensor(0.6), atol=1e-4)
+    features[:, place] = 0.1
+    few = answer(depths, scores, features)
+    assert ((few > 0.4) & (few < 0.5)).all()
+
+
+def test_two_returns_are_not_averaged():
+    """Of two returns with 60 and 40 % of 200 photons, 20 bins apart, each pixel has one, mostly the first."""
+    counts = counts_of(np.full((32, 32), 30.5), 200.0, 4.0, seed=6, share=0.6, second=20.0)
+    place = (found_in(counts, 4.0).depth - GATE[0]) / (GATE[1] - GATE[0]) * BINS
+    assert (np.minimum(np.abs(place - 30.5), np.abs(place - 50.5)) < 1.0).all()
+    assert np.mean(np.abs(place - 30.5) < 1.0) > 0.99
+
+
+def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_path):
+    """Two signal photons a pixel among ten of the background; averages over two noises."""
+    old = {
+        name: value for name, value in load_file(WEIGHTS / "histograms.safetensors").items() if "context." not in name
+    }
+    save_file(old, tmp_path / "old.safetensors", {"model": "histograms"})
+    row, column = np.mgrid[:64, :64]
+    place = np.where((row - 30) ** 2 + (column - 33) ** 2 < 400, 30.5, 60.5)
+    errors = np.zeros((2, 2))
+    for number in range(2):
+        counts = counts_of(place, 2.0, 10.0, seed=10 + number)
+        for which, weights in enumerate((tmp_path / "old.safetensors", None)):
+            depth = found_in(counts, 10.0, weights=weights).depth
+            errors[which, number] = np.mean(((depth - GATE[0]) / (GATE[1] - GATE[0]) * BINS - place) ** 2)
+    assert errors[1].mean() < 0.9 * errors[0].mean()
+
+
+def test_weights_of_the_version_before_load(tmp_path):
+    """Without the wide view, the last candidate and the two channels of the counts."""
+    values = {
+        name: value for name, value in load_file(WEIGHTS / "histograms.safetensors").items() if "context." not in name
+    }
+    entering = [place for place in range(64) if place not in (9, 19, 29, 39, 49)]
+    values["enter_features.weight"] = values["enter_features.weight"][:, entering].contiguous()
+    values["select.pixel.weight"] = values["select.pixel.weight"][:, [*range(18), *range(20, 25)]].contiguous()
+    for layer, last in (("choose.weight", 10), ("choose.bias", 10), ("select.kind", 12), ("select.bias", 12)):
+        rows = values[layer]
+        values[layer] = rows[[place for place in range(len(rows)) if place != last]].contiguous()
+    save_file(values, tmp_path / "old.safetensors", {"model": "histograms"})
+    place = stepped()
+    depth = found_in(counts_of(place, 10.0, 4.0, seed=7), 4.0, weights=tmp_path / "old.safetensors").depth
+    assert np.median(np.abs((depth - GATE[0]) / (GATE[1] - GATE[0]) * BINS - place)) < 0.3
+
+
+def test_new_layers_change_nothing():
+    """A new wide view answers nearly as the network did before, and adds nothing to the target's logit."""
+    torch.manual_seed(1)
+    context = Context()
+    features = torch.randn(1, FEATURES, 17, 24)
+    features[:, -SIDES:] = torch.rand(1, SIDES, 17, 24)
+    depths, scores, target = context(torch.rand(1, 1, 17, 24), torch.randn(1, 3, 17, 24), features)
+    assert depths.shape == scores.shape == (1, ANSWERS, 17, 24) and not target.any()
+    assert (torch.softmax(scores, dim=1)[:, 0].median() > 0.4).all()
+    network = load_network("histograms", device="cpu")
+    assert network.context is not None
+
+
+def test_scattered_light_is_dimmer_and_later_than_a_target():
+    """Light from a target in the left half, 5 % of it delayed by 8 bins on average in the right half; many photons."""
+    edges = np.arange(BINS + 1.0)
+    direct = np.diff(norm.cdf(edges - 30.5, scale=1.2))
+    late = np.convolve(direct, np.diff(expon.cdf(np.arange(41.0), scale=8.0)))[:BINS]
+    above = torch.from_numpy(1000.0 * np.where(np.arange(48)[:, None] < 24, direct, 0.05 * late)).float()
+    above = above.expand(1, 48, 48, BINS).contiguous()
+    level = torch.full((1, BINS), 0.1)
+    place = above.argmax(dim=-1).add(0.5) / BINS
+    channels = torch.stack(light_channels(above, level, place, torch.from_numpy(RESPONSE).float()[None]))[:, 0, 24]
+    left, right = channels[:, 4], channels[:, 40]
+    dimmer = (right[3] - left[3]) / 0.3  # ln of the brightness relative to the brightest within 30 pixels
+    assert abs(float(dimmer) - np.log(0.05)) < 0.15
+    assert left[8] > 0.9 and right[8] < 0.5 and left[10] < 0.01 and right[10] > 0.2
