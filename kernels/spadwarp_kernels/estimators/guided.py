@@ -48,7 +48,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
     request_flight, request_event = make_requests(spec)
     registers = (96, 96)
     if spec.polarised:
-        registers = (128, 96)
+        registers = (128, 128)
     elif spec.grid is not None:
         registers = (72 if takes_collisions(spec) else 80, 72)
     return Estimator(
