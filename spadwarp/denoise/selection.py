@@ -111,8 +111,10 @@ def _evidence(found: Tensor, logits: Tensor, features: Tensor, typical: Tensor) 
 
     def agreeing(around: Tensor, reach: float) -> Tensor:
         """Part of the depths around that agree with each candidate."""
-        parts = [torch.exp((candidates - one).abs() * (-1.0 / reach)) for one in around.split(1, dim=1)]
-        return torch.stack(parts).mean(dim=0)
+        agreeing = torch.zeros_like(candidates)
+        for one in around.split(1, dim=1):
+            agreeing += (candidates - one).abs_().mul_(-1.0 / reach).exp_()
+        return agreeing / around.shape[1]
 
     usual, top, mine = typical[:, :1], own[:, :1], at(own, -1.0)
     apart = (candidates - found).abs()

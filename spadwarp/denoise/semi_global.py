@@ -45,12 +45,13 @@ def messages(score: Tensor, *, slope: float, jump: Tensor) -> Tensor:
     """
     lines = score.flatten(0, 1)
     most = jump.expand(-1, score.shape[1], max(1, score.shape[2] - 1), 1).flatten(0, 1)
+    penalties = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
     received, last = torch.zeros_like(lines), lines.shape[1] - 1
     ahead = lines.new_zeros(2, len(lines), lines.shape[2])  # the message sent last, forwards and backwards
     for place in range(last):
         known = torch.stack([lines[:, place], lines[:, last - place]]).add_(ahead)
         best = known.amax(dim=-1, keepdim=True)
-        ahead = torch.maximum(known, best - torch.stack([most[:, place], most[:, last - place - 1]]))
+        ahead = torch.maximum(known, best - penalties[place])
         known -= slope
         torch.maximum(ahead[..., 1:], known[..., :-1], out=ahead[..., 1:])
         torch.maximum(ahead[..., :-1], known[..., 1:], out=ahead[..., :-1])
