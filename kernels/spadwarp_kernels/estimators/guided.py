@@ -40,7 +40,7 @@ LARGEST_WEIGHT_RATIO = wp.constant(64.0)
 
 # With delta tracking, of the flights of backscattered light that pass the lens far aside one in so many is scored, a
 # power of two.
-ASIDE_SCORED_IN = 8
+ASIDE_SCORED_IN = 16
 
 
 def make_guided(spec: TransportSpec) -> Estimator:
@@ -96,13 +96,13 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
 @wp.func
 def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
-    """Whether light has to turn by more than 37 degrees (cosine 0.8) to reach the lens, from any point of the flight
+    """Whether light has to turn by more than 26 degrees (cosine 0.9) to reach the lens, from any point of the flight
     from x along u: the angle is least at its first point.
 
     After a collision in the water such flights are a third of what is scored; they bring weak, even scores, and next to
     nothing of the variance of bins where it is large.
     """
-    return wp.dot(x, u) > -0.8 * wp.length(x)
+    return wp.dot(x, u) > -0.9 * wp.length(x)
 
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:

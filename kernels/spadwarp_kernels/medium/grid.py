@@ -39,7 +39,7 @@ class Grid:
         block_size: Number of blocks along the three edges of the box; the last may be incomplete.
         block_majorant: Largest c in each block [1/m].
         block_control: Mean c of each block, and the largest difference from it in the block [1/m].
-        residual: c less the mean of its block [1/m], by cell.
+        residual: c less the block's, see `block_statistics` [1/m], by cell.
     """
 
     turn: wp.mat33
@@ -358,7 +358,7 @@ def _checked_cells(name: str, values: ArrayLike, interval: str) -> NDArray[np.fl
 
 
 def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArray[np.float32], ...]:
-    """Largest value, mean and largest difference from the mean in blocks of `edge` cells; the last may be
+    """Largest value, a value near the mean and largest difference from it in blocks of `edge` cells; the last may be
     incomplete."""
     starts = [np.arange(0, n, edge) for n in extinction.shape]
 
@@ -371,6 +371,8 @@ def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArra
     counts = ones[0][:, None, None] * ones[1][None, :, None] * ones[2][None, None, :]
     low, high = over_blocks(np.minimum, extinction), over_blocks(np.maximum, extinction)
     mean = np.clip(over_blocks(np.add, extinction.astype(np.float64)) / counts, low, high).astype(np.float32)
+    # Above the mean, since few cells are far above it, whose difference decides how many points ratio tracking takes.
+    mean = (mean + np.float32(0.1) * (high - mean)).astype(np.float32)
     # Not below the true difference, whatever its rounding.
     deviation = np.maximum(high - mean, mean - low) * np.float32(1.0 + 2.0**-20)
     return high.astype(np.float32), mean, deviation.astype(np.float32)

@@ -2,7 +2,8 @@
 
 Regular tracking adds up the optical depth of every cell on the way. Where cells are many, delta tracking (Woodcock et
 al. 1965) flies through blocks of the largest extinction and rejects collisions, and residual ratio tracking (Novák et
-al. 2014) estimates what a flight lets through from the mean extinction of the blocks and a few cells on the way.
+al. 2014) estimates what a flight lets through from an extinction near the mean of each block and a few cells on the
+way.
 """
 
 import warp as wp
@@ -94,7 +95,7 @@ def draw_by_cells(
 
 @wp.func
 def depth_by_block(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
-    """A guess of the optical depth between x and x + length u, from the mean extinction of the block in the middle."""
+    """A guess of the optical depth between x and x + length u, from the extinction of the block in the middle."""
     grid = layers.grid
     p = grid.turn * (x + (0.5 * length) * u) + grid.shift
     extinction = float(medium.extinction)
@@ -170,8 +171,8 @@ def delta_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: 
 @wp.func
 def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     """Extinction [1/m] whose exp(-mean length) has the expectation of what passes between x and x + length u; by
-    residual ratio tracking about the mean extinction of the blocks, with one rate: first all lanes of a warp go through
-    blocks, then all look up cells."""
+    residual ratio tracking about an extinction near the mean of each block, with one rate: first all lanes of a warp go
+    through blocks, then all look up cells."""
     grid = layers.grid
     line = block_line(grid, x, u, length)
     if line.begin >= line.end:
