@@ -69,6 +69,7 @@ from .traverse import make_aim, make_begin_walk, make_counts, make_look, next_ra
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
 # in the water.
 RAY_LANES = 20
+GUIDED_RAY_LANES = 18
 
 # It scores what its queue holds when so many have room for a contribution that waits for its shadow ray.
 FREE_LANES = 12
@@ -76,8 +77,10 @@ FREE_LANES = 12
 # It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
 WALKING_LANES = 6
 
-# It takes new photons when this many lanes have ended.
-START_LANES = 3
+# It takes new photons when this many lanes have ended; the second where nothing is scored, and with `next_event` in a
+# tree. Both measured.
+START_LANES = 4
+FEWER_START_LANES = 3
 
 
 @made_once
@@ -106,7 +109,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     # Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
     at_once = cuda and not has_bvh and ((queues and flights and spec.grid is None) or not scores)
     early = at_once or (has_bvh and queues and not flights)
-    ray_lanes = RAY_LANES if has_bvh else 32
+    ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
+    start_lanes = START_LANES if scores and (flights or not has_bvh) else FEWER_START_LANES
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
     scatter, leave = make_scatter(spec, estimator.direct, crosses), make_leave(crosses)
@@ -281,7 +285,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     leave(s, new)
 
                 # ---- The next photon for those that have ended
-                if count_lanes(s.stage >= START) >= START_LANES:
+                if count_lanes(s.stage >= START) >= wp.static(start_lanes):
                     if s.stage == END:
                         s.weight = finish(s, out, ledger, thread)
                         s.water_collisions += s.collisions - s.surface_count - s.bounces.count
