@@ -104,7 +104,8 @@ def denoise_file(
 
     Writes to `out`: `NAME.npy`, `NAME_target.npy`, `NAME_confidence.npy` (depth and the two probabilities of all
     frames), `NAME.exr` (all three of the first), and `NAME.png`, in which open water is left out. From counts also
-    `NAME_second.npy`, the depth of a second return in the same pixel, NaN where there is none.
+    `NAME_second.npy`, the depth of a second return in the same pixel, NaN where there is none. In bright scenes this
+    may be light that the water scattered into the pixel from another part of the target.
 
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
@@ -156,7 +157,8 @@ def denoise_file(
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
         notes.append(f"{empty} of {len(depth)} frames are empty: nothing was reported, or no target is seen")
     if second is not None:
-        notes.append(f"{percent(np.isfinite(second).mean())} % of the pixels have a second return")
+        share = percent(np.isfinite(second).mean())
+        notes.append(f"{share} % of the pixels have a second return, of a surface or of light scattered into them")
     threshold = target_threshold(model) if mask is None else mask
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)

@@ -30,7 +30,9 @@ def second_return(
 
     The first return is taken off each histogram: as many counts as lie in it, in the shape of the response. In what
     remains, beyond the response, the counts of `side` × `side` pixels within the response's width have to exceed the
-    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio).
+    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio). Light that the water
+    scatters into a pixel from a brighter part of the target is such an excess, too: with hundreds of detections a pixel
+    most pixels have a second return.
 
     Args:
         depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
