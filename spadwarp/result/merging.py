@@ -141,6 +141,10 @@ def join_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) 
 
 def check_capacity(*tallies: NDArray[np.int64]) -> None:
     """Raises `SpadwarpError` where a bin's sum over components and parts leaves the range of its 64-bit integer."""
+    # A negative number is a large one without its sign.
+    largest = [int(part.view(np.uint64).max(initial=0)) * len(part) for part in tallies]
+    if sum(largest) < 2**62:
+        return
     for row in zip(*(part.swapaxes(0, 1) for part in tallies), strict=True):  # in pieces that a cache holds
         total = np.sum([part.sum(axis=0, dtype=np.float64) for part in row], axis=0)
         if total.size and (total.max() >= 2.0**62 or min(part.min() for part in row) < 0):

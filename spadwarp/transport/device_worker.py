@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
@@ -161,6 +162,25 @@ class DeviceWorker:
         self._closed = batch if self._closed is None else tuple(map(_added, self._closed, batch))
         self._moments = joined_moments(self._moments, moments) if self._moments else moments
 
+    def take_over(self, other: DeviceWorker) -> None:
+        """Moves the tallies of another worker of the same run here; both must rest."""
+        with device_errors(self.model.device):
+            if self._batches is None:
+                sk.add_tallies(self.data.tally, other.data.tally)
+                sk.add_tallies(self.data.ledger, other.data.ledger)
+                if self._gradients is not None:
+                    sk.add_tallies(self._gradients, other.data.gradients)
+            elif other._closed is not None:
+                pairs = ((self._batches, other._batches), (self._gradient_batches, other._gradient_batches))
+                for mine, more in pairs:
+                    if mine is not None and more is not None:
+                        mine.add(more)
+                closed = self._closed
+                self._closed = other._closed if closed is None else tuple(map(_added, closed, other._closed))
+                self._moments = joined_moments(self._moments, other._moments) if closed else other._moments
+        self._check_overflow()
+        other.clear()
+
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
@@ -172,7 +192,7 @@ class DeviceWorker:
                 second_moment = np.stack([half.numpy().reshape(self._shape[1:]) for half in halves])
             ledger, counters = self._closed or sk.read_ledger(self.data)
             return Tallies(
-                total.numpy().reshape(self._shape),
+                _on_host(total).reshape(self._shape),
                 ledger,
                 counters,
                 second_moment,
@@ -216,6 +236,16 @@ class DeviceWorker:
         for array in arrays:
             if array is not None:
                 array.zero_()
+
+
+def _on_host(array: wp.array) -> NDArray[np.int64]:
+    """What an array holds; of a GPU in memory from NumPy, which is of large pages and filled in half the time."""
+    if not array.device.is_cuda:
+        return np.asarray(array.numpy())
+    held = np.empty(array.shape, np.int64)
+    wp.copy(wp.array(held, dtype=wp.int64, device="cpu", copy=False), array)
+    wp.synchronize_device(array.device)
+    return held
 
 
 def _added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

@@ -144,13 +144,11 @@ class LocalWorkers:
         return self._truth
 
     def tallies(self) -> Tallies:
-        """Those of all devices; with a single CPU in its own memory."""
-        total = self.workers[0].tallies()
-        if len(self.workers) > 1:
-            total = Tallies.of(total) if not self._devices[0].is_cuda else total
-            for worker in self.workers[1:]:
-                total.add(worker.tallies())
-        return total
+        """Those of all devices, added up on the first; on CPUs in its own memory."""
+        first, *others = self.workers
+        for other in others:
+            first.take_over(other)
+        return first.tallies()
 
     def metadata(self) -> dict[str, Any]:
         names = list(dict.fromkeys(map(processor_name, self._devices)))

@@ -5,7 +5,7 @@ from .blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES, Blocks, make_bloc
 from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
 from .rates import tally_rates
 from .scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives, make_derivatives
-from .tally import COMPONENTS, Contribution, Scores, deposit, has_overflowed, tally_index, to_fixed_point
+from .tally import COMPONENTS, Contribution, Scores, add_tallies, deposit, has_overflowed, tally_index, to_fixed_point
 
 __all__ = [
     "BLOCK_DERIVATIVES",
@@ -23,6 +23,7 @@ __all__ = [
     "Contribution",
     "Derivatives",
     "Scores",
+    "add_tallies",
     "add_to_ledger",
     "deposit",
     "has_overflowed",

@@ -7,7 +7,7 @@ import warp as wp
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
 
 from .ledger import atomic_add_int64
-from .tally import VOXEL_LIMIT
+from .tally import VOXEL_LIMIT, add_tallies, has_overflowed
 
 # Copies of a component's sum, so that threads seldom add to one address at the same time.
 _SLOTS = wp.constant(4096)
@@ -91,6 +91,21 @@ def close_batch_kernel(
             squares_high[voxel] = squares_high[voxel] + square_high
 
 
+@wp.kernel(enable_backward=False)
+def add_squares_kernel(
+    more_low: wp.array(dtype=wp.uint64),
+    more_high: wp.array(dtype=wp.uint64),
+    squares_low: wp.array(dtype=wp.uint64),
+    squares_high: wp.array(dtype=wp.uint64),
+):
+    """Adds 128-bit integers. Launch: voxels."""
+    voxel = wp.tid()
+    low = squares_low[voxel] + more_low[voxel]
+    carry = wp.where(low < more_low[voxel], wp.uint64(1), wp.uint64(0))
+    squares_low[voxel] = low
+    squares_high[voxel] = squares_high[voxel] + more_high[voxel] + carry
+
+
 class Batches:
     """Totals and squares on the device of a tally; `total` may be the caller's own array of zeros.
 
@@ -117,7 +132,7 @@ class Batches:
             check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
         voxels = tally.size // component_count
         self._sums = wp.zeros(component_count * _SLOTS, dtype=wp.int64, device=tally.device)
-        self._least = wp.int64(1 - (1 << 62) if signed else 0)
+        self._signed, self._least = signed, wp.int64(1 - (1 << 62) if signed else 0)
         self._overflow = wp.zeros(1, dtype=int, device=tally.device)
         self.total = wp.zeros(tally.size, dtype=wp.int64, device=tally.device) if total is None else total
         self.second_moment = tuple(wp.zeros(voxels, dtype=wp.uint64, device=tally.device) for _ in range(2))
@@ -143,6 +158,17 @@ class Batches:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(part, edges[:-1], edges[1:]))
         self.count += 1
+
+    def add(self, other: "Batches") -> None:
+        """Adds the batches of another tally of the same size and sign, which may be on another device."""
+        device = self.total.device
+        add_tallies(self.total, other.total)
+        more = [half.to(device) for half in other.second_moment]
+        outputs = list(self.second_moment)
+        wp.launch(add_squares_kernel, dim=more[0].size, inputs=more, outputs=outputs, device=device)
+        if has_overflowed(self.total, signed=self._signed):
+            self._overflow.fill_(1)
+        self.count += other.count
 
     def has_overflowed(self) -> bool:
         """Whether a voxel of the total has left the range that `has_overflowed` allows; waits for the device."""

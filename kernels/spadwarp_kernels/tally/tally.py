@@ -100,6 +100,30 @@ def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
     return bool(found.numpy()[0])
 
 
+# Integers of another device's tally that are copied at a time.
+_PIECE = 1 << 24
+
+
+@wp.kernel(enable_backward=False)
+def add_kernel(more: wp.array(dtype=wp.int64), first: int, total: wp.array(dtype=wp.int64)):
+    """Launch: integers of `more`, which belong to those of `total` from `first` on."""
+    i = wp.tid()
+    total[first + i] += more[i]
+
+
+def add_tallies(total: wp.array, more: wp.array) -> None:
+    """Adds one tally to another, which may be on another device; no launch that writes `more` may be under way.
+
+    Raises:
+        ArgumentError: They are not contiguous arrays of int64 with one axis and equally long.
+    """
+    check_array("total", total, wp.int64, (None,), contiguous=True)
+    check_array("more", more, wp.int64, tuple(total.shape), contiguous=True)
+    for first in range(0, total.size, _PIECE):
+        piece = more[first : min(first + _PIECE, total.size)].to(total.device)
+        wp.launch(add_kernel, dim=piece.size, inputs=[piece, first], outputs=[total], device=total.device)
+
+
 @wp.func
 def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
     """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
