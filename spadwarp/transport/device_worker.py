@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -72,11 +72,35 @@ class DeviceWorker:
 
     def launch(self, first: int, stop: int) -> None:
         """Traces the photons of one launch to their end."""
-        with device_errors(self.model.device):
+        self._wait(self._begin(first, stop))
+
+    def _begin(self, first: int, stop: int) -> wp.Event | None:
+        """Gives a launch to the device; `_wait` waits for its end. On a CPU it has ended."""
+        device = self.model.device
+        with device_errors(device):
             sk.launch_transport(
                 self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
             )
-            wp.synchronize_device(self.model.device)
+            return device.stream.record_event() if device.is_cuda else None
+
+    def _wait(self, end: wp.Event | None) -> None:
+        if end is not None:
+            with device_errors(self.model.device):
+                wp.synchronize_event(end)
+
+    def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
+        """Traces a launch for each span; yields those that have ended. A GPU has the next one before it ends one."""
+        ahead = 1 if self.model.device.is_cuda else 0
+        running: list[tuple[Range, wp.Event | None]] = []
+        for span in spans:
+            running.append((span, self._begin(*span)))
+            if len(running) > ahead:
+                ended, end = running.pop(0)
+                self._wait(end)
+                yield ended
+        for ended, end in running:
+            self._wait(end)
+            yield ended
 
     def trace(
         self, block: Range, *, stopped: threading.Event, report: Callable[[int], None] = lambda photons: None
@@ -120,14 +144,17 @@ class DeviceWorker:
         waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()
         failures: list[BaseException] = []
 
+        def spans() -> Iterator[Range]:
+            while not (stopped.is_set() or failures):
+                with lock:
+                    span = waiting.take(self._size(waiting.left))
+                if span is None:
+                    return
+                yield span
+
         def work() -> None:
             try:
-                while not (stopped.is_set() or failures):
-                    with lock:
-                        span = waiting.take(self._size(waiting.left))
-                    if span is None:
-                        return
-                    self.launch(*span)
+                for span in self._launched(spans()):
                     with lock:
                         done.append(span)
                     report(span[1] - span[0])
@@ -168,8 +195,8 @@ class DeviceWorker:
             if self._batches is None:
                 sk.add_tallies(self.data.tally, other.data.tally)
                 sk.add_tallies(self.data.ledger, other.data.ledger)
-                if self._gradients is not None:
-                    sk.add_tallies(self._gradients, other.data.gradients)
+                if self._gradients is not None and other._gradients is not None:
+                    sk.add_tallies(self._gradients, other._gradients)
             elif other._closed is not None:
                 pairs = ((self._batches, other._batches), (self._gradient_batches, other._gradient_batches))
                 for mine, more in pairs:
@@ -192,7 +219,7 @@ class DeviceWorker:
                 second_moment = np.stack([half.numpy().reshape(self._shape[1:]) for half in halves])
             ledger, counters = self._closed or sk.read_ledger(self.data)
             return Tallies(
-                _on_host(total).reshape(self._shape),
+                _on_host(total, self.model.device).reshape(self._shape),
                 ledger,
                 counters,
                 second_moment,
@@ -238,13 +265,13 @@ class DeviceWorker:
                 array.zero_()
 
 
-def _on_host(array: wp.array) -> NDArray[np.int64]:
+def _on_host(array: wp.array, device: wp.Device) -> NDArray[np.int64]:
     """What an array holds; of a GPU in memory from NumPy, which is of large pages and filled in half the time."""
-    if not array.device.is_cuda:
+    if not device.is_cuda:
         return np.asarray(array.numpy())
     held = np.empty(array.shape, np.int64)
     wp.copy(wp.array(held, dtype=wp.int64, device="cpu", copy=False), array)
-    wp.synchronize_device(array.device)
+    wp.synchronize_device(device)
     return held
 
 
