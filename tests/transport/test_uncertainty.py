@@ -12,7 +12,7 @@ from scipy import stats
 import spadwarp
 from helpers.runs import same
 from helpers.scenes import scene
-from spadwarp_kernels import Batches
+from spadwarp_kernels import ArgumentError, Batches
 
 
 def test_squares_are_exact_to_128_bits(device):
@@ -30,6 +30,38 @@ def test_squares_are_exact_to_128_bits(device):
     low, high = (half.numpy() for half in batches.second_moment)
     assert [int(h) << 64 | int(l) for l, h in zip(low, high, strict=True)] == expected
     assert batches.count == 300
+
+
+def test_batches_of_two_tallies_are_those_of_one(device):
+    rng = np.random.default_rng(1)
+    rows = rng.integers(-(2**59), 2**59, size=(40, 100), dtype=np.int64) >> rng.integers(0, 59, size=(40, 1))
+
+    def closed(rows):
+        tally = wp.zeros(100, dtype=wp.int64, device=device)
+        batches = Batches(tally, 2, signed=True)
+        for row in rows:
+            tally.assign(row)
+            batches.close(tally)
+        return batches
+
+    one, part, rest = closed(rows), closed(rows[:13]), closed(rows[13:])
+    part.add(rest)
+    assert part.count == one.count and not part.has_overflowed()
+    for mine, expected in zip((part.total, *part.second_moment), (one.total, *one.second_moment), strict=True):
+        assert np.array_equal(mine.numpy(), expected.numpy())
+    # Carries from the lower halves are rare by chance.
+    for batches in (part, rest):
+        batches.second_moment[0].fill_(2**63 + 5)
+        batches.second_moment[1].fill_(7)
+    part.add(rest)
+    assert set(part.second_moment[0].numpy()) == {10} and set(part.second_moment[1].numpy()) == {15}
+    rest.total.fill_(2**62 - 1)
+    part.total.fill_(1)
+    part.add(rest)
+    assert part.has_overflowed()
+    for other in (closed(np.zeros((1, 100), np.int64)).total, Batches(wp.zeros(50, dtype=wp.int64, device=device), 1)):
+        with pytest.raises(ArgumentError):
+            part.add(other)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
+from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_kind
 
 from .ledger import atomic_add_int64
 from .tally import VOXEL_LIMIT, add_tallies, has_overflowed
@@ -160,7 +160,13 @@ class Batches:
         self.count += 1
 
     def add(self, other: "Batches") -> None:
-        """Adds the batches of another tally of the same size and sign, which may be on another device."""
+        """Adds the batches of another tally of the same components, which may be on another device and must rest.
+
+        Raises `ArgumentError` for another size or number of components.
+        """
+        check_kind("other", other, Batches)
+        if other.second_moment[0].size != self.second_moment[0].size:
+            raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
         device = self.total.device
         add_tallies(self.total, other.total)
         more = [half.to(device) for half in other.second_moment]
