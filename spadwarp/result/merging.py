@@ -141,9 +141,8 @@ def join_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) 
 
 def check_capacity(*tallies: NDArray[np.int64]) -> None:
     """Raises `SpadwarpError` where a bin's sum over components and parts leaves the range of its 64-bit integer."""
-    # A negative number is a large one without its sign.
-    largest = [int(part.view(np.uint64).max(initial=0)) * len(part) for part in tallies]
-    if sum(largest) < 2**62:
+    # Almost always the largest number times that of components is enough; a negative one is large without its sign.
+    if sum(int(part.view(np.uint64).max(initial=0)) * len(part) for part in tallies) < 2**62:
         return
     for row in zip(*(part.swapaxes(0, 1) for part in tallies), strict=True):  # in pieces that a cache holds
         total = np.sum([part.sum(axis=0, dtype=np.float64) for part in row], axis=0)

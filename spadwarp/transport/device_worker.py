@@ -75,7 +75,7 @@ class DeviceWorker:
         self._wait(self._begin(first, stop))
 
     def _begin(self, first: int, stop: int) -> wp.Event | None:
-        """Gives a launch to the device; `_wait` waits for its end. On a CPU it has ended."""
+        """Gives a launch to the device, for whose end `_wait` waits; on a CPU it has ended then."""
         device = self.model.device
         with device_errors(device):
             sk.launch_transport(
@@ -89,7 +89,7 @@ class DeviceWorker:
                 wp.synchronize_event(end)
 
     def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
-        """Traces a launch for each span; yields those that have ended. A GPU has the next one before it ends one."""
+        """Traces a launch for each span and yields it when that has ended; a GPU has the next before."""
         ahead = 1 if self.model.device.is_cuda else 0
         running: list[tuple[Range, wp.Event | None]] = []
         for span in spans:
@@ -184,9 +184,13 @@ class DeviceWorker:
             if self._gradients is not None and self._gradient_batches is not None:
                 self._gradient_batches.close(self._gradients, threads=self.threads)
             moments = moments_of(COMPONENTS, self._batches.take_sums())
-            batch = sk.read_ledger(self.data)
+            counts = sk.read_ledger(self.data)
             self.data.ledger.zero_()
-        self._closed = batch if self._closed is None else tuple(map(_added, self._closed, batch))
+        self._add_counts(counts, moments)
+
+    def _add_counts(self, counts: tuple[dict[str, int], ...], moments: dict[str, int]) -> None:
+        """Of closed batches."""
+        self._closed = counts if self._closed is None else tuple(map(_added, self._closed, counts))
         self._moments = joined_moments(self._moments, moments) if self._moments else moments
 
     def take_over(self, other: DeviceWorker) -> None:
@@ -202,9 +206,7 @@ class DeviceWorker:
                 for mine, more in pairs:
                     if mine is not None and more is not None:
                         mine.add(more)
-                closed = self._closed
-                self._closed = other._closed if closed is None else tuple(map(_added, closed, other._closed))
-                self._moments = joined_moments(self._moments, other._moments) if closed else other._moments
+                self._add_counts(other._closed, other._moments)
         self._check_overflow()
         other.clear()
 
@@ -266,7 +268,11 @@ class DeviceWorker:
 
 
 def _on_host(array: wp.array, device: wp.Device) -> NDArray[np.int64]:
-    """What an array holds; of a GPU in memory from NumPy, which is of large pages and filled in half the time."""
+    """What an array holds; of a GPU in memory of NumPy, which asks Linux for pages of 2 MiB.
+
+    97 MiB of an H200 are there in 31 ms, those of `array.numpy()` in 72 ms, most of it for new pages: in memory that
+    was used before they are in 7 ms.
+    """
     if not device.is_cuda:
         return np.asarray(array.numpy())
     held = np.empty(array.shape, np.int64)

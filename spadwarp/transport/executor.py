@@ -14,10 +14,6 @@ __all__ = ["Event", "Executor", "Workers"]
 # Seconds that a block of photons takes: long beside the milliseconds of handing it out, short beside a checkpoint's.
 _BLOCK_SECONDS = 5.0
 
-# Of its share of the photons that wait, what a worker gets at a time: few blocks, and the last ones are small even
-# where a worker becomes a quarter slower.
-_PART = 0.75
-
 
 class Event(NamedTuple):
     """What a worker did.
@@ -149,13 +145,10 @@ class Executor:
 
     def _size(self, worker: Any) -> int:
         """Photons of the next block: some seconds, fewer towards the end so that all workers end together."""
-        first, workers, speed = self._workers.first_block, self._workers.workers, self._speed.get(worker)
-        size, part = first, 0.5 / len(workers)
-        if speed is not None:
-            size = int(speed * _BLOCK_SECONDS)
-            part = _PART * speed / sum(self._speed.get(one, speed) for one in workers)
-        if len(workers) > 1:
-            size = min(size, max(int(part * self._waiting.left), first // 16))
+        first, workers = self._workers.first_block, len(self._workers.workers)
+        size = int(self._speed[worker] * _BLOCK_SECONDS) if worker in self._speed else first
+        if workers > 1:
+            size = min(size, max(self._waiting.left // (2 * workers), first // 16))
         return max(1, size // self._unit) * self._unit
 
     def _take(self, event: Event) -> None:

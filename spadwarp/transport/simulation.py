@@ -12,10 +12,12 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError, SpadwarpWarning
@@ -166,10 +168,13 @@ def simulate(
 
 def _warn_of_rounding(result: Result) -> None:
     """Warns where contributions are so small that rounding them to the tally's unit decides the error."""
-    for name, error in result.rounding_error.items():
+    for name, tally in zip(COMPONENTS, result.tallies, strict=True):
         small = result.counters.get(f"below_unit_{name}", 0)
-        total = int(result.tallies[COMPONENTS.index(name)].sum(dtype=np.float64))
-        if error > _LARGEST_ROUNDING_ERROR and small > _MANY * max(total, 1):
+        # The first rows of pixels mostly show that there is more.
+        if small <= _MANY or any(total * _MANY >= small for total in accumulate(map(_units, tally))):
+            continue
+        total, error = _units(tally), result.rounding_error[name]
+        if error > _LARGEST_ROUNDING_ERROR:
             text = f"adds {percent(error)} % to the error of an average lit bin" if total else "left none of it"
             warnings.warn(
                 f"{name}: rounding to the histogram's unit {text}: {small} contributions of less than one unit came to "
@@ -177,6 +182,10 @@ def _warn_of_rounding(result: Result) -> None:
                 RuntimeWarning,
                 stacklevel=3,
             )
+
+
+def _units(tally: NDArray[np.int64]) -> int:
+    return int(tally.sum(dtype=np.float64))
 
 
 class _Run:

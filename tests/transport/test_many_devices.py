@@ -13,7 +13,6 @@ from helpers.runs import PHOTONS, RUN, same
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp.result.photon_ids import IdQueue, count, joined, shard_of, without
-from spadwarp.transport.executor import Event, Executor
 from spadwarp_kernels.tally import tally
 
 # Photon ids
@@ -71,48 +70,6 @@ def test_tallies_of_two_devices_are_added(other, device, monkeypatch):
     assert np.array_equal(total.numpy(), a + b) and np.array_equal(more.numpy(), b)
     with pytest.raises(spadwarp_kernels.ArgumentError, match="shape \\(30,\\)"):
         spadwarp_kernels.add_tallies(total, wp.zeros(29, dtype=wp.int64, device=other))
-
-
-class Clockwork:
-    """Workers of given speeds [photons/s] on a clock of their own, which lose some time with each block."""
-
-    must_rest, timing, lost = True, {}, 1e-3
-
-    def __init__(self, speeds, first_block):
-        self.speeds, self.first_block, self.workers = speeds, first_block, list(range(len(speeds)))
-        self.ends, self.running, self.collecting, self.blocks = [0.0] * len(speeds), {}, [], 0
-
-    @property
-    def idle(self):
-        return [worker for worker in self.workers if worker not in self.running]
-
-    def trace(self, worker, block):
-        begin = max(self.ends[worker], self.now if self.blocks >= len(self.workers) else 0.0)
-        seconds = (block[1] - block[0]) / self.speeds[worker] + self.lost
-        self.running[worker], self.blocks = (begin + seconds, block, seconds), self.blocks + 1
-
-    def collect(self, worker):
-        self.collecting.append(worker)
-
-    def wait(self):
-        if self.collecting:
-            return [Event("collected", self.collecting.pop())]
-        worker = min(self.running, key=self.running.get)
-        self.ends[worker], block, seconds = self.running.pop(worker)
-        self.now = self.ends[worker]
-        return [Event("traced", worker, ((block,), seconds))]
-
-
-@pytest.mark.parametrize("speeds", [(1.7e9, 1.7e9), (1.7e9, 0.17e9), (1e9, 2e9, 3e9, 0.5e9)])
-def test_devices_of_any_speed_end_together_after_few_blocks(speeds):
-    workers, photons, nothing = Clockwork(speeds, 1 << 26), 10**10, lambda *_: None
-    done = Executor(workers, ((0, photons),), unit=1).run(
-        stopped=threading.Event(), report=nothing, checkpoint_due=lambda: False, checkpoint=nothing
-    )
-    assert done == ((0, photons),)
-    smallest = (1 << 22) / min(speeds) + workers.lost
-    assert max(workers.ends) - min(workers.ends) < smallest
-    assert workers.blocks < 12 * len(speeds)
 
 
 def test_the_stopping_rule_does_not_see_how_many_devices_there_are():

@@ -7,7 +7,7 @@ import warp as wp
 from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_kind
 
 from .ledger import atomic_add_int64
-from .tally import VOXEL_LIMIT, add_tallies, has_overflowed
+from .tally import VOXEL_LIMIT, add_tallies, has_overflowed, pieces
 
 # Copies of a component's sum, so that threads seldom add to one address at the same time.
 _SLOTS = wp.constant(4096)
@@ -169,9 +169,10 @@ class Batches:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
         device = self.total.device
         add_tallies(self.total, other.total)
-        more = [half.to(device) for half in other.second_moment]
-        outputs = list(self.second_moment)
-        wp.launch(add_squares_kernel, dim=more[0].size, inputs=more, outputs=outputs, device=device)
+        for piece in pieces(self.second_moment[0].size):
+            more = [half[piece].to(device) for half in other.second_moment]
+            outputs = [half[piece] for half in self.second_moment]
+            wp.launch(add_squares_kernel, dim=more[0].size, inputs=more, outputs=outputs, device=device)
         if has_overflowed(self.total, signed=self._signed):
             self._overflow.fill_(1)
         self.count += other.count

@@ -100,15 +100,20 @@ def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
     return bool(found.numpy()[0])
 
 
-# Integers of another device's tally that are copied at a time.
-_PIECE = 1 << 24
+# Integers of another device's tally that are copied at a time: few, since a tally may nearly fill a device.
+_PIECE = 1 << 22
+
+
+def pieces(size: int) -> list[slice]:
+    """Of so many integers, those that `_PIECE` allows at a time."""
+    return [slice(first, min(first + _PIECE, size)) for first in range(0, size, _PIECE)]
 
 
 @wp.kernel(enable_backward=False)
-def add_kernel(more: wp.array(dtype=wp.int64), first: int, total: wp.array(dtype=wp.int64)):
-    """Launch: integers of `more`, which belong to those of `total` from `first` on."""
+def add_kernel(more: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.int64)):
+    """Launch: integers."""
     i = wp.tid()
-    total[first + i] += more[i]
+    total[i] += more[i]
 
 
 def add_tallies(total: wp.array, more: wp.array) -> None:
@@ -119,9 +124,9 @@ def add_tallies(total: wp.array, more: wp.array) -> None:
     """
     check_array("total", total, wp.int64, (None,), contiguous=True)
     check_array("more", more, wp.int64, tuple(total.shape), contiguous=True)
-    for first in range(0, total.size, _PIECE):
-        piece = more[first : min(first + _PIECE, total.size)].to(total.device)
-        wp.launch(add_kernel, dim=piece.size, inputs=[piece, first], outputs=[total], device=total.device)
+    for piece in pieces(total.size):
+        part = more[piece].to(total.device)
+        wp.launch(add_kernel, dim=part.size, inputs=[part], outputs=[total[piece]], device=total.device)
 
 
 @wp.func
