@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
 from spadwarp.denoise.histogram_features import SEEN
+from spadwarp.denoise.repeatable import enlarged
 from spadwarp.denoise.scattered_light import LIGHT
 from spadwarp.denoise.sides import LIKENESS
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv
@@ -94,7 +95,7 @@ class Context(nn.Module):
             x = before(down(F.relu(x)))
         x = self.deep(x)
         for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
-            x = after(skip + F.interpolate(up(x), scale_factor=2.0, mode="bilinear", align_corners=False))
+            x = after(skip + enlarged(up(x), 2))
         x = F.relu(self.last(F.relu(x))).unflatten(1, (-1, GROUP))
         x = torch.cat([x.mean(dim=2), x.amax(dim=2), pixel], dim=1)
         scores, target = (head(x).float()[..., :height, :width] for head in (self.head, self.target))

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.pyramid import PyramidNet
+from spadwarp.denoise.repeatable import edge_padded
 from spadwarp.errors import ArgumentError
 
 __all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
@@ -45,7 +46,7 @@ class USDN(nn.Module):
         features = self.first(frame[:, :1]).unflatten(1, (4, 4)).amax(dim=2)
         features = torch.cat([scale(features) for scale in self.scales], dim=1)
         features = F.max_pool2d(features, 7, stride=1, padding=3)
-        depth = self.last(F.pad(features, (2, 3, 2, 3), mode="replicate"))
+        depth = self.last(edge_padded(features, 3)[..., 1:, 1:])
         if not self.training:  # while it learns, values beyond the bounds must have a slope
             depth = depth.clamp(0.0, 1.0)
         return depth

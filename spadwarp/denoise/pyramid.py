@@ -11,8 +11,10 @@ from torch import Tensor, nn
 from spadwarp.denoise.context import Context, answer
 from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import SEEN
+from spadwarp.denoise.repeatable import edge_padded, enlarged
 from spadwarp.denoise.selection import Selection, selected, selected_depth
 from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
+from spadwarp.denoise.two_surfaces import follow_the_others
 from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
 
 __all__ = ["CLOSE", "LONGEST_DELAY", "OUTPUTS", "PyramidNet"]
@@ -63,9 +65,10 @@ class PyramidNet(nn.Module):
     depth from the candidates among them, which replaces the reported one in all that follows: the most probable one,
     never the mean of two returns. The delay of scattered light, which the shape of the return shows, is subtracted from
     the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate, and `spadwarp.denoise.context`
-    weighs them with the view of a wide surrounding. A fifth output is the depth of
-    the candidates, and one for each candidate its logit. While it learns, there are also the candidates of the
-    selection and their scores, and the last answer; the depth is that before the selection.
+    weighs them with the view of a wide surrounding; then pixels with two returns follow those around that have the same
+    two (`spadwarp.denoise.two_surfaces`). A fifth output is the depth of the candidates, and one for each candidate its
+    logit. While it learns, there are also the candidates of the selection and their scores, and the last answer; the depth
+    is that before the selection.
     """
 
     radius = 2
@@ -170,6 +173,8 @@ class PyramidNet(nn.Module):
                 extra += [candidates - delay.detach(), scores, last - delay.detach()]
             else:
                 found, target = self._last(selected_depth(self.select, *seen), *seen[1:])
+                inside = ..., slice(height), slice(width)
+                found[inside] = follow_the_others(found[inside], seen[2][inside])
             found, others = found - delay, torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 
@@ -201,7 +206,7 @@ class PyramidNet(nn.Module):
             skipped.append(x)
             x = before(down(F.relu(x)))
         for level in reversed(range(len(skipped))):
-            finer = F.interpolate(self.up[level](x), scale_factor=2.0, mode="bilinear", align_corners=False)
+            finer = enlarged(self.up[level](x), 2)
             x = finer.add_(skipped[level])
             x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
         for layer in self.polish:
@@ -304,7 +309,7 @@ def _candidates(
         mean = F.avg_pool2d(mean, (side, 1), 1, (side // 2, 0))
         mean = F.avg_pool2d(mean, (1, side), 1, (0, side // 2))
         if coarse > 1:
-            mean = F.interpolate(mean, scale_factor=float(coarse), mode="bilinear", align_corners=False)
+            mean = enlarged(mean, coarse)
         share = mean[:, 1:] + 1e-6
         values += _windows(mean[:, :1] / share, 3, step)
         trusts += _windows(torch.log(share), 3, step)
@@ -315,7 +320,7 @@ def _windows(image: Tensor, side: int, step: int) -> list[Tensor]:
     """The values of an image `[B, 1, H, W]` at `side`² places `step` pixels apart around each pixel."""
     height, width = image.shape[-2:]
     reach = side // 2 * step
-    padded = F.pad(image, (reach, reach, reach, reach), mode="replicate")
+    padded = edge_padded(image, reach)
     starts = range(0, 2 * reach + 1, step)
     return [padded[..., y : y + height, x : x + width] for y in starts for x in starts]
 

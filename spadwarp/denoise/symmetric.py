@@ -15,6 +15,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from spadwarp.denoise.repeatable import permuted
+
 __all__ = ["GROUP", "SymmetricConv", "SymmetricWindow", "symmetric_mean", "turned"]
 
 GROUP = 8
@@ -48,6 +50,12 @@ def _expansion(size: int, channels: Literal[1, 8]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(np.stack(parts))).flatten()
 
 
+def _remember(module: nn.Module, places: Tensor) -> None:
+    """Gives a module the buffers `places`, of `_expansion`, and `inverse`, which are not saved with its weights."""
+    module.register_buffer("places", places.clone(), persistent=False)
+    module.register_buffer("inverse", places.view(GROUP, -1).argsort(dim=1), persistent=False)
+
+
 class SymmetricConv(nn.Module):
     """Convolution of features, or of an image's scalar channels with `lifts`, that commutes with `GROUP`.
 
@@ -69,17 +77,18 @@ class SymmetricConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(outputs, inputs, channels * size * size))
         nn.init.normal_(self.weight, std=(2.0 / (inputs * channels * size * size)) ** 0.5)
         self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
-        self.register_buffer("places", _expansion(size, channels).clone(), persistent=False)
+        _remember(self, _expansion(size, channels))
         self._kept: Tensor | None = None
 
     def expanded(self) -> Tensor:
         """The filters of an ordinary convolution, `[8 outputs, inputs, size, size]`."""
         if self._kept is not None and not torch.is_grad_enabled() and self._kept.device == self.weight.device:
             return self._kept
-        assert isinstance(self.places, Tensor)
+        assert isinstance(self.places, Tensor) and isinstance(self.inverse, Tensor)
         outputs, inputs = self.weight.shape[:2]
         shape = (outputs, inputs, GROUP, -1, self.size, self.size)
-        filters = self.weight.index_select(2, self.places).view(shape).transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        filters = permuted(self.weight, self.places, self.inverse).view(shape)
+        filters = filters.transpose(1, 2).flatten(2, 3).flatten(0, 1)
         if torch.is_grad_enabled() or self.training:
             return filters
         self._kept = filters.detach().contiguous(memory_format=torch.channels_last)
@@ -118,14 +127,16 @@ class SymmetricWindow(nn.Module):
         _, index = torch.unique(classes.flatten(1), dim=1, return_inverse=True)
         self.bias = nn.Parameter(torch.zeros(int(index.max()) + 1))
         self.register_buffer("classes", index, persistent=False)
-        self.register_buffer("places", _expansion(side, 1).clone(), persistent=False)
+        _remember(self, _expansion(side, 1))
 
     def filters(self) -> tuple[Tensor, Tensor]:
         """Weights `[side², 8 inputs]` and biases `[side²]` of a layer of 1 × 1 pixels."""
-        assert isinstance(self.places, Tensor) and isinstance(self.classes, Tensor)
+        assert isinstance(self.places, Tensor) and isinstance(self.inverse, Tensor)
+        assert isinstance(self.classes, Tensor)
         inputs, area = self.weight.shape
-        weight = self.weight.index_select(1, self.places).view(inputs * GROUP, area)
-        return weight.t(), self.bias.index_select(0, self.classes)
+        weight = permuted(self.weight, self.places, self.inverse).view(inputs * GROUP, area)
+        chosen = self.classes[:, None] == torch.arange(len(self.bias), device=self.bias.device)
+        return weight.t(), (chosen * self.bias).sum(dim=1)
 
     def forward(self, x: Tensor) -> Tensor:
         weight, bias = self.filters()

@@ -16,6 +16,7 @@ from torch import nn
 
 from spadwarp.denoise.networks import reads_histograms
 from spadwarp.denoise.recipe import Noise, TrainingRecipe
+from spadwarp.denoise.repeatable import fixed_order
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training_steps import Run, Trained, Workers
 from spadwarp.errors import ConfigError
@@ -33,6 +34,7 @@ _TIMED = 5  # steps after which the duration is foretold
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
 
 
+@fixed_order()
 def fit(
     recipe: TrainingRecipe,
     training: CleanScenes | None,

@@ -113,7 +113,6 @@ class Run:
     def __init__(self, recipe: TrainingRecipe, folder: Path, workers: Workers) -> None:
         self.recipe, self.folder, self.workers = recipe, folder, workers
         self.log, self.checkpoint = folder / "log.jsonl", folder / "checkpoint.pt"
-        torch.backends.cudnn.benchmark = torch.backends.cuda.matmul.allow_tf32 = workers.is_cuda
         torch.manual_seed(recipe.seed)
         network: Any = build_network(recipe.model)
         if recipe.start is not None:

@@ -1,0 +1,74 @@
+"""A seed gives the same weights each time, on a CPU and on a GPU: derivatives, and whole trainings."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+
+from spadwarp.denoise.recipe import MODELS, TrainingRecipe
+from spadwarp.denoise.repeatable import edge_padded, enlarged, fixed_order, permuted
+from spadwarp.denoise.training import fit
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def derivative(function, image, weights):
+    image = image.clone().requires_grad_()
+    return torch.autograd.grad((function(image) * weights).sum(), image)[0]
+
+
+def same_derivatives(one, other, image):
+    """Of sums with random weights, to rounding; the values are equal."""
+    values = other(image)
+    assert torch.equal(one(image), values)
+    weights = torch.randn_like(values)
+    torch.testing.assert_close(derivative(one, image, weights), derivative(other, image, weights))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (6, 3)])
+def test_derivatives_of_interpolation(shape, factor, device):
+    image = torch.randn(2, 3, *shape, dtype=torch.float64, device=device)
+    same_derivatives(
+        lambda x: enlarged(x, factor),
+        lambda x: F.interpolate(x, scale_factor=float(factor), mode="bilinear", align_corners=False),
+        image,
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("reach", [1, 6])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (6, 3)])
+def test_derivatives_of_padding(shape, reach, device):
+    image = torch.randn(2, 3, *shape, dtype=torch.float64, device=device)
+    same_derivatives(lambda x: edge_padded(x, reach), lambda x: F.pad(x, (reach,) * 4, mode="replicate"), image)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_derivatives_of_permutations(device):
+    rows = torch.stack([torch.randperm(9) for _ in range(8)]).to(device)
+    inverse = rows.argsort(dim=1)
+    image = torch.randn(2, 9, dtype=torch.float64, device=device)
+    same_derivatives(lambda x: permuted(x, rows.flatten(), inverse), lambda x: x[:, rows.flatten()], image)
+
+
+def test_settings_of_the_caller_come_back():
+    before = torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic
+    with pytest.raises(KeyError), fixed_order():
+        assert torch.backends.cudnn.deterministic and not torch.backends.cudnn.benchmark
+        raise KeyError
+    assert (torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("model", MODELS)
+def test_a_seed_gives_the_same_weights(model, device, tmp_path):
+    """Bit by bit; on a GPU also of the steps that are replayed as a CUDA graph."""
+    steps = 40 if device == "cuda" else 2
+    optimiser = {"steps": steps, "batch": 2, "crop": 32, "scenes": 4, "redraw": 10, "warm_up": 1, "report_every": steps}
+    noise = {"counting": 1.0} if model == "histograms" else {}
+    recipe = TrainingRecipe.from_dict({"model": model, "seed": 3, "optimiser": optimiser, "noise": noise})
+    first, second = (load_file(fit(recipe, None, None, tmp_path / name, device=device).weights) for name in "ab")
+    assert all(torch.equal(values, second[name]) for name, values in first.items())

@@ -1,0 +1,87 @@
+"""Pixels with two returns follow the others that see the same two surfaces."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from spadwarp.denoise import estimate
+from spadwarp.denoise.histogram_features import FEATURES, SEEN
+from spadwarp.denoise.two_surfaces import follow_the_others
+
+NEAR, FAR = 0.4, 0.5
+
+
+def seen(answers, own=60.0, other=50.0):
+    """Answers `[H, W]`, and features: each pixel has both returns, that of its answer by `own` nats, the other by
+    `other`."""
+    found = torch.as_tensor(answers, dtype=torch.float32)[None, None]
+    features = torch.zeros(1, FEATURES, *found.shape[-2:])
+    features[:, :1], features[:, 1:2] = found - 0.5, NEAR + FAR - found - 0.5
+    features[:, SEEN], features[:, SEEN + 1] = 0.1 * own, 0.1 * other
+    return found, features
+
+
+def one_of(others, own, size=9):
+    answers = np.full((size, size), others)
+    answers[size // 2, size // 2] = own
+    return answers
+
+
+@pytest.mark.parametrize("others, own", [(NEAR, FAR), (FAR, NEAR)])
+def test_a_single_pixel_follows_the_others(others, own):
+    answer = follow_the_others(*seen(one_of(others, own)))
+    assert torch.allclose(answer, torch.tensor(others))
+
+
+def test_it_stays_where_its_photons_differ_by_more_than_chance():
+    """400 nats are about 80 photons: 4400 against 3600 differ by four deviations."""
+    found, features = seen(one_of(FAR, NEAR), own=4400.0, other=3600.0)
+    assert torch.equal(follow_the_others(found, features), found)
+
+
+def test_it_stays_where_the_others_do_not_see_both_surfaces():
+    found, features = seen(one_of(FAR, NEAR))
+    features[:, SEEN + 1] = 0.0
+    features[:, SEEN + 1, 4, 4] = 5.0
+    assert torch.equal(follow_the_others(found, features), found)
+
+
+def test_edges_and_other_depths_stay():
+    """Half of the image has the one surface, half the other; and an answer that is neither of both."""
+    answers = np.full((9, 9), FAR)
+    answers[:, :4] = NEAR
+    found, features = seen(answers)
+    assert torch.equal(follow_the_others(found, features), found)
+    found, features = seen(one_of(FAR, NEAR))
+    found[:, :, 4, 4] = 0.45
+    assert torch.equal(follow_the_others(found, features), found)
+
+
+def test_it_moves_at_corners_and_turns_with_the_image():
+    answers = np.full((7, 8), FAR)
+    answers[0, 0] = answers[3, 6] = answers[6, 2] = NEAR
+    found, features = seen(answers)
+    plain = follow_the_others(found, features)
+    assert torch.allclose(plain, torch.tensor(FAR))
+    turned = follow_the_others(found.flip(2).mT, features.flip(2).mT)
+    assert torch.equal(turned, plain.flip(2).mT)
+
+
+def test_of_two_returns_the_stronger_one_is_found():
+    """65 and 35 % of 30 photons a pixel: by photons alone one pixel in 20 takes the weaker, in the end one in 500.
+
+    The weaker return is 20 bins nearer. 19.5 and 10.5 photons: P(second > first) = P(z > 9 / √30) = 0.05.
+    """
+    bins, edges = 128, np.arange(129.0)
+    first, second = (np.diff(norm.cdf(edges - place, scale=1.2)) for place in (80.3, 60.3))
+    rate = np.broadcast_to(19.5 * first + 10.5 * second + 6.0 / bins, (48, 48, bins))
+    counts = np.random.default_rng(4).poisson(rate).astype(np.float32)
+    taps = np.diff(norm.cdf(np.arange(-4.5, 5.0), scale=1.2))
+    depth = 10.0 + 2.56 * (counts.argmax(axis=-1) + 0.5) / bins
+    assert np.mean(np.abs(depth - 11.606) > 0.2) > 0.01
+    flat = np.full(bins, 6.0 / bins)
+    found = estimate(
+        depth, gate=(10.0, 12.56), model="histograms", counts=counts, background=flat, response=taps / taps.sum()
+    )
+    assert np.mean(np.abs(found.depth - 11.606) > 0.2) < 0.002
