@@ -67,8 +67,8 @@ class PyramidNet(nn.Module):
     the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate, and `spadwarp.denoise.context`
     weighs them with the view of a wide surrounding; then pixels with two returns follow those around that have the same
     two (`spadwarp.denoise.two_surfaces`). A fifth output is the depth of the candidates, and one for each candidate its
-    logit. While it learns, there are also the candidates of the selection and their scores, and the last answer; the depth
-    is that before the selection.
+    logit. While it learns, there are also the candidates of the selection and their scores, and the last answer; the
+    depth is that before the selection.
     """
 
     radius = 2

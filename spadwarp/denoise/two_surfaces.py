@@ -4,7 +4,7 @@ Where a pixel sees two surfaces, through a net or at a veil of turbid water, the
 parts of the light change little from pixel to pixel, but photons are few: by chance, some pixels have more of the
 weaker surface. Their own photons then speak for it so clearly that no smoothing moves them; those of the pixels around
 with the same two returns tell which is the stronger one. A pixel whose photons differ by more than chance stays as it
-is, and so do edges of depth: there, pixels with both returns lie along a line, and those of the one side have its depth.
+is, and so do edges of depth: there, pixels with both returns lie along a line, and those of one side have its depth.
 """
 
 from __future__ import annotations
