@@ -241,6 +241,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
     """The compile-time choices of a scene and of the derivatives asked for; `choices` override them."""
     kinds, by_block = derivative_kinds(scene, derivatives)
+    tracking = grid_tracking(scene)
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
@@ -259,13 +260,28 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         port=port_kind(camera_port(scene)),
         laser_port=port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
-        grid=grid_tracking(scene),
+        grid=tracking,
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
+        points=_points(scene, by_block, tracking),
         channels=len(scene.camera.tallied_channels),
     )
     return spec._replace(**choices)
+
+
+def _points(scene: Scene, by_block: Sequence[str], tracking: Any) -> int:
+    """Points at which a flight is scored."""
+    points = scene.transport.points_per_flight
+    if points > 1 and (
+        scene.transport.estimator != "guided" or scene.domain.reflecting or by_block or tracking is sk.DELTA_TRACKING
+    ):
+        raise config_error(
+            scene,
+            f'transport.points_per_flight = {points}: more than 1 goes with estimator = "guided", and without faces that '
+            "reflect, derivatives by block and delta tracking",
+        )
+    return points
 
 
 def _laser(scene: Scene, device: wp.Device) -> Any:

@@ -6,8 +6,7 @@ from spadwarp_kernels.math.bits import bits_of, from_bits
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.lanes import (
     ADD_ENTRY,
-    LONG_QUEUE_ENTRIES,
-    QUEUE_ENTRIES,
+    MOST_LEFT,
     count_lanes_before,
     make_warp_memory,
     queue_size,
@@ -15,6 +14,7 @@ from spadwarp_kernels.photon.lanes import (
 )
 
 from .contribution import Request
+from .points import make_point_of
 
 # A request's 24 bits for the tally share a word with its component.
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
@@ -32,7 +32,14 @@ def _among_takers(lane: int, takes: bool) -> int:
 
 @made_once
 def make_queue(
-    flights: bool, used: bool, long: bool, traces: bool, confocal: bool, derivatives: int = 0, polarised: bool = False
+    flights: bool,
+    used: bool,
+    long: bool,
+    traces: bool,
+    confocal: bool,
+    derivatives: int = 0,
+    polarised: bool = False,
+    points: int = 1,
 ) -> tuple[wp.Function, wp.Function, wp.Function]:
     """Three Warp functions: ``warp_memory()``, see `make_warp_memory`; ``push(memory, request)`` adds what is wanted;
     ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take one.
@@ -45,13 +52,14 @@ def make_queue(
         confocal: Whether they have a target.
         derivatives: How many scores requests have.
         polarised: Whether they have a Stokes vector.
+        points: At how many points a flight is scored, each by an entry of its own.
     """
     more, rank_of = flights or confocal, _among_takers if traces else _lane
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
-    entries = int(LONG_QUEUE_ENTRIES if long else QUEUE_ENTRIES)
+    entries = MOST_LEFT + 32 * (points + 1 if long else points)
     vectors = first_score + (1 if polarised else score_vectors)
-    warp_memory = make_warp_memory(vectors * entries if used else 0)
+    warp_memory, point_of = make_warp_memory(vectors * entries if used else 0), make_point_of(points)
 
     @wp.func
     def write(memory: int, entry: int, request: Request):
@@ -94,6 +102,10 @@ def make_queue(
         if wp.static(used):
             if request.wanted:
                 write(memory, queue_size(memory, ADD_ENTRY, 0), request)
+                if wp.static(points > 1):
+                    if request.interval[0] < request.interval[1]:
+                        for i in range(wp.static(points - 1)):
+                            write(memory, queue_size(memory, ADD_ENTRY, 0), point_of(request, i + 1))
 
     @wp.func
     def pop(memory: int, lane: int, takes: bool, size: int, count: int) -> Request:

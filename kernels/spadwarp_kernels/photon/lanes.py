@@ -111,9 +111,8 @@ def take_photons(cursor: wp.array(dtype=int)) -> int:
     ...
 
 
-# Entries of a warp's queue: 31 requests that wait and 32 that come, or 64, a flight and an event of each lane.
-QUEUE_ENTRIES = wp.constant(63)
-LONG_QUEUE_ENTRIES = wp.constant(95)
+# Requests that a warp's queue may hold when new ones come.
+MOST_LEFT = 31
 
 
 @wp.func_native(f"""

@@ -10,6 +10,7 @@ from spadwarp_kernels.sensor.projection import PLAIN, Lens
 
 # Meshes of at most this many faces need no BVH.
 BRUTE_FORCE_FACES = 12
+MOST_POINTS = 4
 
 
 class TransportSpec(NamedTuple):
@@ -48,6 +49,8 @@ class TransportSpec(NamedTuple):
             BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`.
         polarised: Photons carry a Stokes vector, and scores are of the light that it stands for, see
             `Model.polarisation`.
+        points: At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`,
+            `blocks` and DELTA_TRACKING.
         channels: What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a
             tally of its own.
     """
@@ -77,6 +80,7 @@ class TransportSpec(NamedTuple):
     derivatives: tuple[str, ...] = ()
     blocks: tuple[str, ...] = ()
     polarised: bool = False
+    points: int = 1
     channels: int = 0
 
     @property

@@ -18,6 +18,7 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_vector,
 )
+from spadwarp_kernels.estimators.contribution import takes_collisions
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
 from spadwarp_kernels.medium.grid import Grid
@@ -28,7 +29,7 @@ from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.phase.tabulated import TABULATED
 from spadwarp_kernels.photon.records import Records
-from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, TransportSpec
+from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, MOST_POINTS, TransportSpec
 from spadwarp_kernels.polarisation.request import MATRIX_POINTS, MOST_CHANNELS, Polarisation
 from spadwarp_kernels.port.kinds import PortKind, check_port
 from spadwarp_kernels.random.density_tables import TABLE_CELLS
@@ -99,6 +100,12 @@ def check_spec(spec: Any) -> None:
             "spec.merged goes with guided and next_event, without spec.reflecting, spec.derivatives and spec.channels"
         )
     _check_kinds(spec)
+    check_integer("spec.points", spec.points, 1, MOST_POINTS)
+    if spec.points > 1 and (spec.estimator != "guided" or spec.reflecting or spec.blocks or takes_collisions(spec)):
+        raise ArgumentError(
+            f"spec.points = {spec.points}: more than 1 goes with spec.estimator = 'guided', without spec.reflecting, "
+            "spec.blocks and DELTA_TRACKING"
+        )
     check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
     if spec.polarised and (spec.derivatives or spec.blocks):
         raise ArgumentError("spec.polarised goes without spec.derivatives and spec.blocks")

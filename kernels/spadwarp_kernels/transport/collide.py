@@ -17,7 +17,7 @@ from spadwarp_kernels.medium.limits import (
     is_outside_rotated,
 )
 from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.photon.lanes import QUEUE_ENTRIES
+from spadwarp_kernels.photon.lanes import MOST_LEFT
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
 from spadwarp_kernels.surface.trace import offset_from_surface
@@ -116,7 +116,7 @@ def make_arrives(flights: bool, traces: bool, queues: bool, at_once: bool) -> tu
     def has_room(s: PhotonState, queued: int) -> bool:
         room = bool(True)
         if wp.static(traces and queues):
-            room = queued <= QUEUE_ENTRIES - 32
+            room = queued <= wp.static(MOST_LEFT)
         if wp.static(traces and not queues):
             room = not s.hidden
         return room

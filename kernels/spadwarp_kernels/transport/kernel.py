@@ -16,6 +16,7 @@ from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_his
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
+from spadwarp_kernels.estimators.points import make_score_points
 from spadwarp_kernels.estimators.queue import make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
@@ -119,11 +120,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     warp_memory, push, pop = make_queue(
-        flights, queues, at_once, has_bvh, confocal, len(spec.derivatives), spec.polarised
+        flights, queues, at_once, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points
     )
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
-    score_images = make_score_images(spec, flights, brute_force)
+    score_more, scores_more = make_score_images(spec, flights, brute_force), reflecting
+    if spec.points > 1 and not queues:
+        score_more, scores_more = make_score_points(spec, score, look), True
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
 
@@ -271,8 +274,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.origin = found.origin
                                     s.lens = found.lens
                                     s.pending = found.contribution
-                            if wp.static(reflecting):
-                                more = score_images(
+                            if wp.static(scores_more):
+                                more = score_more(
                                     asked.request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
                                     polarisation, tally, gradients, ledger, s.pending_add, thread, scale)  # fmt: skip
                                 s.contributions += more.contributions

@@ -1,0 +1,93 @@
+"""More points of a flight than one: each is scored with its part of the weight.
+
+What a pixel's bin holds is noisy above all since few flights are scored in it; the points of a flight lie in others.
+"""
+
+import warp as wp
+
+from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.medium.layers import Layers
+from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.polarisation.request import Polarisation
+from spadwarp_kernels.sensor.camera import Camera
+from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.trace import intersect_surfaces
+from spadwarp_kernels.tally.scores import Derivatives, make_deposit
+
+from .contribution import Request
+from .mirrored import MirroredScores
+
+
+@made_once
+def make_point_of(points: int) -> wp.Function:
+    """The Warp function ``(request, number) -> Request``: of a flight, that of another of its points.
+
+    The second random number of a point is a part of 1 further than that of the one before, modulo 1: each is uniform,
+    and together they are spread evenly (systematic sampling). The first, which picks one of two densities, does so, too.
+    """
+    step = (1 << 32) // points
+
+    @wp.func
+    def point_of(request: Request, number: int) -> Request:
+        other = request
+        other.first = request.first + wp.uint32(number) * wp.uint32(wp.static(step))
+        other.second = request.second + wp.uint32(number) * wp.uint32(wp.static(step))
+        return other
+
+    return point_of
+
+
+@made_once
+def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function) -> wp.Function:
+    """The Warp function with the arguments of `make_score_images` that scores a flight at all points but the first,
+    where each thread scores its own requests; shadow rays are traced on the spot."""
+    points, point_of, deposit = spec.points, make_point_of(spec.points), make_deposit(spec.signed)
+    has_mesh = spec.mesh
+
+    @wp.func
+    def score_points(
+        request: Request,
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        gate: Gate,
+        limits: Limits,
+        surfaces: Surfaces,
+        scan: Scan,
+        derivatives: Derivatives,
+        polarisation: Polarisation,
+        tally: wp.array(dtype=wp.int64),
+        gradients: wp.array(dtype=wp.int64),
+        ledger: wp.array(dtype=wp.int64),
+        pending_add: wp.vec2l,
+        thread: int,
+        scale: float,
+    ) -> MirroredScores:
+        scores = MirroredScores()
+        scores.pending_add = pending_add
+        if request.wanted and request.interval[0] < request.interval[1]:
+            for i in range(wp.static(points - 1)):
+                other = point_of(request, i + 1)
+                found = score(other, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation)
+                if not found.contribution.value <= 0.0:  # NaN is counted as such
+                    scores.contributions += 1
+                    found = look(found, camera, surfaces)
+                    scores.shadow_queries += found.shadow_queries
+                    if wp.static(has_mesh):
+                        if not found.seen:
+                            to = found.lens - found.origin
+                            way = wp.length(to)
+                            scores.shadow_queries += 1
+                            hit = intersect_surfaces(surfaces, found.origin, to / way, way, True)
+                            found.seen = hit.face < 0
+                    if found.seen and not found.contribution.value <= 0.0:
+                        scores.pending_add = deposit(
+                            tally, gradients, ledger, scores.pending_add, thread, scale, derivatives, found.contribution
+                        )
+        return scores
+
+    return score_points
