@@ -21,7 +21,7 @@ class Transport(Section):
     estimator: Literal["analog", "next_event", "guided"] = "guided"
     """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;
     `spadwarp.transport.trace` uses it"""
-    points_per_flight: Whole = Field(1, ge=1, le=4)
+    points_per_flight: Whole = Field(1, ge=1, le=3)
     """points at which `guided` scores a flight; more leave less noise in the bins of a pixel and take longer"""
     termination: Literal["cutoff", "roulette"] = "cutoff"
     """drop light photons (biased), or Russian roulette"""

@@ -278,7 +278,7 @@ def _points(scene: Scene, by_block: Sequence[str], tracking: Any) -> int:
     ):
         raise config_error(
             scene,
-            f'transport.points_per_flight = {points}: more than 1 goes with estimator = "guided", and without faces that '
+            f'transport.points_per_flight = {points}: more than 1 goes with estimator = "guided", without faces that '
             "reflect, derivatives by block and delta tracking",
         )
     return points

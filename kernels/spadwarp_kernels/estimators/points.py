@@ -26,8 +26,8 @@ from .mirrored import MirroredScores
 def make_point_of(points: int) -> wp.Function:
     """The Warp function ``(request, number) -> Request``: of a flight, that of another of its points.
 
-    The second random number of a point is a part of 1 further than that of the one before, modulo 1: each is uniform,
-    and together they are spread evenly (systematic sampling). The first, which picks one of two densities, does so, too.
+    Both random numbers of a point are a part of 1 further than those of the one before, modulo 1: those of each are
+    uniform, and together they are spread evenly (systematic sampling).
     """
     step = (1 << 32) // points
 

@@ -8,13 +8,14 @@ from spadwarp_kernels.photon.lanes import (
     ADD_ENTRY,
     MOST_LEFT,
     count_lanes_before,
+    fits_in_block,
     make_warp_memory,
     queue_size,
     queue_vector,
 )
+from spadwarp_kernels.photon.spec import TransportSpec
 
 from .contribution import Request
-from .points import make_point_of
 
 # A request's 24 bits for the tally share a word with its component.
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
@@ -28,6 +29,17 @@ def _lane(lane: int, takes: bool) -> int:
 @wp.func
 def _among_takers(lane: int, takes: bool) -> int:
     return count_lanes_before(takes)
+
+
+def queue_entries(points: int, long: bool) -> int:
+    """Of a warp: requests that wait, and those that come, of flights by their points, with `long` an event as well."""
+    return MOST_LEFT + 32 * (points + 1 if long else points)
+
+
+def long_queue_fits(spec: TransportSpec) -> bool:
+    """Whether a block's shared memory holds a `long` queue of flights."""
+    vectors = 4 + (1 if spec.polarised else -(-len(spec.derivatives) // 4))
+    return fits_in_block(vectors * queue_entries(spec.points, True))
 
 
 @made_once
@@ -52,14 +64,14 @@ def make_queue(
         confocal: Whether they have a target.
         derivatives: How many scores requests have.
         polarised: Whether they have a Stokes vector.
-        points: At how many points a flight is scored, each by an entry of its own.
+        points: Requests that a flight adds, one for each of its points.
     """
     more, rank_of = flights or confocal, _among_takers if traces else _lane
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
-    entries = MOST_LEFT + 32 * (points + 1 if long else points)
+    entries = queue_entries(points, long)
     vectors = first_score + (1 if polarised else score_vectors)
-    warp_memory, point_of = make_warp_memory(vectors * entries if used else 0), make_point_of(points)
+    warp_memory = make_warp_memory(vectors * entries if used else 0)
 
     @wp.func
     def write(memory: int, entry: int, request: Request):
@@ -102,10 +114,6 @@ def make_queue(
         if wp.static(used):
             if request.wanted:
                 write(memory, queue_size(memory, ADD_ENTRY, 0), request)
-                if wp.static(points > 1):
-                    if request.interval[0] < request.interval[1]:
-                        for i in range(wp.static(points - 1)):
-                            write(memory, queue_size(memory, ADD_ENTRY, 0), point_of(request, i + 1))
 
     @wp.func
     def pop(memory: int, lane: int, takes: bool, size: int, count: int) -> Request:

@@ -63,6 +63,11 @@ _MEMORY = """
 """
 
 
+def fits_in_block(vectors: int) -> bool:
+    """Whether a block has the shared memory, 48 KiB, for queues of so many vec4 in each of its warps."""
+    return 16 * (_QUEUE + vectors) * BLOCK_SIZE // 32 <= 48 * 1024
+
+
 @made_once
 def make_warp_memory(vectors: int) -> wp.Function:
     """The Warp function ``() -> int``: where the shared memory of a warp begins, with so many vec4 in its queue; CUDA

@@ -10,7 +10,7 @@ from spadwarp_kernels.sensor.projection import PLAIN, Lens
 
 # Meshes of at most this many faces need no BVH.
 BRUTE_FORCE_FACES = 12
-MOST_POINTS = 4
+MOST_POINTS = 3
 
 
 class TransportSpec(NamedTuple):
