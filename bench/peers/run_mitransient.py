@@ -108,6 +108,7 @@ if __name__ == "__main__":
         more={
             "seeds": (16, "runs whose spread is the error; 0: no errors"),
             "roulette-from": (5, "mitransient's rr_depth"),
+            "points-per-flight": (1, "of spadwarp, in the comparison of variance x time"),
         },
     )
     seeds, roulette_from = args.seeds, args.roulette_from
@@ -144,11 +145,13 @@ if __name__ == "__main__":
         took = time.perf_counter() - began
         return np.array(film, dtype=np.float64)[..., 0], took
 
-    ours_scene = spadwarp.Scene.from_dict(CASES["staircase_5m_guided"].scene)
+    our_scene = spadwarp.Scene.from_dict(CASES["staircase_5m_guided"].scene).with_overrides(
+        {"transport.points_per_flight": args.points_per_flight}
+    )
 
     def ours(seed: int) -> tuple[np.ndarray, float]:
         # Long enough that the way of the histogram to the host does not count.
-        result = spadwarp.simulate(ours_scene, photons=10 * args.photons, seed=seed, device=args.device)
+        result = spadwarp.simulate(our_scene, photons=10 * args.photons, seed=seed, device=args.device)
         return result.histogram, result.timing["trace"]
 
     def run() -> None:

@@ -42,6 +42,20 @@ def make_point_of(points: int) -> wp.Function:
 
 
 @made_once
+def make_push_points(points: int, push: wp.Function) -> wp.Function:
+    """The Warp function ``(memory, request)``: `push` of `make_queue` for each of the points of a flight."""
+    point_of = make_point_of(points)
+
+    @wp.func
+    def push_points(memory: int, request: Request):
+        push(memory, request)
+        for i in range(wp.static(points - 1)):
+            push(memory, point_of(request, i + 1))
+
+    return push if points == 1 else push_points
+
+
+@made_once
 def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function) -> wp.Function:
     """The Warp function with the arguments of `make_score_images` that scores a flight at all points but the first,
     where each thread scores its own requests; shadow rays are traced on the spot."""

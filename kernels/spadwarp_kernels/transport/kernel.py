@@ -16,7 +16,7 @@ from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_his
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
-from spadwarp_kernels.estimators.points import make_point_of, make_score_points
+from spadwarp_kernels.estimators.points import make_push_points, make_score_points
 from spadwarp_kernels.estimators.queue import long_queue_fits, make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
@@ -125,7 +125,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     )
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
-    point_of = make_point_of(spec.points)
+    push_flight = make_push_points(spec.points, push)
     score_more, scores_more = make_score_images(spec, flights, brute_force), reflecting
     if spec.points > 1 and not queues:
         score_more, scores_more = make_score_points(spec, score, look), True
@@ -212,9 +212,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     if wp.static(flights):
                         if (wp.static(at_once) or round == 0) and flown(s, queued, flying):
                             asked.request = request_flight(s)
-                            push(memory, asked.request)
-                            for i in range(wp.static(spec.points - 1)):
-                                push(memory, point_of(asked.request, i + 1))
+                            push_flight(memory, asked.request)
                             s.flight.interval = wp.vec2(0.0, 0.0)
                     if round == 1 and arrives(s, queued, flying):
                         if wp.static(crosses):

@@ -1,0 +1,92 @@
+"""Several points of a flight: the expectation of one point, less noise in the bins of a pixel, and what is refused."""
+
+import numpy as np
+import pytest
+
+import spadwarp
+import spadwarp_kernels as sk
+from helpers.estimators import cells
+from helpers.scenes import scene
+from helpers.statistics_of_samples import equal_means_p
+from spadwarp.errors import ConfigError
+from spadwarp_kernels.transport.checks import check_spec
+
+BARS = [
+    {"builtin": "box", "size": [3.0, 3.0, 0.1], "translation": [0.0, 0.0, 2.3], "reflectance": 0.7},
+    {"builtin": "box", "size": [0.3, 2.0, 0.4], "translation": [-0.3, 0.0, 1.8], "reflectance": 0.5},
+    {"builtin": "box", "size": [0.3, 2.0, 0.4], "translation": [0.4, 0.0, 1.5], "reflectance": 0.5},
+]
+LAYERS = {"layers": [{"start": 0.8, "extinction": 1.0, "albedo": 0.6}]}
+
+
+def with_points(one, points):
+    return one.with_overrides({"transport.estimator": "guided", "transport.points_per_flight": points})
+
+
+@pytest.mark.physics
+@pytest.mark.slow
+@pytest.mark.parametrize("sections, points", [({}, 2), ({"targets": BARS}, 3), ({"medium": LAYERS}, 3)])
+def test_more_points_have_the_expectation_of_one(sections, points, device):
+    """A plate; boxes that hide water from the lens, so that later points trace shadow rays of their own; layers."""
+    one, more = (cells(with_points(scene(**sections), n), device, 15_000, pixels=True) for n in (1, points))
+    assert equal_means_p(one, more) > 1e-3
+    for found in (one, more):
+        assert found.sum(axis=1).std() / found.sum(axis=1).mean() / np.sqrt(len(found)) < 0.015
+
+
+@pytest.mark.physics
+def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
+    """Variance of 32 × 32 pixels' bins in water over 24 seeds: 1/2 and 1/3 if they were independent, a little more as
+    the points of a flight share its photon."""
+    sections = {
+        "camera": {"width": 32, "height": 32, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+        "gate": {"bins": 16, "bin_width_ps": 1000.0},
+        "targets": [],
+    }
+
+    def variance(points):
+        one = with_points(scene(**sections), points)
+        light = [spadwarp.simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
+        return np.var(light, axis=0).sum(axis=(0, 1))[2:8]
+
+    single, double, triple = (variance(points) for points in (1, 2, 3))
+    assert 0.4 < np.median(double / single) < 0.7
+    assert 0.25 < np.median(triple / single) < 0.55
+
+
+def test_derivatives_and_more_points(device):
+    """The derivative by the albedo's scattering is that of the same light: sums over all bins agree within errors."""
+
+    def totals(points):
+        one = with_points(scene(), points)
+        rows = []
+        for seed in range(12):
+            result = spadwarp.simulate(one, photons=20_000, seed=seed, device=device, derivatives=["medium.scattering"])
+            rows.append(result.derivatives["medium.scattering"].sum())
+        return np.array(rows)
+
+    one, two = totals(1), totals(2)
+    assert abs(one.mean() - two.mean()) < 4 * np.sqrt((one.var(ddof=1) + two.var(ddof=1)) / 12)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"transport.estimator": "next_event"},
+        {"domain": {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}}},
+    ],
+)
+def test_what_goes_with_one_point_alone_is_refused(changes, device):
+    one = scene().with_overrides({"transport.points_per_flight": 2, **changes})
+    with pytest.raises(ConfigError, match=r"transport.points_per_flight = 2: more than 1 goes with"):
+        spadwarp.simulate(one, photons=100, device=device)
+    with pytest.raises(ConfigError, match="points_per_flight"):
+        scene(transport={"points_per_flight": 4})
+
+
+def test_the_kernel_library_refuses_it_too():
+    for wrong in ({"estimator": "next_event"}, {"reflecting": True, "bounded": True}, {"grid": sk.DELTA_TRACKING}):
+        with pytest.raises(sk.ArgumentError, match=r"spec.points = 2: more than 1 goes with"):
+            check_spec(sk.TransportSpec(**{"estimator": "guided", "points": 2, **wrong}))
+    with pytest.raises(sk.ArgumentError, match=r"spec.points = 4 .* \[1, 3\]"):
+        check_spec(sk.TransportSpec(estimator="guided", points=4))
