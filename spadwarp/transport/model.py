@@ -264,13 +264,13 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
-        points=_points(scene, by_block, tracking),
+        points=_points(scene, kinds, by_block, tracking),
         channels=len(scene.camera.tallied_channels),
     )
     return spec._replace(**choices)
 
 
-def _points(scene: Scene, by_block: Sequence[str], tracking: Any) -> int:
+def _points(scene: Scene, kinds: Sequence[str], by_block: Sequence[str], tracking: Any) -> int:
     """Points at which a flight is scored."""
     points = scene.transport.points_per_flight
     if points > 1 and (
@@ -281,6 +281,8 @@ def _points(scene: Scene, by_block: Sequence[str], tracking: Any) -> int:
             f'transport.points_per_flight = {points}: more than 1 goes with estimator = "guided", without faces that '
             "reflect, derivatives by block and delta tracking",
         )
+    if points > 2 and len(kinds) > 4:
+        raise config_error(scene, f"transport.points_per_flight = {points} goes with up to 4 derivatives; take 2")
     return points
 
 

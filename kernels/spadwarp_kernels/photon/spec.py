@@ -50,7 +50,7 @@ class TransportSpec(NamedTuple):
         polarised: Photons carry a Stokes vector, and scores are of the light that it stands for, see
             `Model.polarisation`.
         points: At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`,
-            `blocks` and DELTA_TRACKING.
+            `blocks` and DELTA_TRACKING, three with up to 4 derivatives.
         channels: What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a
             tally of its own.
     """

@@ -100,7 +100,8 @@ def check_spec(spec: Any) -> None:
             "spec.merged goes with guided and next_event, without spec.reflecting, spec.derivatives and spec.channels"
         )
     _check_kinds(spec)
-    check_integer("spec.points", spec.points, 1, MOST_POINTS)
+    # A block has 48 KiB of shared memory for queues.
+    check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
     if spec.points > 1 and (spec.estimator != "guided" or spec.reflecting or spec.blocks or takes_collisions(spec)):
         raise ArgumentError(
             f"spec.points = {spec.points}: more than 1 goes with spec.estimator = 'guided', without spec.reflecting, "
