@@ -273,14 +273,16 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
 def _points(scene: Scene, kinds: Sequence[str], by_block: Sequence[str], tracking: Any) -> int:
     """Points at which a flight is scored."""
     points = scene.transport.points_per_flight
-    if points > 1 and (
-        scene.transport.estimator != "guided" or scene.domain.reflecting or by_block or tracking is sk.DELTA_TRACKING
-    ):
-        raise config_error(
-            scene,
-            f'transport.points_per_flight = {points}: more than 1 goes with estimator = "guided", without faces that '
-            "reflect, derivatives by block and delta tracking",
-        )
+    estimator = scene.transport.estimator
+    against = {
+        f'estimator = "{estimator}"': estimator != "guided",
+        "faces of the domain that reflect": bool(scene.domain.reflecting),
+        "derivatives by block": bool(by_block),
+        'medium.grid.tracking = "delta"': tracking is sk.DELTA_TRACKING,
+    }
+    if points > 1 and any(against.values()):
+        names = " and ".join(name for name, found in against.items() if found)
+        raise config_error(scene, f"transport.points_per_flight = {points} does not go with {names}; take 1")
     if points > 2 and len(kinds) > 4:
         raise config_error(scene, f"transport.points_per_flight = {points} goes with up to 4 derivatives; take 2")
     return points

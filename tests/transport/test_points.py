@@ -70,15 +70,21 @@ def test_derivatives_and_more_points(device):
 
 
 @pytest.mark.parametrize(
-    "changes",
+    "changes, named",
     [
-        {"transport.estimator": "next_event"},
-        {"domain": {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}}},
+        ({"transport.estimator": "next_event"}, 'estimator = "next_event"'),
+        (
+            {
+                "transport.estimator": "guided",
+                "domain": {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}},
+            },
+            "faces of the domain that reflect",
+        ),
     ],
 )
-def test_what_goes_with_one_point_alone_is_refused(changes, device):
+def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
     one = scene().with_overrides({"transport.points_per_flight": 2, **changes})
-    with pytest.raises(ConfigError, match=r"transport.points_per_flight = 2: more than 1 goes with"):
+    with pytest.raises(ConfigError, match=f"transport.points_per_flight = 2 does not go with {named}; take 1"):
         spadwarp.simulate(one, photons=100, device=device)
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})
