@@ -22,7 +22,7 @@ from spadwarp.dataset.sampling import Plan
 from spadwarp.dataset.shards import write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.atomic import atomic_path, remove_temporaries
 from spadwarp.io.lock import lock
 from spadwarp.io.parsing import parse_toml, read_toml
 from spadwarp.io.text import write_json
@@ -143,6 +143,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
                 record.unlink(missing_ok=True)
             except OSError as error:
                 raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
+            remove_temporaries(record)
             written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
             write_json(written, record, indent=1)
     return shard.scenes * plan.frames_per_scene

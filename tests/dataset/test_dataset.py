@@ -211,6 +211,16 @@ def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
     assert before and all(kept[name] == changed for name, changed in before.items())
 
 
+def test_what_a_killed_process_left_unfinished_is_removed_with_its_shard(tmp_path):
+    """A process may be killed between the first byte and the last of a shard's frames or of its record."""
+    small, out = recipe(**{"frames.per_scene": 1}), tmp_path / "data"
+    make(small, out, part=(1, 6))
+    for left in (".frames-00001.h5.0123456789abcdef.tmp", "shards/.00001.json.0123456789abcdef.tmp"):
+        (out / left).write_bytes(b"begun")
+    make(small, out, part=(2, 6))
+    assert (out / "frames-00001.h5").is_file() and not list(out.rglob(".*.tmp"))
+
+
 @pytest.mark.slow
 def test_a_full_disk_is_reported_and_loses_nothing_else(tmp_path):
     """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
