@@ -79,7 +79,7 @@ def draw(directory: Path, path: Path) -> None:
         axis.set(title=case)
         style.plain_axis(axis)
     days = sorted({point[0] for points in cases.values() for line in points.values() for point in line})
-    shown = sorted({days[round(share * (len(days) - 1))] for share in (0.0, 0.5, 1.0)})
+    shown = sorted({days[0], days[-1]})  # a third date would touch its neighbours
     axes[0, 0].set_xticks(shown, labels=[f"{day:%Y-%m-%d}" for day in shown])
     axes[0, 0].margins(x=0.25)
     low, high = axes[0, 0].get_ylim()
