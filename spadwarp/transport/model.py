@@ -264,7 +264,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
-        points=_points(scene, kinds, by_block, tracking),
+        # Those of a scene go with its own estimator.
+        points=1 if "estimator" in choices else _points(scene, kinds, by_block, tracking),
         channels=len(scene.camera.tallied_channels),
     )
     return spec._replace(**choices)

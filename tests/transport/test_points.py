@@ -9,6 +9,7 @@ from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError
+from spadwarp.transport import trace
 from spadwarp_kernels.transport.checks import check_spec
 
 BARS = [
@@ -54,19 +55,45 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
     assert 0.25 < np.median(triple / single) < 0.55
 
 
-def test_derivatives_and_more_points(device):
-    """The derivative by the albedo's scattering is that of the same light: sums over all bins agree within errors."""
+@pytest.mark.parametrize("kind", ["derivative", "polarised", "grid"])
+def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
+    """Light, or its derivative, that a flight and the surface at its end bring: sums over all bins agree within errors.
+
+    Here a round of flights adds three times as many requests as a warp of a GPU scores at a time.
+    """
+    sections, names = {}, ["medium.scattering"] if kind == "derivative" else []
+    if kind == "polarised":
+        sections = {"laser": {"polarisation": "linear"}, "camera": {"polarisation": "stokes"}}
+    if kind == "grid":
+        path, cells = tmp_path / "cells.npz", np.full((2, 2, 2), 0.5)
+        np.savez(path, extinction=cells, albedo=cells, size=[9.0] * 3)
+        sections = {"medium": {"grid": {"file": str(path), "tracking": "regular"}}}
 
     def totals(points):
-        one = with_points(scene(), points)
+        one = with_points(scene(**sections), points)
         rows = []
         for seed in range(12):
-            result = spadwarp.simulate(one, photons=20_000, seed=seed, device=device, derivatives=["medium.scattering"])
-            rows.append(result.derivatives["medium.scattering"].sum())
+            result = spadwarp.simulate(one, photons=20_000, seed=seed, device=device, derivatives=names)
+            assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
+            rows.append(result.derivatives[names[0]].sum() if names else result.histogram.sum())
         return np.array(rows)
 
-    one, two = totals(1), totals(2)
-    assert abs(one.mean() - two.mean()) < 4 * np.sqrt((one.var(ddof=1) + two.var(ddof=1)) / 12)
+    one, three = totals(1), totals(3)
+    assert abs(one.mean() - three.mean()) < 4 * np.sqrt((one.var(ddof=1) + three.var(ddof=1)) / 12)
+
+
+def test_records_of_photons_have_no_points(device):
+    one, more = (trace(with_points(scene(), points), photons=500, device=device) for points in (1, 3))
+    assert np.array_equal(one.position, more.position) and np.array_equal(one.weight, more.weight)
+
+
+def test_results_of_other_points_are_not_added(device):
+    one, two = (
+        spadwarp.simulate(with_points(scene(), points), photons=100, first_photon=first, seed=1, device=device)
+        for points, first in ((1, 0), (2, 100))
+    )
+    with pytest.raises(ConfigError, match="scene of the results differs in transport"):
+        spadwarp.merge([one, two])
 
 
 @pytest.mark.parametrize(

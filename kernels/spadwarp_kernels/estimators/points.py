@@ -24,18 +24,18 @@ from .mirrored import MirroredScores
 
 @made_once
 def make_point_of(points: int) -> wp.Function:
-    """The Warp function ``(request, number) -> Request``: of a flight, that of another of its points.
+    """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
 
     Both random numbers of a point are a part of 1 further than those of the one before, modulo 1: those of each are
     uniform, and together they are spread evenly (systematic sampling).
     """
-    step = (1 << 32) // points
+    step = wp.uint32((1 << 32) // points)
 
     @wp.func
     def point_of(request: Request, number: int) -> Request:
         other = request
-        other.first = request.first + wp.uint32(number) * wp.uint32(wp.static(step))
-        other.second = request.second + wp.uint32(number) * wp.uint32(wp.static(step))
+        other.first = request.first + wp.uint32(number) * wp.static(step)
+        other.second = request.second + wp.uint32(number) * wp.static(step)
         return other
 
     return point_of
@@ -44,6 +44,8 @@ def make_point_of(points: int) -> wp.Function:
 @made_once
 def make_push_points(points: int, push: wp.Function) -> wp.Function:
     """The Warp function ``(memory, request)``: `push` of `make_queue` for each of the points of a flight."""
+    if points == 1:
+        return push
     point_of = make_point_of(points)
 
     @wp.func
@@ -52,7 +54,7 @@ def make_push_points(points: int, push: wp.Function) -> wp.Function:
         for i in range(wp.static(points - 1)):
             push(memory, point_of(request, i + 1))
 
-    return push if points == 1 else push_points
+    return push_points
 
 
 @made_once

@@ -110,6 +110,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     # Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
     at_once = cuda and not has_bvh and ((queues and flights and spec.grid is None) or not scores)
     at_once = at_once and long_queue_fits(spec)
+    # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
+    drains = at_once or (queues and not has_bvh and spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
     start_lanes = START_LANES if scores and (flights or not has_bvh) else FEWER_START_LANES
@@ -257,7 +259,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if wp.static(queues):
                                 asked.request = pop(memory, lane, not s.hidden, queued, free)
                                 queued = queue_size(memory, SET_SIZE, wp.max(queued - free, 0))
-                            ready = wp.static(at_once) and queued >= 32
+                            ready = wp.static(drains) and queued >= 32
                             found = score(
                                 asked.request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation
                             )
