@@ -63,7 +63,7 @@ def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
     """
     sections, names = {}, ["medium.scattering"] if kind == "derivative" else []
     if kind == "polarised":
-        sections = {"laser": {"polarisation": "linear"}, "camera": {"polarisation": "stokes"}}
+        sections = {"medium": {"scattering_matrix": "scaled_rayleigh"}, "camera": {"polarisation": "stokes"}}
     if kind == "grid":
         path, cells = tmp_path / "cells.npz", np.full((2, 2, 2), 0.5)
         np.savez(path, extinction=cells, albedo=cells, size=[9.0] * 3)
