@@ -78,8 +78,8 @@ FREE_LANES = 12
 # It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
 WALKING_LANES = 6
 
-# It takes new photons when this many lanes have ended; the second where nothing is scored, and with `next_event` in a
-# tree. Both measured.
+# It takes new photons when this many lanes have ended; the second where nothing is scored, in grids, and in a tree with
+# `next_event`. All measured.
 START_LANES = 4
 FEWER_START_LANES = 3
 
@@ -114,7 +114,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     drains = at_once or (queues and not has_bvh and spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
-    start_lanes = START_LANES if scores and (flights or not has_bvh) else FEWER_START_LANES
+    start_lanes = START_LANES if scores and spec.grid is None and (flights or not has_bvh) else FEWER_START_LANES
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
     scatter, leave = make_scatter(spec, estimator.direct, crosses), make_leave(crosses)
