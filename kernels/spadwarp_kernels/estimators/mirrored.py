@@ -282,8 +282,9 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
 
 
 @wp.struct
-class MirroredScores:
-    """What the images of an event have added: see `add_pending`, and counters of `PhotonState`."""
+class AddedScores:
+    """What the images of an event, or the further points of a flight, have added: see `add_pending`, and counters of
+    `PhotonState`."""
 
     pending_add: wp.vec2l
     contributions: int
@@ -293,7 +294,7 @@ class MirroredScores:
 @made_once
 def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
-    polarisation, tally, gradients, ledger, pending_add, thread, scale) -> MirroredScores`` that scores an event by way
+    polarisation, tally, gradients, ledger, pending_add, thread, scale) -> AddedScores`` that scores an event by way
     of all images; arguments as of `make_score_image`."""
     score_image = make_score_image(spec, flights, brute_force)
     deposit = make_deposit(spec.signed)
@@ -316,8 +317,8 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         pending_add: wp.vec2l,
         thread: int,
         scale: float,
-    ) -> MirroredScores:
-        scores = MirroredScores()
+    ) -> AddedScores:
+        scores = AddedScores()
         scores.pending_add = pending_add
         if request.wanted:
             for number in range(limits.boundary.images.shape[0]):

@@ -19,7 +19,7 @@ from spadwarp_kernels.surface.trace import intersect_surfaces
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 
 from .contribution import Request
-from .mirrored import MirroredScores
+from .mirrored import AddedScores
 
 
 @made_once
@@ -82,8 +82,8 @@ def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function
         pending_add: wp.vec2l,
         thread: int,
         scale: float,
-    ) -> MirroredScores:
-        scores = MirroredScores()
+    ) -> AddedScores:
+        scores = AddedScores()
         scores.pending_add = pending_add
         if request.wanted and request.interval[0] < request.interval[1]:
             for i in range(wp.static(points - 1)):

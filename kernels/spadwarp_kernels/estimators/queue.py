@@ -31,6 +31,11 @@ def _among_takers(lane: int, takes: bool) -> int:
     return count_lanes_before(takes)
 
 
+def _vectors(more: bool, derivatives: int, polarised: bool) -> int:
+    """Of a request, four numbers each; `more`: it has an interval, a point of the lens or a target."""
+    return (4 if more else 3) + (1 if polarised else -(-derivatives // 4))
+
+
 def queue_entries(points: int, long: bool) -> int:
     """Of a warp: requests that wait, and those that come, of flights by their points, with `long` an event as well."""
     return MOST_LEFT + 32 * (points + 1 if long else points)
@@ -38,8 +43,7 @@ def queue_entries(points: int, long: bool) -> int:
 
 def long_queue_fits(spec: TransportSpec) -> bool:
     """Whether a block's shared memory holds a `long` queue of flights."""
-    vectors = 4 + (1 if spec.polarised else -(-len(spec.derivatives) // 4))
-    return fits_in_block(vectors * queue_entries(spec.points, True))
+    return fits_in_block(_vectors(True, len(spec.derivatives), spec.polarised) * queue_entries(spec.points, True))
 
 
 @made_once
@@ -70,8 +74,7 @@ def make_queue(
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
     entries = queue_entries(points, long)
-    vectors = first_score + (1 if polarised else score_vectors)
-    warp_memory = make_warp_memory(vectors * entries if used else 0)
+    warp_memory = make_warp_memory(_vectors(more, derivatives, polarised) * entries if used else 0)
 
     @wp.func
     def write(memory: int, entry: int, request: Request):
