@@ -21,6 +21,7 @@ from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene, SceneLike, as_scene
+from spadwarp.transport import points_per_flight
 
 __all__ = ["check", "summary"]
 
@@ -44,9 +45,11 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """Everything worth knowing about a scene, warnings first; occlusion is not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
-    for the tables of a phase function and a scattering matrix and the instrument response of the detector.
+    for the tables of a phase function and a scattering matrix and the instrument response of the detector;
+    `ConfigError` for several points per flight with what they do not go with.
     """
     survey = Survey(as_scene(scene), mesh)
+    points_per_flight(survey.scene)
     _check_response(survey.scene)
     messages = [message for find in _CHECKS for message in find(survey)]
     return sorted(messages, key=lambda message: message.level != "warning")

@@ -25,6 +25,7 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error
+from spadwarp.transport.points import points_per_flight
 from spadwarp.transport.polarisation import polarised_model
 from spadwarp.transport.tally_unit import tally_scale
 
@@ -241,7 +242,6 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
     """The compile-time choices of a scene and of the derivatives asked for; `choices` override them."""
     kinds, by_block = derivative_kinds(scene, derivatives)
-    tracking = grid_tracking(scene)
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
         phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
@@ -260,33 +260,15 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         port=port_kind(camera_port(scene)),
         laser_port=port_kind(laser_port(scene)),
         reflecting=bool(scene.domain.reflecting),
-        grid=tracking,
+        grid=grid_tracking(scene),
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
         # Those of a scene go with its own estimator.
-        points=1 if "estimator" in choices else _points(scene, kinds, by_block, tracking),
+        points=1 if "estimator" in choices else points_per_flight(scene, kinds, by_block),
         channels=len(scene.camera.tallied_channels),
     )
     return spec._replace(**choices)
-
-
-def _points(scene: Scene, kinds: Sequence[str], by_block: Sequence[str], tracking: Any) -> int:
-    """Points at which a flight is scored."""
-    points = scene.transport.points_per_flight
-    estimator = scene.transport.estimator
-    against = {
-        f'estimator = "{estimator}"': estimator != "guided",
-        "faces of the domain that reflect": bool(scene.domain.reflecting),
-        "derivatives by block": bool(by_block),
-        'medium.grid.tracking = "delta"': tracking is sk.DELTA_TRACKING,
-    }
-    if points > 1 and any(against.values()):
-        names = " and ".join(name for name, found in against.items() if found)
-        raise config_error(scene, f"transport.points_per_flight = {points} does not go with {names}; take 1")
-    if points > 2 and len(kinds) > 4:
-        raise config_error(scene, f"transport.points_per_flight = {points} goes with up to 4 derivatives; take 2")
-    return points
 
 
 def _laser(scene: Scene, device: wp.Device) -> Any:
