@@ -65,11 +65,12 @@ def train(
         trained = run(chosen, out, device=device, progress=shown, notify=None if quiet or not first else complain)
     if first:
         if not quiet:
+            over = "photon numbers" if chosen.model == "histograms" else "levels of backscatter"
             say(
                 opt.rows(
                     {
                         "model": f"{chosen.model}, {opt.count(chosen.optimiser.steps)} steps, seed {chosen.seed}",
-                        "validation": f"{trained.psnr:.2f} dB PSNR, mean over six levels of backscatter",
+                        "validation": f"{trained.psnr:.2f} dB PSNR, mean over {over}",
                         "time": f"{trained.seconds:.0f} s",
                         "written": f"{trained.weights} ({opt.in_bytes(trained.weights.stat().st_size)})",
                     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,53 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.frames import MARGIN, depth_frames
-from spadwarp.denoise.histogram_inputs import dim_pixels, features_of_histograms, target_bins
+from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, weights_metadata
+from spadwarp.denoise.reading import ENDINGS, DepthReading, backscatter_profile, depth_at, read_depth
 from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
-from spadwarp.frames.depth import depth_of
-from spadwarp.frames.estimators import Method
-from spadwarp.frames.measured import Histograms, read_histograms, stored_images
+from spadwarp.files import holds_own_file, locate
+from spadwarp.frames.measured import Histograms
 from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.io.paths import existing_file
-from spadwarp.result import Result
-from spadwarp.scene.sight import depth_from_time
-from spadwarp.transport import PhotonRecords
-from spadwarp.units import percent, range_from_time
+from spadwarp.io.exr import write_exr
+from spadwarp.units import percent
 from spadwarp.viz import draw_denoised
 
-__all__ = ["ENDINGS", "Denoised", "DepthReading", "denoise_file", "depth_files", "read_depth"]
-
-ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
-
-_EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DepthReading:
-    """Depth from a file.
-
-    Attributes:
-        depth: float32 `[N, H, W]` [m]; NaN where there is none.
-        frames: Whether the file held several frames.
-        gate: (start, stop) [m]; None where the file does not give it.
-        profile: Backscatter over the gate, `[bins]`; None where the file does not give it.
-        source: How the depth was obtained, as text.
-        histograms: What the depth was estimated from, if these are counts whose instrument response is known.
-        truth: True depth of the first frame, `[H, W]` [m]; None where the file does not give it.
-    """
-
-    depth: NDArray[np.float32]
-    frames: bool
-    gate: tuple[float, float] | None
-    profile: NDArray[np.float64] | None
-    source: str
-    histograms: Histograms | None = None
-    truth: NDArray[np.float32] | None = None
+__all__ = ["Denoised", "denoise_file", "depth_files"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -112,9 +80,9 @@ def denoise_file(
         out: The folder.
         model, weights, device, precision: See `spadwarp.denoise.estimate`.
         mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
-        gate: (start, stop) in depth [m]; of histograms only the bins within it count. Default: the file's, else all.
+        gate: (start, stop) in depth [m]; of counts only the bins within it are used. Default: the file's, else all.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
-        reading: Arguments of `read_depth`.
+        reading: The other arguments of `read_depth`.
 
     Raises:
         FileError: A file cannot be read or written.
@@ -125,9 +93,7 @@ def denoise_file(
         raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
     if mask is not None and not 0.0 <= mask <= 1.0:
         raise ArgumentError(f"mask = {mask} is outside [0, 1]")
-    read = read_depth(path, **reading)
-    if gate is not None and read.histograms is not None:
-        read = _read_within(read, gate, reading)
+    read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
     if gate is None:
         valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
@@ -195,124 +161,6 @@ def _write(
     return [*(folder / f"{name}{ending}.npy" for ending in arrays), write_exr(folder / f"{name}.exr", first, metadata)]
 
 
-def read_depth(
-    path: str | Path,
-    *,
-    as_depth: bool = False,
-    channel: str | None = None,
-    scale: float = 1.0,
-    method: Method | None = None,
-    group_index: float | None = None,
-    device: str | None = None,
-    **measured: Any,
-) -> DepthReading:
-    """Depth from a file.
-
-    `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
-    depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or histograms, see
-    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
-
-    Args:
-        path: The file.
-        as_depth: Three dimensions in `.npy` and `.mat` are frames `[N, H, W]` of depth, not a histogram.
-        channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
-            "co" or "cross", see `spadwarp.result.received`; default: "I", all light.
-        scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
-        method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
-            where the response is not known.
-        group_index: Of measured histograms, see `depth_of`.
-        device: Warp device of the estimator.
-        measured: What a file of measured histograms does not say, as `read_histograms` takes it.
-
-    Raises:
-        FileError: No such file, not readable, or without depth.
-        ArgumentError: An argument out of range, or missing for what the file holds.
-    """
-    place = locate(path)
-    if place.suffix.lower() not in ENDINGS and not place.is_dir():
-        raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ArgumentError(f"scale = {scale} is outside (0, inf)")
-    truth: NDArray[np.float32] | None = None
-    of_result: dict[str, Any] = {}
-    if is_own_file(place):
-        held = load(place)
-        own, truth = stored_depth(held), _truth(held)
-        of_result = {"channel": channel or "I"} if isinstance(held, Result) else {}
-        if own is not None:
-            frames = own.values.astype(np.float32)
-            return DepthReading(
-                depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is", truth=truth
-            )
-    stored = _stored_depth(place, channel, measured.get("dataset"), as_depth)
-    if stored is not None:
-        if stored.dtype.kind not in "iuf":
-            raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
-        if given := [name.replace("_", " ") for name in measured if name != "dataset"]:
-            raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
-        depth = stored.astype(np.float32)
-        below = np.count_nonzero(depth < 0)
-        depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
-        frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
-        source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
-        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = read_histograms(place, **measured, **of_result)
-    return dataclasses.replace(_estimate_depth(histograms, method, group_index, device), truth=truth)
-
-
-def _truth(held: Held) -> NDArray[np.float32] | None:
-    """True depth of the first frame, where one of our files has it."""
-    if isinstance(held, Result):
-        return held.truth.depth
-    if isinstance(held, PhotonRecords):
-        return None
-    depth = sequence(held).at(0).depth
-    return None if depth is None else depth.astype(np.float32)
-
-
-def _stored_depth(path: Path, channel: str | None, dataset: str | None, as_depth: bool) -> NDArray[Any] | None:
-    """Depth `[H, W]` or `[N, H, W]` as the file has it; None for histograms."""
-    ending = path.suffix.lower()
-    if ending == ".exr":
-        channels, _ = read_exr(path)
-        wanted: Sequence[str] = _EXR_CHANNELS if channel is None else (channel,)
-        found = next((channels[name] for name in wanted if name in channels), None)
-        if found is None:
-            raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
-        return found
-    return stored_images(path, dataset, several=as_depth)
-
-
-def _estimate_depth(
-    histograms: Histograms, method: Method | None, group_index: float | None, device: str | None
-) -> DepthReading:
-    bins = histograms.values.shape[-1]
-    counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
-    if counted and histograms.background is None:
-        # Flat, at the median bin of all pixels and frames together: that of sparse counts would be 0.
-        total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
-        level = np.median(total) * bins / histograms.values.size
-        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32))
-    method = method or ("likelihood" if counted else "matched")
-    if method in ("matched", "likelihood") and histograms.response is None:
-        method = "centroid"
-    reduced = depth_of(histograms, method=method, group_index=group_index, device=device)
-    scene = histograms.scene
-    index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
-    gate_stop = histograms.gate_start + bins * float(histograms.bin_width or 0.0)
-    depth = reduced.values.astype(np.float32)
-    depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
-    dim = [] if counted else dim_pixels(histograms)
-    return DepthReading(
-        depth=depth,
-        frames=reduced.frames > 1,
-        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
-        profile=_profile(histograms),
-        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
-        histograms=histograms if counted else None,
-    )
-
-
 def _from_counts(
     read: DepthReading,
     histograms: Histograms,
@@ -334,7 +182,7 @@ def _from_counts(
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
         time = start + place.astype(np.float64) * (values.shape[-1] * width)
-        return _depth_at(time, histograms, group_index)
+        return depth_at(time, histograms, group_index)
 
     given: dict[str, Any] = {
         "counts": values, "background": known[..., first:stop], "response": response, "device": device,
@@ -346,40 +194,13 @@ def _from_counts(
         return found, _second(found.depth, to_depth, given)
     features = features_of_histograms(**given, total=histograms.values.sum(axis=-1), to_depth=to_depth)
     if profile is None or values.shape[-1] < shape[-1]:
-        profile = _profile(dataclasses.replace(histograms, values=values, background=known[..., first:stop]))
+        profile = backscatter_profile(dataclasses.replace(histograms, values=values, background=known[..., first:stop]))
     with warnings.catch_warnings():
         if values.shape[-1] < shape[-1]:
             warnings.simplefilter("ignore")  # depths outside this part are false peaks
         frames = depth_frames(read.depth, gate=part, profile=profile, features=features)
     found = estimate_frames(frames, model=model, weights=weights, device=device)
     return found, _second(found.depth, to_depth, given)
-
-
-def _depth_at(time: NDArray[np.float64], histograms: Histograms, group_index: float) -> NDArray[np.float64]:
-    """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
-    if histograms.scene is None:
-        return range_from_time(time, group_index)
-    return depth_from_time(time, scene=histograms.scene)
-
-
-def _read_within(read: DepthReading, gate: tuple[float, float], reading: dict[str, Any]) -> DepthReading:
-    """The same from those bins alone whose depth lies in a gate [m] in some pixel."""
-    held = read.histograms
-    assert held is not None
-    bins, width, index = held.values.shape[-1], float(held.bin_width or 0.0), reading.get("group_index")
-    times = [np.full(held.values.shape[-3:-1], held.gate_start + width * edge) for edge in (0, bins)]
-    near, far = (_depth_at(time, held, float(index or 1.0)) for time in times)
-    first = max(0, int(np.floor(np.min((gate[0] - near) / (far - near)) * bins + 1e-6)))
-    stop = min(bins, int(np.ceil(np.max((gate[1] - near) / (far - near)) * bins - 1e-6)))
-    if stop <= first:
-        extent = f"{near.min():.4g} to {far.max():.4g} m"
-        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m lies outside the histograms, {extent}")
-    known = held.background if held.background_per_bin is None else held.background_per_bin[..., first:stop]
-    within = dataclasses.replace(
-        held, values=held.values[..., first:stop], gate_start=held.gate_start + first * width, background=known
-    )
-    found = _estimate_depth(within, reading.get("method"), index, reading.get("device"))
-    return dataclasses.replace(found, truth=read.truth)
 
 
 def _second(
@@ -389,12 +210,3 @@ def _second(
     start, stop = (to_depth(np.full_like(depth, place)) for place in (0.0, 1.0))
     place = ((depth - start) / (stop - start)).reshape(given["counts"].shape[:-1])
     return to_depth(second_return(place, **given).reshape(depth.shape)).astype(np.float32)
-
-
-def _profile(histograms: Histograms) -> NDArray[np.float64] | None:
-    """Backscatter of all pixels together over the bins; None where the file does not give it."""
-    background = histograms.background_per_bin
-    if background is None:
-        return None
-    total = np.asarray(background, np.float64).reshape(-1, background.shape[-1]).sum(axis=0)
-    return total if total.sum() > 0 else None

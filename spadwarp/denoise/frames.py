@@ -20,6 +20,7 @@ __all__ = [
     "SIDES",
     "SMALLEST_SIDE",
     "DepthFrames",
+    "checked_gate",
     "depth_frames",
     "fill_missing",
 ]
@@ -97,6 +98,16 @@ class DepthFrames:
         return np.concatenate([frame, pooled - 0.5, self.features[:, POOLED:-SIDES], sides], axis=1, dtype=np.float32)
 
 
+def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
+    """(start, stop) [m] of a gate that has a width. Raises `ArgumentError`."""
+    if not (isinstance(gate, tuple | list) and len(gate) == 2):
+        raise ArgumentError(f"gate = {shown(gate)} is not (start, stop) [m]")
+    start, stop = (check_real("gate", one, "[0, 1e6] m") for one in gate)
+    if not start < stop:
+        raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with start < stop")
+    return start, stop
+
+
 def depth_frames(
     depth: ArrayLike,
     *,
@@ -132,11 +143,7 @@ def depth_frames(
         raise ArgumentError(
             f"histograms are {len(features)} frames of {features.shape[2:]} pixels, depth is {values.shape}"
         )
-    if not (isinstance(gate, tuple | list) and len(gate) == 2):
-        raise ArgumentError(f"gate = {shown(gate)} is not (start, stop) [m]")
-    start, stop = (check_real("gate", one, "[0, 1e6] m") for one in gate)
-    if not start < stop:
-        raise ArgumentError(f"gate = ({start}, {stop}) m is not (start, stop) with start < stop")
+    start, stop = checked_gate(gate)
     if (values[np.isfinite(values)] < 0).any():
         raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf)")
     present = np.isfinite(values) & (values > 0)

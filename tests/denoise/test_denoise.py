@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import re
 import subprocess
@@ -23,7 +24,7 @@ from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.cli import app
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, files, metrics, network_files, photon_counts, training_steps
+from spadwarp.denoise import baselines, files, metrics, network_files, photon_counts, reading, training_steps
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import load_training_recipe
@@ -170,7 +171,7 @@ def test_histograms_become_depth_first(tmp_path):
     with pytest.raises(ArgumentError, match="another is needed"):
         files.denoise_file(tmp_path / "counts.npy", tmp_path)
     with pytest.raises(ArgumentError, match="bin width is missing"):
-        files.read_depth(tmp_path / "counts.npy", group_index=index, gate_start=0.0)
+        reading.read_depth(tmp_path / "counts.npy", group_index=index, gate_start=0.0)
 
 
 def test_a_peak_before_the_pulse_is_no_depth(tmp_path):
@@ -183,6 +184,27 @@ def test_a_peak_before_the_pulse_is_no_depth(tmp_path):
     response = instrument_response(pulse_fwhm=0.0, jitter_fwhm=350e-12)
     found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", irf=response, **known)
     assert np.median(found.depth) == pytest.approx(61.5 * 80e-12 * 299_792_458 / 2, abs=0.01)
+
+
+def test_a_gate_limits_the_bins_of_counts_and_depth_is_estimated_once(tmp_path, monkeypatch):
+    counts = np.random.default_rng(2).poisson(0.05, (16, 16, 128)).astype(np.uint16)
+    counts[..., 60:63] += 3
+    counts[..., 20:23] += 9  # nearer and brighter than the target
+    np.save(tmp_path / "counts.npy", counts)
+    metres = 80e-12 * 299_792_458 / 2
+    estimated, depth_of = [], reading.depth_of
+    monkeypatch.setattr(reading, "depth_of", lambda held, **rest: estimated.append(held) or depth_of(held, **rest))
+    given = {
+        "bin_width": 80e-12, "gate_start": 0.0, "group_index": 1.0, "model": "likelihood", "device": "cpu",
+        "irf": instrument_response(pulse_fwhm=0.0, jitter_fwhm=200e-12),
+    }  # fmt: skip
+    gate = (40.5 * metres, 90.5 * metres)
+    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", gate=gate, **given)
+    assert [held.values.shape for held in estimated] == [(16, 16, 51)] and found.gate == gate
+    assert np.median(found.depth) == pytest.approx(61.5 * metres, abs=0.5 * metres)
+    for wrong in ((math.nan, 1.0), (1.0, 0.5), 3.0):
+        with pytest.raises(ArgumentError, match="gate = "):
+            files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", gate=wrong, **given)
 
 
 def test_what_cannot_be_read(tmp_path):
@@ -199,14 +221,14 @@ def test_what_cannot_be_read(tmp_path):
         ("scalar.mat", r"no array of 3 or 4 dimensions, sparse matrix or cells; it holds scalar \(1, 1\)"),
     ):
         with pytest.raises(FileError, match=message):
-            files.read_depth(tmp_path / name)
+            reading.read_depth(tmp_path / name)
     with pytest.raises(FileError, match="no file that ends in"):
         files.depth_files(tmp_path / "empty")
 
 
 def test_depths_below_zero_count_as_not_reported(tmp_path):
     np.save(tmp_path / "marked.npy", np.where(np.eye(16) > 0, -1.0, 15.0))
-    marked = files.read_depth(tmp_path / "marked.npy")
+    marked = reading.read_depth(tmp_path / "marked.npy")
     assert "16 values below 0" in marked.source and np.isnan(marked.depth).sum() == 16
 
 
