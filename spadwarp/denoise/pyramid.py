@@ -67,8 +67,8 @@ class PyramidNet(nn.Module):
     the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate, and `spadwarp.denoise.context`
     weighs them with the view of a wide surrounding; then pixels with two returns follow those around that have the same
     two (`spadwarp.denoise.two_surfaces`). A fifth output is the depth of the candidates, and one for each candidate its
-    logit. While it learns, there are also the candidates of the selection and their scores, and the last answer; the
-    depth is that before the selection.
+    logit. While it learns, there are also the candidates of the selection and their scores, those of the wide view, its
+    answer and its logit of "sees a target"; depth and logits are those before the selection.
     """
 
     radius = 2
@@ -168,15 +168,25 @@ class PyramidNet(nn.Module):
         if delay is not None:
             seen = found.detach(), others.detach(), frame[:, 3:].float()
             if torch.is_grad_enabled():
-                candidates, scores = self.select(*seen)
-                last, target = self._last(selected(candidates, scores).detach(), *seen[1:])
-                extra += [candidates - delay.detach(), scores, last - delay.detach()]
+                extra += self._learnt(*seen, delay.detach())
             else:
                 found, target = self._last(selected_depth(self.select, *seen), *seen[1:])
                 inside = ..., slice(height), slice(width)
                 found[inside] = follow_the_others(found[inside], seen[2][inside])
-            found, others = found - delay, torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
+                others = torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
+            found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
+
+    def _learnt(self, found: Tensor, logits: Tensor, features: Tensor, delay: Tensor) -> list[Tensor]:
+        """Candidates of the selection and their scores; those of the wide view, its answer and its logit "target".
+
+        What comes before is an input here: each learns from its own answer alone.
+        """
+        assert self.context is not None
+        candidates, scores = self.select(found, logits, features)
+        depths, weights, target = self.context(selected(candidates, scores).detach(), logits, features)
+        last = answer(depths, weights, features)
+        return [candidates - delay, scores, depths - delay, weights, last - delay, logits[:, :1] + target]
 
     def _last(self, before: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """The answer with the view of a wide surrounding, and what it adds to the logit of "sees a target".

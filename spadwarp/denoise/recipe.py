@@ -16,7 +16,7 @@ from spadwarp.io.parsing import read_toml
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole
 
-__all__ = ["MODELS", "Noise", "Optimiser", "TrainingRecipe", "load_training_recipe"]
+__all__ = ["MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
 
 MODELS = ("pyramid", "histograms", "dncnn", "usdn")
 """Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
@@ -88,6 +88,14 @@ class Noise(_Table):
     unknown_water: Share = Field(0.2, description="samples whose backscatter profile is hidden from the network")
 
 
+class Part(Noise):
+    """A part of the samples, with noise of its own: `[noise]`, except for what is given here."""
+
+    share: float = Field(..., gt=0, le=1, description="part of the samples; all shares together are 1")
+    crowded: Share = Field(0.0, description="of these, samples whose scene is two scenes, one before the other")
+    open_water: Share = Field(0.0, description="of these, samples with a target in open water for certain")
+
+
 class Optimiser(_Table):
     """How the network is trained."""
 
@@ -105,6 +113,10 @@ class Optimiser(_Table):
         description='"psnr": logarithm of the mean square of each crop, so that easy crops count as much as hard ones',
     )
     precision: Literal["bfloat16", "float32"] = Field("bfloat16", description="of the network's layers on a GPU")
+    pool: Whole = Field(
+        0, ge=0, le=10**7, description="samples at hand, of which each update takes some; 0: each update draws its own"
+    )
+    uses: float = Field(1.0, ge=1, le=1e6, description="updates that a sample of the pool is used in, on average")
     report_every: Whole = Field(
         500, ge=1, le=10**12, description="updates between two lines of the log and two checkpoints"
     )
@@ -122,16 +134,39 @@ class TrainingRecipe(_Table):
     )
     seed: Whole = Field(0, ge=0, le=2**63 - 1, description="of weights, crops and noise")
     noise: Noise = Noise()
+    mixture: tuple[Part, ...] = Field((), description="parts of the samples with other noise; needs a pool")
     optimiser: Optimiser = Optimiser()
     _source: Path | None = PrivateAttr(None)
 
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _with_common_noise(cls, tables: Any) -> Any:
+        noise, mixture = tables.get("noise", {}), tables.get("mixture")
+        if not isinstance(noise, Mapping) or not isinstance(mixture, list):
+            return tables
+        parts = tuple({**noise, **part} if isinstance(part, Mapping) else part for part in mixture)
+        return {**tables, "mixture": parts}
+
     @pydantic.model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        if self.model == "histograms" and self.noise.counting != 1:
-            raise ValueError(f'noise.counting = {self.noise.counting} with model = "histograms", which needs 1')
+        reads_histograms = self.model == "histograms"
+        for noise in (self.noise, *self.mixture):
+            if reads_histograms and noise.counting != 1:
+                raise ValueError(f'noise.counting = {noise.counting} with model = "histograms", which needs 1')
+        if self.mixture and not self.optimiser.pool:
+            raise ValueError("optimiser.pool = 0 with a mixture, whose parts need a pool")
+        if self.optimiser.pool and not reads_histograms:
+            raise ValueError(f"optimiser.pool = {self.optimiser.pool} with model = {self.model!r}, which has none")
+        total = sum(part.share for part in self.mixture)
+        if self.mixture and abs(total - 1.0) > 1e-6:
+            raise ValueError(f"mixture: the shares add up to {total:g}, not to 1")
         if self.start is not None and self.start != self.model:
             raise ValueError(f"start = {self.start!r}: its layers are not those of {self.model!r}")
         return self
+
+    def parts(self) -> tuple[Part, ...]:
+        """The mixture; without one, all samples have the recipe's noise."""
+        return self.mixture or (Part(share=1.0, **self.noise.model_dump()),)
 
     @property
     def source(self) -> Path | None:

@@ -49,11 +49,13 @@ class CleanScenes(NamedTuple):
 
 class Batch(NamedTuple):
     """Noisy frames as networks take them, `[B, 3, h, w]`, or `[B, 3 + FEATURES, h, w]` with histograms; clean depth
-    over the gate and where a target is seen, `[B, 1, h, w]`."""
+    over the gate and where a target is seen, `[B, 1, h, w]`; and 1 where a crop counts for the target's probability,
+    else 0, `[B, 1, 1, 1]`."""
 
     frame: Tensor
     clean: Tensor
     hit: Tensor
+    judged: Tensor
 
 
 class _Crops(NamedTuple):
@@ -113,7 +115,7 @@ def draw_batch(
     if features is not None:
         features[:, :POOLED] -= 0.5
         frame = torch.cat([frame, features], dim=1)
-    return Batch(frame, clean[:, None], hit[:, None].float())
+    return Batch(frame, clean[:, None], hit[:, None].float(), torch.ones_like(frame[:, :1, :1, :1]))
 
 
 def _report(crops: _Crops, noise: Noise, random: Random, always_replaced: bool) -> tuple[Tensor, Tensor]:

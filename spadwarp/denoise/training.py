@@ -17,6 +17,7 @@ from torch import nn
 from spadwarp.denoise.networks import reads_histograms
 from spadwarp.denoise.recipe import Noise, TrainingRecipe
 from spadwarp.denoise.repeatable import fixed_order
+from spadwarp.denoise.samples import Scenes
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training_steps import Run, Trained, Workers
 from spadwarp.errors import ConfigError
@@ -71,18 +72,18 @@ def fit(
     if settings.batch % workers.size:
         raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {workers.size} processes")
     Path(out).mkdir(parents=True, exist_ok=True)
-    scenes = _Scenes(recipe, workers, training)
+    scenes = Scenes(recipe, workers.rank, workers.device, training)
     if validation is None:
         validation = procedural_scenes(
             64 if workers.is_cuda else 8, settings.crop + 32, seed=_VALIDATION_SEED, device=workers.device
         )
     validation = validation.to(workers.device)
-    run = Run(recipe, Path(out), workers)
+    run = Run(recipe, Path(out), workers, scenes)
     first, began = run.step, time.monotonic()
     psnr: dict[float, float] = {}
     with interruptible() as interrupted:
         while run.step < settings.steps and not workers.any(interrupted.is_set()):
-            run.update(scenes.at(run.step))
+            run.update()
             if run.step % settings.report_every == 0 or run.step == settings.steps:
                 psnr = validation_psnr(run.average, validation, recipe)
                 run.report(psnr)
@@ -117,29 +118,6 @@ def _duration(workers: Workers, seconds: float, steps: int) -> str:
         "`spadwarp denoise` uses; fewer steps (--steps), or start from these weights (start in the recipe), take less. "
         "Ctrl-C keeps a checkpoint from which the same command resumes"
     )
-
-
-class _Scenes:
-    """The clean scenes of each step: those of a dataset, or new ones drawn every so many steps."""
-
-    def __init__(self, recipe: TrainingRecipe, workers: Workers, given: CleanScenes | None) -> None:
-        self.recipe, self.workers = recipe, workers
-        self.given = None if given is None else given.to(workers.device)
-        self.drawn: tuple[int, CleanScenes] | None = None
-
-    def at(self, step: int) -> CleanScenes:
-        """Scenes for a step, which do not depend on the steps before it."""
-        if self.given is not None:
-            return self.given
-        settings = self.recipe.optimiser
-        turn = step // settings.redraw
-        if self.drawn is None or self.drawn[0] != turn:
-            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 + self.workers.rank
-            scenes = procedural_scenes(
-                settings.scenes, settings.crop + 32, seed=seed % 2**62, device=self.workers.device
-            )
-            self.drawn = turn, scenes
-        return self.drawn[1]
 
 
 @torch.no_grad()

@@ -1,0 +1,171 @@
+"""The samples of a training: where its clean scenes come from, and which noisy crops each step learns from."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spadwarp.denoise.recipe import Part, TrainingRecipe
+from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
+
+__all__ = ["Fresh", "Pool", "Samples", "Scenes"]
+
+PORTIONS = 24
+"""Portions of which a pool consists; each is drawn at once."""
+
+_FIRST = 8  # portions that are drawn before the first step
+_WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
+
+
+class Scenes:
+    """The clean scenes of each step: those of a dataset, or new ones drawn every so many steps.
+
+    Args:
+        recipe: Seed, size of the crops, number of scenes and steps between two drawings.
+        rank: Number of this process, each of which draws its own.
+        device: Of the scenes.
+        given: Those of a dataset, which are the same in every step.
+    """
+
+    def __init__(self, recipe: TrainingRecipe, rank: int, device: torch.device, given: CleanScenes | None) -> None:
+        self.recipe, self.rank, self.device = recipe, rank, device
+        self.given = None if given is None else given.to(device)
+        self.drawn: tuple[int, CleanScenes] | None = None
+
+    def at(self, step: int) -> CleanScenes:
+        """Scenes for a step, which do not depend on the steps before it."""
+        if self.given is not None:
+            return self.given
+        settings = self.recipe.optimiser
+        turn = step // settings.redraw
+        if self.drawn is None or self.drawn[0] != turn:
+            seed = (self.recipe.seed * 1_000_003 + turn) * 4096 + self.rank
+            scenes = procedural_scenes(settings.scenes, settings.crop + 32, seed=seed % 2**62, device=self.device)
+            self.drawn = turn, scenes
+        return self.drawn[1]
+
+
+class Samples(Protocol):
+    """What a step learns from. `batch` is recorded in a CUDA graph, `prepare` is called before each step."""
+
+    def prepare(self, step: int) -> None: ...
+
+    def hold(self) -> None:
+        """From now on `batch` reads the same memory in every step."""
+
+    def batch(self) -> Batch: ...
+
+
+class Fresh:
+    """Samples that are drawn anew in each step."""
+
+    def __init__(
+        self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, *, histograms: bool
+    ) -> None:
+        self.recipe, self.scenes, self.size = recipe, scenes, size
+        self.generator, self.histograms = generator, histograms
+        self.now: CleanScenes | None = None
+        self.held: CleanScenes | None = None
+
+    def prepare(self, step: int) -> None:
+        now = self.scenes.at(step)
+        if self.held is not None and now is not self.now:
+            for kept, new in zip(self.held, now, strict=True):
+                kept.copy_(new)
+        self.now = now
+
+    def hold(self) -> None:
+        assert self.now is not None
+        self.held = CleanScenes(*(values.clone() for values in self.now))
+
+    def batch(self) -> Batch:
+        scenes = self.held or self.now
+        assert scenes is not None
+        return draw_batch(
+            scenes, self.recipe.noise, size=self.size, crop=self.recipe.optimiser.crop, generator=self.generator,
+            histograms=self.histograms,
+        )  # fmt: skip
+
+
+class Pool:
+    """Samples that wait in memory, each for several steps, as features of histograms take longer to compute than a step.
+
+    The pool has `PORTIONS` of equal size; the oldest one is replaced every so many steps, so that a sample is used
+    `optimiser.uses` times on average. All samples of a portion have the noise of one part of the recipe's mixture. A
+    portion depends on its number and on the seed alone: a resumed run draws those again that it had.
+
+    Args:
+        recipe: See `spadwarp.denoise.recipe`.
+        scenes: Clean scenes of each step.
+        size: Samples of a batch.
+        generator: Chooses the samples of each batch.
+        share: Part of the pool that this process has.
+    """
+
+    def __init__(
+        self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, share: float = 1.0
+    ) -> None:
+        settings = recipe.optimiser
+        self.recipe, self.scenes, self.size, self.generator = recipe, scenes, size, generator
+        self.portion = max(1, round(share * settings.pool / PORTIONS))
+        self.interval = max(1, round(settings.uses * self.portion / size))
+        self.parts = recipe.parts()
+        self.drawn = 0
+        self.filled = torch.zeros((), device=generator.device)
+        self.memory: Batch | None = None
+
+    def prepare(self, step: int) -> None:
+        due = _FIRST + step // self.interval
+        for number in range(max(self.drawn, due - PORTIONS), due):
+            self._draw(number, self.scenes.at(max(0, number - _FIRST) * self.interval))
+        self.drawn = due
+
+    def hold(self) -> None:
+        """The memory is the same from the start."""
+
+    def batch(self) -> Batch:
+        chosen = torch.rand(self.size, generator=self.generator, device=self.generator.device)
+        index = (chosen * self.filled).long().clamp_max(PORTIONS * self.portion - 1)
+        assert self.memory is not None
+        return Batch(*(values.index_select(0, index) for values in self.memory))
+
+    @torch.no_grad()
+    def _draw(self, number: int, scenes: CleanScenes) -> None:
+        host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number))
+        part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
+        seed = int(host.integers(2**62))
+        generator = torch.Generator(self.generator.device).manual_seed(seed)
+        is_crowded = host.random() < part.crowded
+        if host.random() < part.open_water:
+            scenes = in_open_water(scenes)
+        new = draw_batch(
+            crowded(scenes) if is_crowded else scenes, part, size=self.portion, crop=self.recipe.optimiser.crop,
+            generator=generator, histograms=True,
+        )  # fmt: skip
+        if is_crowded:
+            new = new._replace(judged=torch.zeros_like(new.judged))
+        if self.memory is None:
+            self.memory = Batch(*(values.new_empty(PORTIONS * len(values), *values.shape[1:]) for values in new))
+        first = number % PORTIONS * self.portion
+        for kept, values in zip(self.memory, new, strict=True):
+            kept[first : first + self.portion] = values
+        self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
+
+
+def in_open_water(scenes: CleanScenes) -> CleanScenes:
+    """Those of the scenes that have a target in open water; all if none has."""
+    share = scenes.depth.isfinite().flatten(1).float().mean(1)
+    some = ((share > _WATER[0]) & (share < _WATER[1])).nonzero()[:, 0]
+    return CleanScenes(*(values[some] for values in scenes)) if len(some) else scenes
+
+
+def crowded(scenes: CleanScenes) -> CleanScenes:
+    """Each scene with the next one: of both, each pixel sees the nearer surface."""
+    other = CleanScenes(*(values.roll(1, 0) for values in scenes))
+    before: Tensor = (scenes.depth <= other.depth) | other.depth.isnan()
+    depth, sigma = (torch.where(before, *pair) for pair in zip(scenes[:2], other[:2], strict=True))
+    gate = torch.stack([torch.minimum(scenes.gate, other.gate)[:, 0], torch.maximum(scenes.gate, other.gate)[:, 1]], 1)
+    return CleanScenes(depth, sigma, gate, scenes.profile)
