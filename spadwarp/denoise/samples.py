@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spadwarp.denoise.recipe import Part, TrainingRecipe
+from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
 
 __all__ = ["Fresh", "Pool", "Samples", "Scenes"]
@@ -91,7 +91,7 @@ class Fresh:
 
 
 class Pool:
-    """Samples that wait in memory, each for several steps, as features of histograms take longer to compute than a step.
+    """Samples that wait in memory, each for several steps: features of histograms take longer to compute than a step.
 
     The pool has `PORTIONS` of equal size; the oldest one is replaced every so many steps, so that a sample is used
     `optimiser.uses` times on average. All samples of a portion have the noise of one part of the recipe's mixture. A

@@ -206,22 +206,53 @@ def test_crops_without_a_target_do_not_count_for_depth():
     hit[1] = 0.0
     clean[1] = 1.0
     output = torch.full((2, 1, 32, 32), 0.5)
-    alone = loss_of(output[:1], Batch(frame[:1], clean[:1], hit[:1]), kind="mse")
+    both = Batch(frame, clean, hit, torch.ones(2, 1, 1, 1))
+    alone = loss_of(output[:1], Batch(*(values[:1] for values in both)), kind="mse")
     assert alone == pytest.approx(0.01, rel=1e-5)
-    assert loss_of(output, Batch(frame, clean, hit), kind="mse") == pytest.approx(0.01, rel=1e-5)
+    assert loss_of(output, both, kind="mse") == pytest.approx(0.01, rel=1e-5)
 
 
 def test_the_chosen_depth_decides_what_counts_as_the_targets():
     """With histograms: a chosen depth that is right does not count as wrong because the pixel's own depth is."""
     hit = torch.ones(1, 1, 32, 32)
-    batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit)
+    batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit, torch.ones(1, 1, 1, 1))
     logits = 9 * hit.expand(-1, 3, -1, -1)
     candidates = torch.zeros(1, 1 + POOLED, 32, 32)
     right, wrong = (torch.cat([0.5 * hit, logits, chosen * hit, candidates], dim=1) for chosen in (0.5, 0.1))
     assert loss_of(right, batch, kind="mse") + 0.2 < loss_of(wrong, batch, kind="mse")
 
 
+def test_the_wide_view_and_the_selection_learn_from_their_own_answers_alone():
+    """Their errors reach no layer before them, and those of the other layers not theirs."""
+    torch.manual_seed(5)
+    network = networks.build_network("histograms")
+    frame = torch.rand(1, 3 + FEATURES, 32, 32)
+    batch = Batch(frame, torch.rand(1, 1, 32, 32), torch.ones(1, 1, 32, 32), torch.ones(1, 1, 1, 1))
+    output = network(frame)
+    first = 4 + 2 + POOLED
+    for part, own in ((output[:, :first], False), (output[:, first:], True)):
+        network.zero_grad()
+        rest = torch.cat([output[:, :first].detach(), part], dim=1) if own else part
+        loss_of(rest, batch, kind="psnr").backward(retain_graph=True)
+        for name, values in network.named_parameters():
+            late = name.startswith(("context.", "select."))
+            learns = values.grad is not None and bool((values.grad != 0).any())
+            assert not (learns and late != own), name
+    assert learns  # the last of the wide view's
+
+
+def test_crowded_crops_do_not_count_for_the_targets_probability():
+    hit = (torch.rand(1, 1, 32, 32) > 0.5).float()
+    frame, depth = torch.rand(1, 3, 32, 32), torch.full((1, 1, 32, 32), 0.5)
+    wrong, right = (torch.cat([depth, 9 * sign * (2 * hit - 1), depth, depth], dim=1) for sign in (-1, 1))
+    for judged in (0.0, 1.0):
+        batch = Batch(frame, depth, hit, torch.full((1, 1, 1, 1), judged))
+        more = loss_of(wrong, batch, kind="mse") - loss_of(right, batch, kind="mse")
+        assert more == pytest.approx(0.3 * 9 * judged, rel=1e-4, abs=1e-6)
+
+
 OPTIMISER = {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2}
+COUNTS = {"model": "histograms", "noise": {"counting": 1.0}, "optimiser": {"pool": 48}}
 RECIPE = {"model": "usdn", "data": "none", "seed": 4, "optimiser": OPTIMISER}
 
 
@@ -303,6 +334,12 @@ def test_a_folder_holds_one_recipe(tmp_path):
         ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
         ({"model": "histograms"}, r"noise.counting"),
         ({"start": "pyramid"}, r"start"),
+        ({"optimiser": {"pool": 48}}, r"optimiser.pool = 48 with model = 'usdn'"),
+        ({"mixture": [{"share": 1.0}]}, r"optimiser.pool = 0 with a mixture"),
+        ({**COUNTS, "mixture": [{"share": 0.4}, {"share": 0.5}]}, r"shares add up to 0.9, not to 1"),
+        ({**COUNTS, "mixture": [{"share": 1.0, "foton": [1.0, 2.0]}]}, r"mixture.*foton"),
+        ({**COUNTS, "mixture": [{"share": 1.0, "photons": [0.0, 2.0]}]}, r"mixture.*photons"),
+        ({**COUNTS, "mixture": [{"share": 1.0, "counting": 0.5}]}, r"noise.counting = 0.5"),
     ],
 )
 def test_errors_in_a_recipe_name_the_field(change, message):

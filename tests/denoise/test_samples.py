@@ -1,0 +1,116 @@
+"""The samples of a training: a pool that depends on seed and step alone, the mixture of its noises, its scenes."""
+
+import numpy as np
+import pytest
+import torch
+
+from spadwarp.denoise import samples
+from spadwarp.denoise.recipe import TrainingRecipe
+from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, crowded, in_open_water
+from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
+
+CPU = torch.device("cpu")
+SHARES = (0.5, 0.3, 0.2)
+OPTIMISER = {"batch": 4, "crop": 32, "scenes": 16, "redraw": 5, "pool": 2 * PORTIONS, "uses": 6.0}
+MIXTURE = [{"share": share, "photons": [10.0**part, 10.0**part]} for part, share in enumerate(SHARES)]
+MIXTURE[0]["crowded"] = 1.0
+MIXTURE[1]["open_water"] = 1.0
+
+
+def recipe(**changes):
+    tables = {"model": "histograms", "seed": 4, "noise": {"counting": 1.0, "ambient": 0.4}, "mixture": MIXTURE}
+    return TrainingRecipe.from_dict({**tables, "optimiser": {**OPTIMISER, **changes}})
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Replaces the drawing of noise, which takes long: what it was asked for, and random numbers of its generator."""
+    asked = []
+
+    def draw(scenes, noise, *, size, crop, generator, histograms):
+        asked.append((scenes, noise, size))
+        one = torch.rand(size, 1, 2, 2, generator=generator) + scenes.gate[:1, :1, None, None]
+        return Batch(one, one.clone(), one.clone(), torch.ones(size, 1, 1, 1))
+
+    monkeypatch.setattr(samples, "draw_batch", draw)
+    return asked
+
+
+def pool(**changes):
+    chosen = recipe(**changes)
+    return Pool(chosen, Scenes(chosen, 0, CPU, None), chosen.optimiser.batch, torch.Generator().manual_seed(1))
+
+
+def test_a_resumed_pool_holds_what_it_would_have_held(drawn):
+    for step in (0, 40, 101):
+        whole, resumed = pool(), pool()
+        for earlier in range(step + 1):
+            whole.prepare(earlier)
+        resumed.prepare(step)
+        for mine, theirs in zip(whole.memory, resumed.memory, strict=True):
+            filled = int(whole.filled)
+            assert filled == int(resumed.filled) > 0
+            assert torch.equal(mine[:filled], theirs[:filled])
+        assert torch.equal(whole.batch().frame, resumed.batch().frame)
+
+
+def test_a_sample_is_used_as_often_as_asked(drawn):
+    """Once the pool is full: samples taken over samples drawn."""
+    ours = pool()
+    first, steps = 200, 300
+    ours.prepare(first)
+    before = len(drawn)
+    for step in range(first + 1, first + steps + 1):
+        ours.prepare(step)
+    taken = steps * ours.batch().frame.shape[0]
+    assert taken / sum(size for _, _, size in drawn[before:]) == pytest.approx(OPTIMISER["uses"], rel=0.02)
+
+
+def test_a_pool_takes_only_samples_that_were_drawn(drawn):
+    ours = pool()
+    ours.prepare(0)
+    seen = {float(value) for value in ours.memory.frame[: int(ours.filled), 0, 0, 0]}
+    for _ in range(50):
+        assert {float(value) for value in ours.batch().frame[:, 0, 0, 0]} <= seen
+
+
+def test_parts_have_their_shares_and_their_noise(drawn):
+    ours = pool()
+    count = 600
+    for step in range(0, count * ours.interval, ours.interval):
+        ours.prepare(step)
+    photons = np.array([noise.photons[0] for _, noise, _ in drawn])
+    for part, share in enumerate(SHARES):
+        error = np.sqrt(share * (1 - share) / len(photons))
+        assert abs(np.mean(photons == 10.0**part) - share) < 4 * error
+    assert {noise.ambient for _, noise, _ in drawn} == {0.4}  # of [noise]
+
+
+def test_crowded_samples_do_not_judge_the_target(drawn):
+    ours = pool()
+    ours.prepare(0)
+    for number, (scenes, noise, size) in enumerate(drawn):
+        judged = ours.memory.judged[number * size : (number + 1) * size]
+        assert bool(judged.any()) == (noise.crowded == 0.0)
+        if noise.open_water:
+            share = scenes.depth.isfinite().flatten(1).float().mean(1)
+            assert ((share > 0.03) & (share < 0.85)).all()
+
+
+def test_of_two_scenes_a_pixel_sees_the_nearer():
+    scenes = procedural_scenes(12, 48, seed=3, device="cpu")
+    both = crowded(scenes)
+    for place in range(12):
+        pair = torch.stack([scenes.depth[place], scenes.depth[place - 1]]).nan_to_num(torch.inf)
+        assert torch.equal(both.depth[place].nan_to_num(torch.inf), pair.amin(dim=0))
+        sigma = torch.stack([scenes.sigma[place], scenes.sigma[place - 1]])
+        nearer = sigma.gather(0, pair.argmin(dim=0)[None])[0]
+        seen = both.depth[place].isfinite()
+        assert torch.equal(both.sigma[place][seen], nearer[seen])
+    low, high = both.gate[:, 0, None, None], both.gate[:, 1, None, None]
+    assert (((both.depth > low) & (both.depth < high)) | both.depth.isnan()).all()
+
+
+def test_without_open_water_all_scenes_are_taken():
+    wall = CleanScenes(torch.ones(3, 8, 8), torch.ones(3, 8, 8), torch.ones(3, 2), torch.ones(3, 64))
+    assert in_open_water(wall) is wall
