@@ -47,14 +47,24 @@ def test_it_stays_where_the_others_do_not_see_both_surfaces():
     assert torch.equal(follow_the_others(found, features), found)
 
 
-def test_edges_and_other_depths_stay():
-    """Half of the image has the one surface, half the other; and an answer that is neither of both."""
+@pytest.mark.parametrize("third", [0.2, 0.43, 0.6])
+def test_an_answer_that_is_neither_return_moves_if_it_is_far(third):
+    """Three other depths: before both returns, between them and nearer the one not taken, and behind both."""
+    found, features = seen(one_of(FAR, NEAR))
+    found[:, :, 4, 4] = third
+    assert torch.allclose(follow_the_others(found, features), torch.tensor(FAR))
+    features[:, SEEN + 1] = 0.0  # one return
+    assert torch.equal(follow_the_others(found, features), found)
+
+
+def test_edges_and_answers_near_the_surface_stay():
+    """Half of the image has the one surface, half the other; and an answer within 5 % of the gate of the surface."""
     answers = np.full((9, 9), FAR)
     answers[:, :4] = NEAR
     found, features = seen(answers)
     assert torch.equal(follow_the_others(found, features), found)
     found, features = seen(one_of(FAR, NEAR))
-    found[:, :, 4, 4] = 0.45
+    found[:, :, 4, 4] = 0.46
     assert torch.equal(follow_the_others(found, features), found)
 
 
