@@ -24,7 +24,7 @@ from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.cli import app
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, files, metrics, network_files, photon_counts, reading, training_steps
+from spadwarp.denoise import baselines, files, metrics, network_files, photon_counts, reading, samples, training_steps
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import load_training_recipe
@@ -334,19 +334,17 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
     assert steps == [4, 8, 12, 16]
 
     streams = [torch.Generator().manual_seed(3 * 1009 + rank) for rank in range(2)]
-    draw, loss = training_steps.draw_batch, training_steps.loss_of
+    draw, loss = samples.draw_batch, training_steps.loss_of
 
     def both(scenes, noise, *, size, generator, **others):
-        if others.get("always_replaced"):  # of the validation
-            return draw(scenes, noise, size=size, generator=generator, **others)
         halves = [draw(scenes, noise, size=size // 2, generator=one, **others) for one in streams]
         return Batch(*map(torch.cat, zip(*halves, strict=True)))
 
     def mean_loss(output, batch, *, kind):
-        halves = zip(*(one.chunk(2) for one in (output, batch.frame, batch.clean, batch.hit)), strict=True)
+        halves = zip(*(one.chunk(2) for one in (output, *batch)), strict=True)
         return sum(loss(one, Batch(*parts), kind=kind) for one, *parts in halves) / 2
 
-    monkeypatch.setattr(training_steps, "draw_batch", both)
+    monkeypatch.setattr(samples, "draw_batch", both)
     monkeypatch.setattr(training_steps, "loss_of", mean_loss)
     scenes = [read_scenes(dataset, split) for split in ("train", "validation")]
     fit(load_training_recipe(place), *scenes, tmp_path / "one", device="cpu")
