@@ -62,6 +62,7 @@ LOADED_LATE = {
     "denoise/networks.py",
     "denoise/pyramid.py",
     "denoise/repeatable.py",
+    "denoise/samples.py",
     "denoise/scattered_light.py",
     "denoise/selection.py",
     "denoise/semi_global.py",
