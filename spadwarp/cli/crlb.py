@@ -46,6 +46,7 @@ def crlb(
 
     The least standard deviation of any unbiased estimate, with pile-up, noise and instrument response: when everything
     that is named is unknown, and when all others are known. What not knowing the water costs in depth is the ratio.
+    Of values of the pixels, the table shows the median of the pixels that see a target.
 
     \b
     Examples:

@@ -138,7 +138,7 @@ def _table(found: Fit) -> Table:
             rounded(one.value, one.standard_error),
             f"{one.standard_error:.2g}",
             " to ".join(rounded(end, one.standard_error) for end in one.interval),
-            f"{one.start:.4g}",
+            rounded(one.start, one.standard_error),
             f"{percent(one.simulation)} %",
         )
     return table

@@ -13,7 +13,7 @@ from spadwarp.scene import detection_efficiency, noise_rate
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
 
-__all__ = ["MonteCarloNoise", "monte_carlo_noise", "noise_caption"]
+__all__ = ["LIMIT", "MonteCarloNoise", "monte_carlo_noise", "noise_caption"]
 
 LIMIT = 0.5
 """Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""

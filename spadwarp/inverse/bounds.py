@@ -16,7 +16,7 @@ from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.fitting import BATCHES, PHOTONS, SIMULATION, checked_prior, detector_law
 from spadwarp.inverse.rendering import Renderer
 from spadwarp.inverse.solving import Solution
-from spadwarp.inverse.unknowns import DEPTH, read_unknowns, start_value
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, read_unknowns, start_value
 from spadwarp.inverse.weighing import solved
 from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import SceneLike, as_scene
@@ -33,14 +33,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Bound:
-    """Bound of one unknown; of an unknown of each pixel in the median pixel.
+    """Bound of one unknown; of an unknown of each pixel, the median of the pixels that see a target.
 
     Attributes:
         name, value, unit: The unknown and its value in the scene; depth counts from where the targets are.
         standard_error: Least standard deviation of an unbiased estimate when all unknowns are unknown.
         alone: The same when all others are known.
         relative: `standard_error` over the value; NaN for depth.
-        per_pixel: Whether each pixel has a value of its own.
+        per_pixel: Whether each pixel has a value of its own. The median of the background is that of all pixels.
     """
 
     name: str
@@ -164,7 +164,8 @@ def bounds(
             break
         number = min(most, int(number * max(2.0, min(solution.simulation_share / (0.8 * SIMULATION), 16.0))))
     mean = law.mean(halves[0].rates, planned_pulses(law, halves[0].rates, pulses))
-    found, maps, alone_maps = _table(unknowns, values, scales, own, solution, image)
+    assert render.truth is not None
+    found, maps, alone_maps = _table(unknowns, values, scales, own, solution, np.isfinite(render.truth.depth))
     covariance = _inverse(solution.information)
     names = [one.name for one in shared]
     warnings = render.warnings() + not_identifiable(
@@ -205,9 +206,13 @@ def _table(
     scales: Floats,
     own: Equations,
     solution: Solution,
-    image: tuple[int, int],
+    seen: NDArray[np.bool_],
 ) -> tuple[dict[str, Bound], dict[str, Floats], dict[str, Floats]]:
-    """Bounds by name, and maps of those of the pixels: with all unknown, and with all others known."""
+    """Bounds by name, and maps of those of the pixels: with all unknown, and with all others known.
+
+    `seen` `[H, W]`: where a target is. Other pixels have light of the targets that the water has scattered, and so a
+    bound, but it is not what one asks for.
+    """
     covariance = _inverse(solution.information)
     blocks = np.einsum("pii->pi", own.slope)
     bounds, maps, alone_maps = {}, {}, {}
@@ -217,8 +222,9 @@ def _table(
             with np.errstate(divide="ignore", invalid="ignore"):
                 together = np.sqrt(solution.own_bound[:, column, column]) * scales[i]
                 alone_map = scales[i] / np.sqrt(np.where(blocks[:, i] > 0, blocks[:, i], np.nan))
-            maps[one.name], alone_maps[one.name] = together.reshape(image), alone_map.reshape(image)
-            error, alone = (float(np.nanmedian(part)) for part in (together, alone_map))
+            maps[one.name], alone_maps[one.name] = together.reshape(seen.shape), alone_map.reshape(seen.shape)
+            rows = slice(None) if one.name == BACKGROUND or not seen.any() else seen.reshape(-1)
+            error, alone = (float(np.nanmedian(part[rows])) for part in (together, alone_map))
             column += 1
         else:
             total = float(blocks[:, i].sum())

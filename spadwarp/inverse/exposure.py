@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ class Exposure:
         window: Start [s] and bins of the detector's window.
         tdc_widths: Relative widths of its bins; None: equal.
         irf: The response that the counts contain; None: that of the scene.
+        monte_carlo_noise: Of simulated counts: standard error of their simulation over their shot noise, at the 95th
+            percentile of the pixels; None: not known, or measured.
     """
 
     counts: NDArray[np.int64] | None
@@ -37,6 +40,7 @@ class Exposure:
     window: tuple[float, int]
     tdc_widths: NDArray[np.float64] | None = None
     irf: InstrumentResponse | None = None
+    monte_carlo_noise: float | None = None
 
     def left(self) -> NDArray[np.float32]:
         """Pulses without a count before each bin, `[pixel, bin]`: those that first-photon counting has left there."""
@@ -68,14 +72,15 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         counts = FramesFile.load(path) if own else read_histograms(path, **facts)
     gate = scene.gate
     start, width, irf, widths = gate.start, gate.bin_width, None, None
-    values = counts
+    values, noise = counts, None
     if isinstance(counts, Frames | FramesFile):
         start, width, irf = counts.gate_start, counts.bin_width, counts.irf
         steps = np.diff(counts.edges)
         widths = None if np.allclose(steps, steps[0], rtol=1e-9) else steps
-        pulses = counts.pulses if pulses is None else pulses
+        pulses, noise = counts.pulses if pulses is None else pulses, counts.monte_carlo_noise
         if isinstance(counts, Frames) and counts.summed:
             pulses *= counts.frames
+            noise = None if noise is None else noise * math.sqrt(counts.frames)
         values = counts.counts() if isinstance(counts, FramesFile) else counts.counts
     elif isinstance(counts, Histograms):
         start, irf, values = counts.gate_start, counts.irf, counts.values
@@ -92,6 +97,7 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         window=(start, cube.shape[1]),
         tdc_widths=widths,
         irf=irf,
+        monte_carlo_noise=None if noise is None else noise * math.sqrt(frames),
     )
 
 

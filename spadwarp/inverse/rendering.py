@@ -174,15 +174,21 @@ class Renderer:
         return {"seed": self.seed, "device": self.device, "apart": self.apart, "tally": self._tally}
 
     def _with_focus(self, scene: Scene) -> Scene:
-        """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved."""
+        """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.
+
+        The view stays that of the scene, too: with a focus in metres, the distance of the sensor would follow it.
+        """
         from spadwarp.mesh import build_mesh, focus_distance
 
         if "focus" not in self._kept:
             self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
-        focus = self._kept["focus"]
-        if focus is None or scene.camera.focus_distance != "target":
+        focus, camera = self._kept["focus"], scene.camera
+        if focus is None or camera.focus_distance != "target":
             return scene
-        return scene.model_copy(update={"camera": scene.camera.model_copy(update={"focus_distance": focus})})
+        changes: dict[str, Any] = {"focus_distance": focus}
+        if camera.pixel_pitch_um is not None:
+            changes |= {"fx": camera.focal_pixels[0], "pixel_pitch_um": None}
+        return scene.model_copy(update={"camera": camera.model_copy(update=changes)})
 
     def _receiver(self, scene: Scene, values: Values) -> Receiver:
         gate, camera, detector = scene.gate, scene.camera, scene.detector

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.frames.monte_carlo_noise import LIMIT
 from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
 from spadwarp.inverse.unknowns import DEPTH, Unknown, with_values
 from spadwarp.units import percent
@@ -92,7 +93,7 @@ def estimates_of(
         covariance=solution.covariance,
         iterations=tuple(iterations),
         converged=converged,
-        warnings=(*warnings, *_warnings(names, solution, shared, prior, converged)),
+        warnings=(*warnings, *_of_simulated(exposure), *_warnings(names, solution, shared, prior, converged)),
         depth=depth,
         counts=exposure.counts.reshape(*image, -1),
         expected=expected.reshape(*image, -1),
@@ -118,6 +119,19 @@ def _estimate(one: Unknown, value: float, error: float, simulation: float, start
         simulation=simulation,
         start=start,
         unit=one.unit,
+    )
+
+
+def _of_simulated(exposure: Exposure) -> tuple[str, ...]:
+    """A warning where simulated counts hold more noise than their photons have."""
+    noise = exposure.monte_carlo_noise
+    if noise is None or noise <= LIMIT:
+        return ()
+    return (
+        f"the counts are simulated, and the simulation traced too few photons for {exposure.pulses} pulses: its noise, "
+        f"the same in every frame, is {noise:.2g} times the shot noise of the counts (95th percentile of the pixels); "
+        f"the standard errors do not contain it. {math.ceil((noise / LIMIT) ** 2)} times the photons would make it "
+        f"{LIMIT:g}",
     )
 
 

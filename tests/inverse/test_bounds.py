@@ -6,7 +6,9 @@ import pytest
 import spadwarp
 from helpers.inverse import CLEAR, UNKNOWN, plate
 from spadwarp.frames import detector_response
-from spadwarp.inverse import bounds
+from spadwarp.inverse import bounds, read_unknowns
+from spadwarp.inverse.exposure import Exposure
+from spadwarp.inverse.rendering import Renderer
 
 pytestmark = pytest.mark.physics
 
@@ -77,3 +79,31 @@ def test_bins_much_wider_than_the_response_are_named():
     for unknown, named in (("depth", True), ("reflectance", False)):
         found = bounds(wide, unknown=unknown, photons=2000, device="cpu")
         assert any("much shorter than a bin" in text for text in found.warnings) == named
+
+
+def test_the_median_of_the_pixels_is_that_of_those_that_see_a_target():
+    # Half of the image is water, which has light of the plate that was scattered beside it.
+    scene = plate({"targets[0].translation": [-1.5, 0.0, 1.5]})
+    found = bounds(scene, unknown="depth:pixel", pulses=10**6, photons=400_000, device="cpu")
+    seen = np.isfinite(spadwarp.truth_maps(scene, device="cpu").depth)
+    beside = found.maps["depth"][~seen]
+    assert 0.4 < seen.mean() < 0.6 and np.isfinite(beside).any()
+    assert found.bounds["depth"].standard_error == np.nanmedian(found.maps["depth"][seen])
+    assert found.bounds["depth"].standard_error < 0.5 * np.nanmedian(beside)
+
+
+def test_the_depth_is_looked_for_in_the_view_of_the_scene():
+    # Of a focal length in metres: with a focus in metres, the sensor would stand further from the lens than in focus on
+    # the target, and the view would be 5 % narrower.
+    scene = plate(
+        {
+            "camera.focal_length": 0.08,
+            "camera.pixel_pitch_um": 4000.0,
+            "targets[0].rotation_deg": [0.0, 40.0, 0.0],
+            "targets[0].size": [1.0, 1.0],
+        }
+    )
+    exposure = Exposure(counts=None, pulses=1, window=(scene.gate.start, scene.gate.bins))
+    render = Renderer(scene, read_unknowns(scene, "depth"), exposure, device="cpu")
+    render({"depth": 0.0}, photons=1000)
+    np.testing.assert_array_equal(render.truth.depth, spadwarp.truth_maps(scene, device="cpu").depth)

@@ -166,3 +166,12 @@ def test_commands_say_what_python_says(light, tmp_path):
     twin = spadwarp.inverse.bounds(scene, unknown=UNKNOWN, photons=100_000, pulses=10_000, device="cpu")
     one = tables(tmp_path / "crlb.json")["bounds"]["medium.scattering"]
     assert one["standard_error"] == pytest.approx(twin.bounds["medium.scattering"].standard_error, rel=1e-6)
+
+
+def test_noise_that_simulated_counts_inherit_is_said():
+    scene = plate()
+    few = spadwarp.simulate(scene, photons=30_000, seed=2, uncertainty=True, device="cpu")
+    frames = spadwarp.detect(few, pulses=500_000, frames=4, seed=3, device="cpu")
+    assert read_exposure(frames, scene).monte_carlo_noise == pytest.approx(2 * frames.monte_carlo_noise)
+    found = spadwarp.fit(frames, scene, unknown="absorption", photons=30_000, device="cpu")
+    assert any("the simulation traced too few photons for 2000000 pulses" in text for text in found.warnings)
