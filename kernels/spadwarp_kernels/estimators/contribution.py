@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.math.bits import from_bits
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.math.rotations import one_minus_cosine, set_apart, snap_direction
@@ -21,6 +20,7 @@ from spadwarp_kernels.surface.ggx import ggx_brdf
 from spadwarp_kernels.surface.lambert import lambert_brdf
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
+from spadwarp_kernels.surface.trace import patch_face, tree_face
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, Scores, tally_index
 
 from .flight_sampling import make_sample_flight
@@ -255,6 +255,7 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    face_at = patch_face if spec.brute_force and not spec.public_tree else tree_face
     divides, fused = spec.polarised and spec.port is None, _fused_axes(spec, flights)
 
     @wp.func
@@ -273,8 +274,7 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
         if wp.static(has_mesh):
             on_surface = request.slot >= 0
             if on_surface:
-                face = face_in(surfaces.order, request.slot)
-                normal = face_normal(surfaces.faces, request.slot, request.u)
+                face, normal = face_at(surfaces, request.slot, request.u)
                 cos_out = wp.max(wp.dot(v, normal), 0.0)
                 scattering = lambert_brdf(reflectance_at(surfaces, face, x)) * cos_out
                 if wp.static(specular):

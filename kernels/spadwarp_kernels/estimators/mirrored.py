@@ -27,7 +27,7 @@ from spadwarp_kernels.sensor.camera import Camera, lens_point
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
+from spadwarp_kernels.surface.trace import intersect_surfaces, meets_faces
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Scores, tally_index
 
@@ -116,7 +116,7 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
                 if way.clear and segment_meets_box(start, heading, part, surfaces.lower, surfaces.upper):
                     way.shadow_queries += 1
                     if wp.static(brute_force):
-                        way.clear = intersect_faces(surfaces, start, heading, part).face < 0
+                        way.clear = not meets_faces(surfaces, start, heading, part)
                     else:
                         way.clear = intersect_surfaces(surfaces, start, heading, part, True).face < 0
             begin += part * along

@@ -8,8 +8,6 @@ from spadwarp_kernels.phase.phase_function import PhaseFunction
 from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.sensor.projection import PLAIN, Lens
 
-# Meshes of at most this many faces need no BVH.
-BRUTE_FORCE_FACES = 12
 MOST_POINTS = 3
 
 

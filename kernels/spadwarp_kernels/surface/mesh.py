@@ -17,6 +17,7 @@ from spadwarp_kernels.arguments import (
     check_values,
 )
 from spadwarp_kernels.intersect.bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
+from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES, PATCH_ROWS, empty_patches, pack_patches, set_patches
 from spadwarp_kernels.intersect.triangle import LANES, face_vectors, pack_faces, set_faces
 from spadwarp_kernels.intersect.wide import empty_wide, pack_wide, refit_wide
 from spadwarp_kernels.sensor.camera import Camera
@@ -57,6 +58,7 @@ class Surfaces:
         depth, levels: Of the tree of a moving mesh, see `node_depths`; empty for others, and on the CPU but for one
             level.
         extent: Largest coordinate that the tree is made for [m].
+        patches, normals: Of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all.
     """
 
     mesh: wp.uint64
@@ -74,6 +76,8 @@ class Surfaces:
     depth: wp.array(dtype=int)
     levels: int
     extent: float
+    patches: wp.array(dtype=wp.vec4)
+    normals: wp.array(dtype=wp.vec4)
 
 
 def make_surfaces(
@@ -143,6 +147,7 @@ def make_surfaces(
     surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device) if device.is_cuda else empty_wide()
     surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
+    surfaces.patches, surfaces.normals = empty_patches(device)
     if mesh is None:
         return surfaces
     if textures is not None:
@@ -174,11 +179,19 @@ def make_surfaces(
     else:
         surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
         surfaces.levels = 0 if extent is None else 1
+    surfaces.patches, surfaces.normals = _few_patches(mesh, surfaces.order, extent is None)
     surfaces.lower = wp.vec3(*(lower - padding))
     surfaces.upper = wp.vec3(*(upper + padding))
     if camera is not None:
         surfaces.near_depth = near_depth_map(mesh, camera)
     return surfaces
+
+
+def _few_patches(mesh: wp.Mesh, order: wp.array, pairs: bool) -> tuple[wp.array, wp.array]:
+    """Those of `Surfaces`."""
+    if not mesh.device.is_cuda or mesh.indices.size > 3 * BRUTE_FORCE_FACES:
+        return empty_patches(mesh.device)
+    return pack_patches(mesh, order.numpy(), pairs)
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
@@ -200,7 +213,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     check_kind("mesh", mesh, wp.Mesh)
     if surfaces.mesh != mesh.id:
         raise ArgumentError("surfaces are not those of mesh")
-    for name in ("near_depth", "nodes", "faces", "order", "depth", "levels"):
+    for name in ("near_depth", "nodes", "faces", "order", "depth", "levels", "patches", "normals"):
         if getattr(surfaces, name) is None:
             raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
     if (surfaces.near_depth.size > 0) != (camera is not None):
@@ -218,6 +231,8 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
         refit_bvh(*tree, surfaces.depth, surfaces.levels)
     else:
         refit_wide(*tree)
+    if surfaces.patches.size:
+        set_patches(mesh, surfaces.patches, surfaces.normals)
     if camera is not None:
         update_near_depth(surfaces.near_depth, mesh, camera)
 
@@ -227,6 +242,14 @@ def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) ->
     slots = faces if device.is_cuda else None
     slots = check_array(f"{name}.order", surfaces.order, wp.int32, (slots,), device).size
     check_array(f"{name}.faces", surfaces.faces, wp.vec4, (face_vectors(slots, device),), device)
+
+
+def check_patches(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
+    """Raises `ArgumentError` for patches of another number of faces, or of none."""
+    check_array(f"{name}.normals", surfaces.normals, wp.vec4, (faces,), device)
+    size = check_array(f"{name}.patches", surfaces.patches, wp.vec4, (None,), device).size
+    if size == 0 or size % PATCH_ROWS:
+        raise ArgumentError(f"{name}.patches has {size} entries; make_surfaces fills it")
 
 
 def _check_mesh(mesh: Any) -> wp.Device:

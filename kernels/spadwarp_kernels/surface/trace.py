@@ -4,7 +4,8 @@ import warp as wp
 
 from spadwarp_kernels.intersect.box import inverse_direction
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
-from spadwarp_kernels.intersect.triangle import face_distance, face_in, face_normal
+from spadwarp_kernels.intersect.patches import nearest_patch, normal_and_face, patch_faces, patch_normal
+from spadwarp_kernels.intersect.triangle import face_in, face_normal
 from spadwarp_kernels.intersect.wide import walk_wide
 from spadwarp_kernels.math.bits import bits_of
 
@@ -57,23 +58,22 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 
 
 @wp.func
-def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
-    """As `intersect_mesh`, by trying every face: faster than a tree for a handful of them on a GPU."""
+def patch_hit(surfaces: Surfaces, met: wp.vec4) -> SurfaceHit:
+    """The hit on the patch that `nearest_patch` has found."""
+    row = bits_of(met[3])
+    named = patch_faces(surfaces.patches, row, met[2] > 0.0)
     hit = SurfaceHit()
-    hit.face = -1
-    hit.slot = -1
-    hit.distance = max_distance
-    nearest = int(-1)
-    for slot in range(surfaces.order.shape[0]):
-        distance = face_distance(surfaces.faces, slot, x, u)
-        if distance >= 0.0 and distance < hit.distance:
-            hit.distance = distance
-            nearest = slot
-    if nearest >= 0:
-        hit.slot = nearest
-        hit.face = face_in(surfaces.order, nearest)
-        hit.normal = face_normal(surfaces.faces, nearest, u)
+    hit.distance = met[0]
+    hit.normal = patch_normal(surfaces.patches, row, met[1])
+    hit.slot = named[0]
+    hit.face = named[1]
     return hit
+
+
+@wp.func
+def meets_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> bool:
+    """Whether the ray x + s u, 0 <= s < max_distance, hits one of a handful of faces."""
+    return bits_of(nearest_patch(surfaces.patches, x, u, max_distance)[3]) >= 0
 
 
 @wp.func_native("""
@@ -86,6 +86,22 @@ def intersect_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: fl
 def _on_cpu() -> bool:
     """Known when the kernel is compiled, so that each device has one of the two walks."""
     ...
+
+
+@wp.func
+def tree_face(surfaces: Surfaces, slot: int, u: wp.vec3):
+    """The face in a slot: its index, and its unit normal against u."""
+    return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
+
+
+@wp.func
+def patch_face(surfaces: Surfaces, slot: int, u: wp.vec3):
+    """`tree_face` for surfaces with patches."""
+    if _on_cpu():
+        return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
+    row = normal_and_face(surfaces.normals, slot)
+    normal = wp.vec3(row[0], row[1], row[2])
+    return bits_of(row[3]), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
 
 
 @wp.func

@@ -21,6 +21,7 @@ from spadwarp_kernels.arguments import (
 from spadwarp_kernels.estimators.contribution import takes_collisions
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
+from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.medium.grid import Grid
 from spadwarp_kernels.medium.layers import Layers, Water
 from spadwarp_kernels.medium.limits import Limits
@@ -29,7 +30,7 @@ from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
 from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.phase.tabulated import TABULATED
 from spadwarp_kernels.photon.records import Records
-from spadwarp_kernels.photon.spec import BRUTE_FORCE_FACES, MOST_POINTS, TransportSpec
+from spadwarp_kernels.photon.spec import MOST_POINTS, TransportSpec
 from spadwarp_kernels.polarisation.request import MATRIX_POINTS, MOST_CHANNELS, Polarisation
 from spadwarp_kernels.port.kinds import PortKind, check_port
 from spadwarp_kernels.random.density_tables import TABLE_CELLS
@@ -38,7 +39,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.sensor.projection import PLAIN, Lens
 from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.surface.mesh import Surfaces, check_faces, surface_choices
+from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
 from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
@@ -267,6 +268,8 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
     check_faces("model.surfaces", surfaces, faces, device)
+    if spec.brute_force and device.is_cuda:
+        check_patches("model.surfaces", surfaces, faces, device)
     check_array("model.surfaces.nodes", surfaces.nodes, wp.vec4, (None,), device)
     check_array("model.surfaces.near_depth", surfaces.near_depth, wp.float32, (None, None), device)
     if spec.pattern:

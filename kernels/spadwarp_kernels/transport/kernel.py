@@ -21,6 +21,8 @@ from spadwarp_kernels.estimators.queue import long_queue_fits, make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, place, step_leaf, step_node
+from spadwarp_kernels.intersect.pairs import NOWHERE
+from spadwarp_kernels.intersect.patches import nearest_patch
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -54,7 +56,7 @@ from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import intersect_faces, surface_hit
+from spadwarp_kernels.surface.trace import patch_hit, surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import TOO_LONG
@@ -201,12 +203,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper):
                             s.stage = RAY
                     if wp.static(brute_force):
-                        hit = intersect_faces(surfaces, s.x, s.u, s.flight.reach)
+                        # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
+                        met = nearest_patch(surfaces.patches, s.x, s.u, NOWHERE)
                         s.surface_queries += 1
-                        if hit.face >= 0:
-                            if hit.distance < s.flight.distance:
-                                s.hit = hit
-                            s.flight = shorten(s.flight, hit.distance)
+                        if met[0] < s.flight.distance:
+                            s.hit = patch_hit(surfaces, met)
+                        s.flight = shorten(s.flight, met[0])
                 # Round 0 scores the flight, round 1 the event at its end.
                 round = int(wp.static(0 if flights and not at_once else 1))
                 while round < 2:

@@ -12,7 +12,7 @@ from spadwarp_kernels.photon.state import FLIGHT, NO_RAY, RAY, SHADOW_RAY, SURFA
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import may_be_hidden
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import intersect_faces, intersect_surfaces
+from spadwarp_kernels.surface.trace import intersect_surfaces, meets_faces
 
 
 @wp.struct
@@ -69,8 +69,8 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
                     if not found.seen:
                         found.shadow_queries = 1
                         length = wp.length(to)
-                        hit = intersect_faces(surfaces, found.origin, to / length, length)
-                        found.contribution.value = wp.where(hit.face < 0, found.contribution.value, 0.0)
+                        hidden = meets_faces(surfaces, found.origin, to / length, length)
+                        found.contribution.value = wp.where(hidden, 0.0, found.contribution.value)
                         found.seen = True
         return found
 
