@@ -74,7 +74,7 @@ def make_queue(
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
     entries = queue_entries(points, long)
-    warp_memory = make_warp_memory(_vectors(more, derivatives, polarised) * entries if used else 0)
+    warp_memory = make_warp_memory(_vectors(more, derivatives, polarised) * entries if used else 0, flights and long)
 
     @wp.func
     def write(memory: int, entry: int, request: Request):

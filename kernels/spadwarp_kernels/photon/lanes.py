@@ -56,7 +56,7 @@ _MEMORY = """
     unsigned int begin = __cvta_generic_to_shared(memory + %du * (threadIdx.x >> 5u));
     // Out of the compiler's sight, which else computes it anew, in six instructions, wherever it is used.
     asm volatile("" : "+r"(begin));
-    return begin;
+    return %s;
 #else
     return 0;
 #endif
@@ -68,13 +68,17 @@ def fits_in_block(vectors: int) -> bool:
     return 16 * (_QUEUE + vectors) * BLOCK_SIZE // 32 <= 48 * 1024
 
 
+# As if another lane had it: the assembler too, which looks through the above, then keeps it in a register.
+_HELD = "__shfl_sync(0xffffffffu, begin, threadIdx.x & 31u)"
+
+
 @made_once
-def make_warp_memory(vectors: int) -> wp.Function:
+def make_warp_memory(vectors: int, held: bool = False) -> wp.Function:
     """The Warp function ``() -> int``: where the shared memory of a warp begins, with so many vec4 in its queue; CUDA
-    alone. Kernels take no more than they need, since the cache has the rest."""
+    alone. Kernels take no more than they need, since the cache has the rest. `held`: in a register, come what may."""
     of_warp = _QUEUE + vectors
 
-    @wp.func_native(_MEMORY % (of_warp * BLOCK_SIZE // 32, of_warp))
+    @wp.func_native(_MEMORY % (of_warp * BLOCK_SIZE // 32, of_warp, _HELD if held else "begin"))
     def warp_memory() -> int: ...
 
     return warp_memory
