@@ -238,8 +238,6 @@ def _fused_axes(spec: TransportSpec, flights: bool) -> int:
     Found in the machine code of Warp 1.19 and CUDA 13. Where it is another number, the intensity differs in the last
     bits from that of the run without polarisation, and a test on a GPU fails.
     """
-    if spec.mesh and spec.brute_force:
-        return 0
     if spec.mesh or spec.varies:
         return 0 if flights else 2
     return 2 if flights else 3
