@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
+from spadwarp.device import physical_memory
+from spadwarp.errors import DeviceError
 
 __all__ = ["Fresh", "Pool", "Samples", "Scenes"]
 
@@ -17,6 +22,7 @@ PORTIONS = 24
 """Portions of which a pool consists; each is drawn at once."""
 
 _FIRST = 8  # portions that are drawn before the first step
+_PIECE = 8  # samples that are drawn at once on a CPU, which takes half a second each
 _WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a target in open water
 
 
@@ -49,9 +55,16 @@ class Scenes:
 
 
 class Samples(Protocol):
-    """What a step learns from. `batch` is recorded in a CUDA graph, `prepare` is called before each step."""
+    """What a step learns from. `batch` is recorded in a CUDA graph, `prepare` is gone through before each step."""
 
-    def prepare(self, step: int) -> None: ...
+    seconds: float
+    """What `prepare` takes, on average over the steps."""
+
+    def prepare(self, step: int) -> Iterator[tuple[int, int]]:
+        """Draws what the step needs, piece by piece, and yields how many samples of how many are drawn.
+
+        What was drawn of an unfinished one is drawn again by the next.
+        """
 
     def hold(self) -> None:
         """From now on `batch` reads the same memory in every step."""
@@ -69,13 +82,15 @@ class Fresh:
         self.generator, self.histograms = generator, histograms
         self.now: CleanScenes | None = None
         self.held: CleanScenes | None = None
+        self.seconds = 0.0  # scenes are few, and drawn rarely
 
-    def prepare(self, step: int) -> None:
+    def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         now = self.scenes.at(step)
         if self.held is not None and now is not self.now:
             for kept, new in zip(self.held, now, strict=True):
                 kept.copy_(new)
         self.now = now
+        yield from ()
 
     def hold(self) -> None:
         assert self.now is not None
@@ -103,6 +118,9 @@ class Pool:
         size: Samples of a batch.
         generator: Chooses the samples of each batch.
         share: Part of the pool that this process has.
+
+    Raises:
+        DeviceError: The pool is larger than the memory of the device.
     """
 
     def __init__(
@@ -112,15 +130,32 @@ class Pool:
         self.recipe, self.scenes, self.size, self.generator = recipe, scenes, size, generator
         self.portion = max(1, round(share * settings.pool / PORTIONS))
         self.interval = max(1, round(settings.uses * self.portion / size))
+        self.piece = self.portion if generator.device.type == "cuda" else min(_PIECE, self.portion)
         self.parts = recipe.parts()
-        self.drawn = 0
+        self.drawn, self.seconds = 0, 0.0
         self.filled = torch.zeros((), device=generator.device)
         self.memory: Batch | None = None
+        self._check_memory()
 
-    def prepare(self, step: int) -> None:
+    def _check_memory(self) -> None:
+        settings, device = self.recipe.optimiser, self.generator.device
+        needed = 4 * PORTIONS * self.portion * settings.crop**2 * (3 + FEATURES + 2)
+        available = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else physical_memory()
+        if available is not None and needed > available:
+            raise DeviceError(
+                f"optimiser.pool = {settings.pool} with optimiser.crop = {settings.crop} needs {needed / 2**30:.1f} "
+                f"GiB on {device}; {available / 2**30:.1f} GiB are available"
+            )
+
+    def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         due = _FIRST + step // self.interval
-        for number in range(max(self.drawn, due - PORTIONS), due):
-            self._draw(number, self.scenes.at(max(0, number - _FIRST) * self.interval))
+        first = max(self.drawn, due - PORTIONS)
+        total = max(0, due - first) * self.portion
+        for number in range(first, due):
+            began = time.monotonic()
+            for drawn in self._draw(number, self.scenes.at(max(0, number - _FIRST) * self.interval)):
+                yield (number - first) * self.portion + drawn, total
+            self.seconds = (time.monotonic() - began) / self.interval
         self.drawn = due
 
     def hold(self) -> None:
@@ -133,7 +168,7 @@ class Pool:
         return Batch(*(values.index_select(0, index) for values in self.memory))
 
     @torch.no_grad()
-    def _draw(self, number: int, scenes: CleanScenes) -> None:
+    def _draw(self, number: int, scenes: CleanScenes) -> Iterator[int]:
         host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number))
         part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
         seed = int(host.integers(2**62))
@@ -141,17 +176,22 @@ class Pool:
         is_crowded = host.random() < part.crowded
         if host.random() < part.open_water:
             scenes = in_open_water(scenes)
-        new = draw_batch(
-            crowded(scenes) if is_crowded else scenes, part, size=self.portion, crop=self.recipe.optimiser.crop,
-            generator=generator, histograms=True,
-        )  # fmt: skip
         if is_crowded:
-            new = new._replace(judged=torch.zeros_like(new.judged))
-        if self.memory is None:
-            self.memory = Batch(*(values.new_empty(PORTIONS * len(values), *values.shape[1:]) for values in new))
+            scenes = crowded(scenes)
         first = number % PORTIONS * self.portion
-        for kept, values in zip(self.memory, new, strict=True):
-            kept[first : first + self.portion] = values
+        for done in range(0, self.portion, self.piece):
+            new = draw_batch(
+                scenes, part, size=min(self.piece, self.portion - done), crop=self.recipe.optimiser.crop,
+                generator=generator, histograms=True,
+            )  # fmt: skip
+            if is_crowded:
+                new = new._replace(judged=torch.zeros_like(new.judged))
+            if self.memory is None:
+                size = PORTIONS * self.portion
+                self.memory = Batch(*(values.new_empty(size, *values.shape[1:]) for values in new))
+            for kept, values in zip(self.memory, new, strict=True):
+                kept[first + done : first + done + len(values)] = values
+            yield done + len(new.frame)
         self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
 
 

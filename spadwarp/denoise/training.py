@@ -6,6 +6,7 @@ checkpoint when the command is repeated.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,7 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Signal photons per pixel, a third of the background, at which networks that read histograms are validated."""
 
 _TIMED = 5  # steps after which the duration is foretold
+_PATIENCE = 3.0  # seconds after which it is said how long samples take to be drawn
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
 
 
@@ -79,17 +81,22 @@ def fit(
         )
     validation = validation.to(workers.device)
     run = Run(recipe, Path(out), workers, scenes)
-    first, began = run.step, time.monotonic()
+    first, spent = run.step, 0.0
     psnr: dict[float, float] = {}
     with interruptible() as interrupted:
         while run.step < settings.steps and not workers.any(interrupted.is_set()):
+            if not _prepared(run, interrupted, notify):
+                break
+            began = time.monotonic()
             run.update()
+            spent += time.monotonic() - began
             if run.step % settings.report_every == 0 or run.step == settings.steps:
                 psnr = validation_psnr(run.average, validation, recipe)
                 run.report(psnr)
             if workers.rank == 0:
                 if notify is not None and run.step == first + _TIMED:
-                    notify(_duration(workers, (time.monotonic() - began) / _TIMED, settings.steps - run.step))
+                    seconds = spent / _TIMED + run.samples.seconds
+                    notify(_duration(workers, seconds, settings.steps - run.step))
                 if progress is not None:
                     progress("steps", run.step, settings.steps)
         if run.step < settings.steps:
@@ -103,20 +110,39 @@ def fit(
     return trained
 
 
+def _prepared(run: Run, interrupted: threading.Event, notify: Callable[[str], None] | None) -> bool:
+    """Draws the samples of the next step; False where it was interrupted. Says once how long this takes, if it does."""
+    began, silent = time.monotonic(), notify is None or run.steps_here > 0 or run.workers.rank > 0
+    for drawn, total in run.samples.prepare(run.step):
+        if run.workers.any(interrupted.is_set()):
+            return False
+        seconds = time.monotonic() - began
+        if not silent and notify is not None and seconds > _PATIENCE:
+            left = seconds * (total - drawn) / drawn
+            notify(f"drawing {total} samples before the first step, about {left:.0f} s{_advice(run.workers)}")
+            silent = True
+    return True
+
+
 def _duration(workers: Workers, seconds: float, steps: int) -> str:
-    """How long the rest of a training takes, and on a CPU what to do instead."""
+    """How long the rest of a training takes."""
     minutes = seconds * steps / 60.0
     text = (
         f"{steps} steps to go, about {minutes:.0f} minutes"
         if minutes < 120
         else (f"{steps} steps to go, about {minutes / 60.0:.0f} hours")
     )
+    return f"{text}{_advice(workers)}"
+
+
+def _advice(workers: Workers) -> str:
+    """On a CPU, what to do instead."""
     if workers.is_cuda:
-        return text
+        return ""
     return (
-        f"{text} on this CPU; a data-centre GPU takes minutes. The package has trained weights, which "
-        "`spadwarp denoise` uses; fewer steps (--steps), or start from these weights (start in the recipe), take less. "
-        "Ctrl-C keeps a checkpoint from which the same command resumes"
+        " on this CPU; a data-centre GPU trains in minutes. The package has trained weights, which `spadwarp denoise` "
+        "uses; fewer steps (--steps), or start from these weights (start in the recipe), take less. Ctrl-C keeps a "
+        "checkpoint from which the same command resumes"
     )
 
 

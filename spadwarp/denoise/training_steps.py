@@ -197,14 +197,13 @@ class Run:
         self.last_report, self.timed_from = time.monotonic(), self.step
 
     def update(self) -> None:
-        """One step. On a single GPU steps are replayed as a CUDA graph, which launches faster."""
+        """One step, whose samples are prepared. On a single GPU steps are replayed as a CUDA graph: launched faster."""
         rate = learning_rate(self.step, self.recipe)
         for group in self.optimiser.param_groups:
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        self.samples.prepare(self.step)
         if self.graph is not None:
             self.graph.replay()
             loss = self.graph_loss

@@ -8,6 +8,7 @@ from spadwarp.denoise import samples
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
+from spadwarp.errors import DeviceError
 
 CPU = torch.device("cpu")
 SHARES = (0.5, 0.3, 0.2)
@@ -41,12 +42,16 @@ def pool(**changes):
     return Pool(chosen, Scenes(chosen, 0, CPU, None), chosen.optimiser.batch, torch.Generator().manual_seed(1))
 
 
+def prepare(ours, step):
+    return list(ours.prepare(step))
+
+
 def test_a_resumed_pool_holds_what_it_would_have_held(drawn):
     for step in (0, 40, 101):
         whole, resumed = pool(), pool()
         for earlier in range(step + 1):
-            whole.prepare(earlier)
-        resumed.prepare(step)
+            prepare(whole, earlier)
+        prepare(resumed, step)
         for mine, theirs in zip(whole.memory, resumed.memory, strict=True):
             filled = int(whole.filled)
             assert filled == int(resumed.filled) > 0
@@ -58,17 +63,17 @@ def test_a_sample_is_used_as_often_as_asked(drawn):
     """Once the pool is full: samples taken over samples drawn."""
     ours = pool()
     first, steps = 200, 300
-    ours.prepare(first)
+    prepare(ours, first)
     before = len(drawn)
     for step in range(first + 1, first + steps + 1):
-        ours.prepare(step)
+        prepare(ours, step)
     taken = steps * ours.batch().frame.shape[0]
     assert taken / sum(size for _, _, size in drawn[before:]) == pytest.approx(OPTIMISER["uses"], rel=0.02)
 
 
 def test_a_pool_takes_only_samples_that_were_drawn(drawn):
     ours = pool()
-    ours.prepare(0)
+    prepare(ours, 0)
     seen = {float(value) for value in ours.memory.frame[: int(ours.filled), 0, 0, 0]}
     for _ in range(50):
         assert {float(value) for value in ours.batch().frame[:, 0, 0, 0]} <= seen
@@ -78,7 +83,7 @@ def test_parts_have_their_shares_and_their_noise(drawn):
     ours = pool()
     count = 600
     for step in range(0, count * ours.interval, ours.interval):
-        ours.prepare(step)
+        prepare(ours, step)
     photons = np.array([noise.photons[0] for _, noise, _ in drawn])
     for part, share in enumerate(SHARES):
         error = np.sqrt(share * (1 - share) / len(photons))
@@ -88,7 +93,7 @@ def test_parts_have_their_shares_and_their_noise(drawn):
 
 def test_crowded_samples_do_not_judge_the_target(drawn):
     ours = pool()
-    ours.prepare(0)
+    prepare(ours, 0)
     for number, (scenes, noise, size) in enumerate(drawn):
         judged = ours.memory.judged[number * size : (number + 1) * size]
         assert bool(judged.any()) == (noise.crowded == 0.0)
@@ -114,3 +119,22 @@ def test_of_two_scenes_a_pixel_sees_the_nearer():
 def test_without_open_water_all_scenes_are_taken():
     wall = CleanScenes(torch.ones(3, 8, 8), torch.ones(3, 8, 8), torch.ones(3, 2), torch.ones(3, 64))
     assert in_open_water(wall) is wall
+
+
+def test_drawing_goes_on_in_pieces_and_an_abandoned_one_begins_again(drawn):
+    whole, stopped = pool(pool=960), pool(pool=960)  # 24 portions of 40 samples
+    pieces = prepare(whole, 0)
+    assert pieces == [(done, pieces[-1][1]) for done in range(8, pieces[-1][1] + 1, 8)]
+    for number, _ in enumerate(stopped.prepare(0)):
+        if number == 7:  # within the second portion
+            break
+    assert prepare(stopped, 0) == pieces
+    assert torch.equal(whole.batch().frame, stopped.batch().frame)
+    assert prepare(whole, 0) == []
+
+
+def test_a_pool_beyond_the_memory_is_refused():
+    with pytest.raises(
+        DeviceError, match=r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
+    ):
+        pool(pool=9_000_000, crop=64)
