@@ -120,10 +120,11 @@ def propose_exposure(
     terms = _terms(pilot, pulses, question.method)
     frame_time = pulses * positions / rate
     limit = _limit(scene, pilot, terms, pulses, question.method)
-    counts = {"pulses_per_frame": pulses}
+    # Given on its own, the analytic model's number would hold against a later change of the detector's.
+    own = None if scene.analytic.pulses_per_depth_frame is None else pulses
     compared = CHANNELS if small.camera.channels and not even else ()
     return Exposure(
-        scene=scene.with_overrides(detector=counts, analytic={"pulses_per_depth_frame": pulses}),
+        scene=scene.with_overrides(detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": own}),
         pile_up_energy=piled,
         eye=eye,
         energy_limit=energy_limit,

@@ -244,11 +244,17 @@ def rows(table: dict[str, str], *, indent: str = "") -> str:
     return "\n".join(f"{indent}{name:<{width}}  {value}".rstrip() for name, value in table.items())
 
 
-def show_table(table: Table) -> None:
-    """A table on stdout, as wide as the terminal; 160 columns elsewhere."""
+def show_table(table: Table, *, keys: int = 1) -> None:
+    """A table on stdout, as wide as the terminal; 160 columns elsewhere.
+
+    One that is wider is printed in several parts, each with the first `keys` columns, so that no number is cut off.
+    """
     from rich.console import Console
+
+    from spadwarp.cli._tables import parts
 
     console = Console(highlight=False, markup=False)  # "[m]" is a unit
     if not console.is_terminal:
         console = Console(highlight=False, markup=False, width=160)
-    console.print(table)
+    for part in parts(table, console, keys):
+        console.print(part)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Console
+    from rich.table import Column, Table
 
     from spadwarp.analytic import BudgetRow
     from spadwarp.scene import Scene
+
+_SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
 
 
 def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
@@ -39,7 +44,7 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
             f"{row.range:.4g}",
             f"{row.optical_depth:.3g}",
             f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
-            f"{row.pulses:.3g}",
+            counted(row.pulses),
             f"{row.signal:.3g}",
             f"{row.background:.3g}",
             f"{row.alpha:.3g}",
@@ -47,7 +52,7 @@ def budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -
             bracketed(1e12 * row.sigma_time, reached),
             bracketed(1e3 * row.sigma_depth, reached),
             percent(row.outlier_probability),
-            "never" if math.isinf(row.pulses_for_1cm) else f"{row.pulses_for_1cm:.3g}",
+            "never" if math.isinf(row.pulses_for_1cm) else counted(row.pulses_for_1cm),
         )
         before = name
     return table
@@ -61,6 +66,11 @@ def table_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
         notes.append(
             f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
             "the ranges, but one as long around the return"
+        )
+    if any(row.optical_depth > _SCATTERS for row in found):
+        notes.append(
+            "signal: unscattered light alone. In water that scatters more light comes back from a target, for example "
+            "1.3 times as much at c·r = 0.2 and 3.6 times at 1; `spadwarp plan` traces all of it"
         )
     own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
     if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:
@@ -80,6 +90,39 @@ def new_table(first: str, *titles: str) -> Table:
     for title in titles:
         table.add_column(title, justify="right", no_wrap=True)
     return table
+
+
+def parts(table: Table, console: Console, keys: int) -> list[Table]:
+    """The table if it is not wider than the console or can break its lines, else parts of it that are not.
+
+    Each part begins with the first `keys` columns.
+    """
+    widest = console.options.update(width=10_000)
+
+    def part(columns: Sequence[Column]) -> Table:
+        chosen = copy.copy(table)
+        chosen.columns = [dataclasses.replace(column, _index=i) for i, column in enumerate(columns)]
+        return chosen
+
+    def fits(columns: Sequence[Column]) -> bool:
+        return console.measure(part(columns), options=widest).maximum <= console.width
+
+    if not all(column.no_wrap for column in table.columns) or fits(table.columns):
+        return [table]
+    first, groups = table.columns[:keys], [table.columns[keys : keys + 1]]
+    for column in table.columns[keys + 1 :]:
+        if fits([*first, *groups[-1], column]):
+            groups[-1].append(column)
+        else:
+            groups.append([column])
+    return [part([*first, *group]) for group in groups]
+
+
+def counted(value: float) -> str:
+    """A number of pulses to three digits: 5 300, 1.2e+07."""
+    if not 100.0 <= value < 1e7:
+        return short(value)
+    return f"{float(f'{value:.3g}'):,.0f}".replace(",", " ")
 
 
 def short(value: float) -> str:

@@ -172,8 +172,8 @@ def _lines(summary: dict[str, Any]) -> dict[str, str]:
     return {
         "pixels": f"{opt.count(summary['pixels'])}, {opt.count(summary['pixels_with_target'])} see a target, "
         f"{opt.count(summary['pixels_with_estimate'])} have an estimate; medians of these:",
-        "signal": f"{summary['signal']:.3g} detections a pulse, backscatter {summary['backscatter']:.3g}, "
-        f"all together {summary['alpha']:.3g}",
+        "signal": f"{summary['signal']:.3g} detections a pulse of unscattered light, {summary['backscatter']:.3g} of "
+        f"backscatter that was scattered once, {summary['alpha']:.3g} with dark counts and ambient light",
         "signal to backscatter": f"{summary['signal_to_backscatter']:.3g}",
         "bound": f"{1e12 * summary['sigma_time']:.3g} ps, {1e3 * summary['sigma_depth']:.3g} mm of depth",
         "outliers": f"{percent(summary['outlier_probability'])} of the fits would find a false peak",

@@ -70,7 +70,7 @@ def budget(
             spadwarp.io.write_csv([dataclasses.asdict(row) for row in found], out / "budget.csv"),
         ]
     if not quiet:
-        opt.show_table(budget_table([row.medium for row in found], "water", found))
+        opt.show_table(budget_table([row.medium for row in found], "water", found), keys=2)
         for text in table_notes(found, scene):
             say(text)
         if written:

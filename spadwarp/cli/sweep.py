@@ -78,7 +78,8 @@ def sweep(
         opt.show_table(
             budget_table(names, curves.field, some)
             if of is Quantity.budget
-            else _error_table(names, curves.field, some)
+            else _error_table(names, curves.field, some),
+            keys=2 if of is Quantity.budget else 1,
         )
         if of is Quantity.budget:
             for text in table_notes(some, scene):

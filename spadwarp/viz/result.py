@@ -271,5 +271,8 @@ def channel_text(channel: str | None) -> str:
 def _phase_text(medium: Medium) -> str:
     if medium.phase_function == "tabulated":
         return f"phase function {Path(str(medium.phase_table)).stem}"
+    law = {"fournier_forand": "Fournier–Forand ", "two_term_henyey_greenstein": "two-term "}.get(
+        str(medium.phase_function), ""
+    )
     symbols = {"anisotropy": "g", "alpha": "α", "particle_index": "n", "junge_slope": "µ"}
-    return ", ".join(f"{symbols.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())
+    return law + ", ".join(f"{symbols.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())

@@ -1,5 +1,7 @@
 """Numbers on the command line: finite, or refused with the name of the option."""
 
+import re
+
 import numpy as np
 import pytest
 import typer
@@ -99,3 +101,17 @@ def test_tables_keep_units_in_brackets(capsys):
     show_table(table)
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("range [m]", "error [mm]", "depth [m]", "1 [ps]"))
+
+
+def test_a_table_wider_than_the_terminal_is_printed_in_parts(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "45")
+    titles = [f"quantity {i}" for i in range(6)]
+    table = new_table("water", "range", *titles)
+    for name in ("clear", "coastal"):
+        table.add_row(name, "5 m", *[f"{name[0]} {i}.23e-05" for i in range(6)])
+    show_table(table, keys=2)
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert "…" not in printed and all(title in printed for title in titles)
+    assert max(map(len, printed.splitlines())) <= 45
+    assert printed.count("coastal") == printed.count("range") == 3
