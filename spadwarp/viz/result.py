@@ -275,4 +275,5 @@ def _phase_text(medium: Medium) -> str:
         str(medium.phase_function), ""
     )
     symbols = {"anisotropy": "g", "alpha": "α", "particle_index": "n", "junge_slope": "µ"}
-    return law + ", ".join(f"{symbols.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())
+    values = [f"{symbols.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items()]
+    return law + ", ".join(values)
