@@ -26,7 +26,7 @@ def draw_depth(
 ) -> Path:
     """A depth or range image `[H, W]` [m] beside the intensity; returns the path. `width`: of the picture [inch]."""
     panels = Panels(image.shape, 2, width=width)
-    panels.show_depth(image, title, shown_limits(image, beyond=1.0), label)
+    panels.show_depth(image, title, shown_limits(image, beyond=1.0, weights=intensity), label)
     panels.show_intensity(intensity, "Intensity", "sum over bins")
     return save(panels.figure, path)
 

@@ -156,10 +156,22 @@ def error_limit(error: NDArray[Any]) -> float:
     return float(math.ceil(reach / digit * 2 - 1e-9) / 2 * digit)  # of two digits: 3.5 mm
 
 
-def shown_limits(image: NDArray[Any], *, beyond: float = 0.0, margin: float = 0.0) -> tuple[float, float]:
-    """Lowest and highest value, at least 1 cm apart, without `beyond` percent at each end; the margin is relative."""
-    values = image[np.isfinite(image)]
-    low, high = np.percentile(values, (beyond, 100.0 - beyond)) if values.size else (0.0, 1.0)
+def shown_limits(
+    image: NDArray[Any], *, beyond: float = 0.0, margin: float = 0.0, weights: NDArray[Any] | None = None
+) -> tuple[float, float]:
+    """Lowest and highest value, at least 1 cm apart, without `beyond` percent at each end; the margin is relative.
+
+    With `weights`, such as counts, percent of their sum: depths of pixels with hardly any counts are spread over the
+    gate, and those of the target would have one colour.
+    """
+    known = np.isfinite(image)
+    if weights is not None and weights[known].sum() > 0:
+        known &= weights > 0
+        each = weights[known].astype(np.float64)
+        ends = np.quantile(image[known], (beyond / 100, 1.0 - beyond / 100), weights=each, method="inverted_cdf")
+    else:
+        ends = np.percentile(image[known], (beyond, 100.0 - beyond)) if known.any() else np.array([0.0, 1.0])
+    low, high = ends
     spare = max(0.0, 0.01 - (high - low)) / 2
     spare += margin * (high - low + 2 * spare)
     return float(low - spare), float(high + spare)

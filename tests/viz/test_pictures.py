@@ -19,6 +19,7 @@ from spadwarp.mesh import describe_mesh
 from spadwarp.viz import evaluation, style, transient_video, validation
 from spadwarp.viz import learning_curves as curves
 from spadwarp.viz.depth import draw_denoised, draw_depth
+from spadwarp.viz.panels import shown_limits
 
 FOLDER = os.environ.get("SPADWARP_TEST_PICTURES")  # where the pictures stay, to be looked at
 METHODS = ("input", "median", "gating", "bm3d", "usdn", "dncnn", "pyramid")
@@ -291,3 +292,13 @@ def test_frames_on_disk_draw_the_picture_that_detect_writes(recording, result, t
     drawn = spadwarp.viz.draw_recording(recording, result, tmp_path / "frame.png").read_bytes()
     spadwarp.load(recording.path).plot().savefig(tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes() == drawn
+
+
+def test_colours_of_a_depth_frame_are_those_of_the_pixels_with_counts():
+    # One count in each pixel beside the target, anywhere in the gate; 200 in each pixel of the target.
+    depth = np.linspace(1.0, 9.0, 400).reshape(20, 20)
+    counts = np.ones_like(depth)
+    depth[5:15, 5:15], counts[5:15, 5:15] = np.linspace(4.0, 4.1, 100).reshape(10, 10), 200.0
+    low, high = shown_limits(depth, beyond=1.0, weights=counts)
+    assert 3.9 < low < 4.02 and 4.08 < high < 4.2
+    assert shown_limits(depth, beyond=1.0, weights=0 * counts) == shown_limits(depth, beyond=1.0)
