@@ -328,8 +328,8 @@ def described(result: Result, files: RunFiles) -> str:
         lines["derivatives"] = "by " + ", ".join(summary["derivatives"])
     if _has_errors(result) and math.isfinite(result.relative_error):
         lines["error"] = (
-            f"{100 * result.relative_error:.3g} % in the bins that decide the depth, or less, in 95 % of "
-            f"the pixels that hold a target"
+            f"standard error {100 * result.relative_error:.3g} % or less in the brightest bin of 95 % of the pixels "
+            "that see a target"
         )
     parts = sorted(ledger["fractions"].items(), key=lambda entry: -abs(entry[1]))
     lines["ledger"] = (

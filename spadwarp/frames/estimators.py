@@ -61,7 +61,10 @@ def arrival_time(
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     filtered = method in ("matched", "likelihood")
     if irf is None and filtered:
-        raise ArgumentError(f"method = {method!r} needs an irf")
+        raise ArgumentError(
+            f"method = {method!r} needs an irf, the instrument response of the histogram: an InstrumentResponse, or an "
+            "array of response per bin. Histograms of `simulate` have none yet: `detect` adds it, or take 'centroid'"
+        )
 
     with in_torch_order(histogram, background):
         rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
