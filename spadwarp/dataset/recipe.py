@@ -154,6 +154,8 @@ class MonteCarlo(Table):
 
     @model_validator(mode="after")
     def _traced(self) -> Self:
+        if self.model_fields_set and "share" not in self.model_fields_set:
+            raise ValueError("share is missing: 1 traces all scenes, 0.5 half of them; without it none is traced")
         if self.channel != "I" and self.share < 1.0:
             raise ValueError(f"channel = {self.channel!r} needs share = 1: the analytic simulator has no polarisation")
         return self

@@ -413,6 +413,12 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
         Plan(traced)
 
 
+def test_a_recipe_that_describes_traced_scenes_but_has_none_is_refused():
+    with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.*share is missing"):
+        Recipe.from_dict({**TABLES, "monte_carlo": {"photons": 1000}})
+    assert Recipe.from_dict({**TABLES, "monte_carlo": {"photons": 1000, "share": 0.0}}).monte_carlo.share == 0.0
+
+
 def test_errors_of_recipes_name_each_field():
     wrong = {
         "pose": {"distance": -1.0, "yaw": 3.0},
