@@ -161,7 +161,7 @@ def export_command(
             "--field",
             metavar="NAME",
             help="Image of a frame; may be repeated: noisy, clean, label, intensity, bound, normal, albedo, prior, and "
-            "of traced scenes features, counts, expected. By default the first five, and features.",
+            "of traced scenes features, counts, expected, polarisation. By default the first five, and features.",
         ),
     ] = None,
     frames_per_file: Annotated[
