@@ -41,7 +41,7 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
     import warp as wp
 
     start_warp()
-    if names == "cuda:all":
+    if isinstance(names, str) and names == "cuda:all":
         return wp.get_cuda_devices() or [pick_device("cuda:0")]
     return [pick_device(name) for name in (names.split(",") if isinstance(names, str) else [names])]
 
@@ -60,9 +60,9 @@ def pick_device(name: str | wp.Device | None = None) -> wp.Device:
     names = [device.alias for device in wp.get_devices()]
     if name is None:
         name = next((alias for alias in names if alias.startswith("cuda")), "cpu")
-    if name == "cuda" and "cuda:0" in names:
+    if isinstance(name, str) and name == "cuda" and "cuda:0" in names:
         name = "cuda:0"
-    if name not in names:
+    if not isinstance(name, str) or name not in names:
         hint = "" if len(names) > 1 else "; Warp sees no NVIDIA GPU with driver R580 or newer"
         raise DeviceError(f"device = {shown(name)} is not one of {', '.join(names)}{hint}")
     return wp.get_device(name)

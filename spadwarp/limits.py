@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import difflib
 import functools
 import math
@@ -134,8 +135,9 @@ def suggestion(word: Any, known: Sequence[str]) -> str:
 
 
 def _is_single(value: Any) -> bool:
-    """Whether it is neither a truth value, Python's or NumPy's, nor an array."""
-    return type(value).__name__ not in ("bool", "bool_") and getattr(value, "ndim", 0) == 0
+    """Whether it may be a number: no class, truth value, text, time or complex number of NumPy's, and no array."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")  # dtypes of torch have none
+    return not isinstance(value, bool | type) and kind in ("i", "u", "f") and getattr(value, "ndim", 0) == 0
 
 
 def parse_number(text: str) -> float:
@@ -162,6 +164,10 @@ class _Short(reprlib.Repr):
         self.maxstring = self.maxother = self.maxlong = 4 * _LONGEST
         self.maxlist = self.maxtuple = self.maxdict = self.maxset = self.maxarray = _LONGEST
         self.maxlevel = 10
+
+    def repr_array(self, x: Any, level: int) -> str:
+        # Chosen by the name of the type, which Warp's arrays share with those of the standard library.
+        return super().repr_array(x, level) if isinstance(x, array.array) else self.repr_instance(x, level)
 
     def repr_int(self, x: int, level: int) -> str:
         return repr(x) if x.bit_length() < 1000 else f"an integer of {x.bit_length()} bits"

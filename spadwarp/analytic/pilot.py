@@ -50,7 +50,8 @@ class Pilot:
         pixels: Their number.
         unscattered, target: Detections of the target per pulse in the gate, without scattered light and with it.
         backscatter, noise: Of backscatter, and of dark counts and ambient light.
-        brightest: Detections of light per pulse of the brightest hundredth of the pixels.
+        brightest: Detections of light per pulse of the brightest hundredth of the pixels; of the brightest one, where
+            so short a run has light in fewer.
         bound: Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N.
         shot_noise: The same without background and pile-up.
         information_noise: Part of the runs' information on the depth that was their noise, which `bound` and
@@ -180,6 +181,7 @@ def measure(
     signal, scale = light - background, both.scene.laser.photons_per_pulse * scene.detections_per_photon
     peak, level = _return(signal, background, both)
     bound, shot, information_noise = _bounds(both, (first, second), seen, device)
+    detected = both.detections.sum(axis=-1)
     noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
@@ -187,7 +189,7 @@ def measure(
         target=median(signal.sum(axis=-1)),
         backscatter=median(both.component("backscatter").sum(axis=-1) * scale),
         noise=noise,
-        brightest=float(np.quantile(both.detections.sum(axis=-1), 0.99)),
+        brightest=float(np.quantile(detected, 0.99) or detected.max()),
         bound=bound,
         shot_noise=shot,
         information_noise=information_noise,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from spadwarp import Ray, Result, Scene
+    from spadwarp.cli._progress import Report
     from spadwarp.run import RunFiles
 
 
@@ -160,7 +161,7 @@ def simulate(
     inputs = (scene_path, *scene.files)
     options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
     outputs = _outputs(out, resume=earlier is not None, **options)
-    _load_pictures(scene)
+    pictures = _load_pictures(scene)
     with progress(quiet=quiet) as report:
         result = spadwarp.simulate(
             scene,
@@ -168,7 +169,7 @@ def simulate(
             device=device,
             engine=engine,
             threads=threads,
-            progress=report,
+            progress=_joined_at_the_end(report, pictures),
             uncertainty=uncertainty,
             relative_error=relative_error,
             first_photon=first_photon,
@@ -267,11 +268,29 @@ def _prepared(device: str | None, engine: Ray | None) -> ModuleType:
     return importlib.import_module("spadwarp.run")
 
 
-def _load_pictures(scene: Scene) -> None:
+def _load_pictures(scene: Scene) -> threading.Thread | None:
     """Begins to load what draws the pictures at the end: while kernels are loaded and photons traced, not before, since
     it would hold up this thread."""
-    if (scene.output.png or scene.output.pdf) and address_space() is None:
-        threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True).start()
+    if not (scene.output.png or scene.output.pdf) or address_space() is not None:
+        return None
+    thread = threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True)
+    thread.start()
+    return thread
+
+
+def _joined_at_the_end(report: Report | None, pictures: threading.Thread | None) -> Report | None:
+    """Progress that waits, when all photons are traced, for what is loaded meanwhile: while Matplotlib is loaded, it
+    takes the warnings of every thread for its own, those about the result too."""
+    if pictures is None:
+        return report
+
+    def reported(stage: str, done: int, total: int) -> None:
+        if report is not None:
+            report(stage, done, total)
+        if total and done >= total:
+            pictures.join()
+
+    return reported
 
 
 def _has_errors(result: Result) -> bool:

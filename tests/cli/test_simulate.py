@@ -1,7 +1,9 @@
 """`simulate`: what it writes, what it refuses; and that it says what Python says."""
 
+import importlib
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +50,23 @@ def test_options_lie_over_the_scene(scene, tmp_path):
 def test_quiet_is_silent(scene, tmp_path):
     outcome = run("simulate", scene, "--out", tmp_path / "out", "--quiet", *DEVICE)
     assert outcome.output == ""
+
+
+@pytest.mark.filterwarnings("default::RuntimeWarning")
+def test_warnings_of_a_run_are_shown_while_what_draws_is_loaded(scene, tmp_path, monkeypatch):
+    """Matplotlib takes the warnings of all threads while it reads its styles."""
+    load = importlib.import_module
+
+    def load_slowly(name, package=None):
+        if name == "spadwarp.viz":
+            with warnings.catch_warnings(record=True):
+                time.sleep(2.0)
+        return load(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", load_slowly)
+    thin = ("--set", "medium.extinction=1e-12", "--set", "output.png=true", "--photons", 1000)
+    outcome = run("simulate", scene, "--out", tmp_path / "out", "--quiet", *thin, *DEVICE)
+    assert "rounding to the histogram's unit" in outcome.stderr
 
 
 def test_output_follows_the_scene(scene, tmp_path):

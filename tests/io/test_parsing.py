@@ -1,10 +1,12 @@
 """Numbers and text that enter: read whole, or refused with a sentence, whatever they cost."""
 
+import array
 import math
 from fractions import Fraction
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -59,7 +61,7 @@ def test_large_integers_keep_every_digit():
     assert check_integer("seed", 2**64 - 1, "[0, 18446744073709551615]") == 2**64 - 1
 
 
-@pytest.mark.parametrize("value", [5.5, math.nan, math.inf, "5", None, True, np.True_, np.array([5]), [5], 1j])
+@pytest.mark.parametrize("value", [5.5, math.nan, math.inf, "5", None, True, np.True_, np.array([5]), [5], 1j, int])
 def test_what_is_not_an_integer_is_refused(value):
     with pytest.raises(ArgumentError, match=r"^photons = .* is not an integer in \[1, 10\]$"):
         check_integer("photons", value, "[1, 10]")
@@ -80,7 +82,10 @@ def test_a_real_argument_is_finite_and_in_range(value):
         check_real("relative_error", value, "(0, 1)")
 
 
-@pytest.mark.parametrize("value", ["0.5", None, True, [0.5], {}])
+@pytest.mark.parametrize(
+    "value",
+    ["0.5", None, True, [0.5], {}, float, np.str_("0.5"), np.complex128(0.5 + 1.0j), np.timedelta64(5, "ns")],
+)
 def test_a_real_argument_is_a_number(value):
     with pytest.raises(ArgumentError, match=r"^relative_error = .* is not a number$"):
         check_real("relative_error", value, "(0, 1)")
@@ -93,6 +98,8 @@ def test_values_are_quoted_shortly():
     for value in (deep, "x" * 10**6, 10**5000, list(range(10**6)), {"a": deep}):
         assert len(shown(value)) <= 60
     assert shown((1.0, "a")) == "[1.0, 'a']"
+    assert shown(array.array("d", [1.0])) == "array('d', [1.0])"
+    assert len(shown(wp.zeros(100, device="cpu"))) <= 60
 
 
 @pytest.mark.parametrize(
