@@ -10,8 +10,10 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import shown
 
 if TYPE_CHECKING:
     import torch
@@ -25,6 +27,7 @@ __all__ = [
     "is_torch",
     "on_host",
     "output_tensor",
+    "real_array",
     "tensor_of",
 ]
 
@@ -98,6 +101,14 @@ def histogram_rows(
 def on_host(array: Any) -> Any:
     """A tensor as a NumPy array, copied only from a GPU; anything else as it is."""
     return array.detach().cpu().numpy() if is_torch(array) else array
+
+
+def real_array(name: str, values: Any, dtype: Any = np.float32) -> NDArray[Any]:
+    """A copy of an argument as an array of real numbers, also of a tensor. Raises `ArgumentError`."""
+    given = np.asarray(on_host(values))
+    if given.dtype.kind not in "biuf":
+        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers")
+    return given.astype(dtype)
 
 
 def is_torch(array: Any) -> bool:

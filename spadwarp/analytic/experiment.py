@@ -158,6 +158,8 @@ def plan(
     margin = check_real("margin", margin, "[0, 1e6] m")
     check_choice("method", method, METHODS)
     if ranges is not None:
+        if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
+            raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
         span = _number("ranges", ranges[0], "m"), _number("ranges", ranges[1], "m")
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")

@@ -14,6 +14,7 @@ from spadwarp.analytic.model import response_sigma
 from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
+from spadwarp.limits import check_integer
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
 
@@ -52,6 +53,8 @@ def save_analytic(result: AnalyticResult, path: str | Path, *, frames: int | Non
     def write(name: str, values: NDArray[Any]) -> None:
         file.create_dataset(name, data=values, **(_PACKED if values.size else {}))
 
+    if frames is not None:
+        frames = check_integer("frames", frames, "[0, 2147483647]")
     count, shape = len(result.depth) if frames is None else frames, result.truth.depth.shape
     with write_hdf5(path) as file:
         file.attrs.update(_metadata(result))

@@ -24,6 +24,7 @@ from spadwarp.files import holds_own_file, locate
 from spadwarp.frames.measured import Histograms
 from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
+from spadwarp.limits import check_real
 from spadwarp.units import percent
 from spadwarp.viz import draw_denoised
 
@@ -91,8 +92,7 @@ def denoise_file(
     folder, name = Path(out), Path(path).stem
     if folder.resolve() == Path(path).resolve().parent:
         raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
-    if mask is not None and not 0.0 <= mask <= 1.0:
-        raise ArgumentError(f"mask = {mask} is outside [0, 1]")
+    mask = None if mask is None else check_real("mask", mask, "[0, 1]")
     read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
     if gate is None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import on_host, real_array
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_real, shown
 
@@ -21,7 +22,9 @@ __all__ = [
     "SMALLEST_SIDE",
     "DepthFrames",
     "checked_gate",
+    "checked_profile",
     "depth_frames",
+    "depth_values",
     "fill_missing",
 ]
 
@@ -108,6 +111,22 @@ def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
     return start, stop
 
 
+def checked_profile(profile: ArrayLike) -> NDArray[np.float64]:
+    """Backscatter over the gate, `[bins]`. Raises `ArgumentError`."""
+    bins = real_array("profile", profile, np.float64)
+    if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
+        raise ArgumentError(f"profile has shape {bins.shape}; [bins] of numbers >= 0 that are not all 0 is needed")
+    return bins
+
+
+def depth_values(depth: ArrayLike) -> NDArray[np.float32]:
+    """Depth as float32, NaN where a masked array is masked. Raises `ArgumentError` for what is no array of numbers."""
+    values = np.ma.asanyarray(on_host(depth))
+    if values.dtype.kind not in "iuf":
+        raise ArgumentError(f"depth is {values.dtype} {values.shape}; real numbers [H, W] or [N, H, W] are needed")
+    return np.asarray(values.astype(np.float32).filled(np.nan))
+
+
 def depth_frames(
     depth: ArrayLike,
     *,
@@ -130,10 +149,10 @@ def depth_frames(
     Raises:
         ArgumentError: Shapes, sizes or values that cannot be, or a gate without width.
     """
-    values = np.asarray(depth)
-    if values.dtype.kind not in "iuf" or values.ndim not in (2, 3):
+    values = depth_values(depth)
+    if values.ndim not in (2, 3):
         raise ArgumentError(f"depth is {values.dtype} {values.shape}; real numbers [H, W] or [N, H, W] are needed")
-    values = values.astype(np.float32).reshape(-1, *values.shape[-2:])
+    values = values if values.ndim == 3 else values[None]
     if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
         raise ArgumentError(
             f"depth is {len(values)} frames of {values.shape[1]} x {values.shape[2]} pixels; at least one frame of "
@@ -163,9 +182,7 @@ def depth_frames(
             raise ArgumentError(f"density has shape {np.shape(density)}; {values.shape} is needed, of numbers >= 0")
         relative = np.nan_to_num(given * np.float32(stop - start), nan=1.0)
     elif profile is not None:
-        bins = np.asarray(profile, np.float64)
-        if bins.ndim != 1 or not (np.isfinite(bins).all() and (bins >= 0).all() and bins.sum() > 0):
-            raise ArgumentError(f"profile has shape {bins.shape}; [bins] of numbers >= 0 that are not all 0 is needed")
+        bins = checked_profile(profile)
         index = np.nan_to_num((values - start) / (stop - start)) * bins.size
         relative = (bins / bins.mean())[np.clip(index.astype(np.int64), 0, bins.size - 1)].astype(np.float32)
     return DepthFrames(depth=values, gate=(start, stop), density=relative, features=features)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.gates import bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
@@ -15,7 +16,7 @@ from spadwarp.errors import ArgumentError
 from spadwarp.frames.measured import Histograms
 from spadwarp.units import percent
 
-__all__ = ["dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
+__all__ = ["checked_histograms", "dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
 
 
 def features_of_histograms(
@@ -68,15 +69,7 @@ def histogram_tensors(
     Arguments and errors are those of `features_of_histograms`.
     """
     torch = require_torch()
-    cubes = np.asarray(counts)
-    levels, taps = (np.array(given, np.float32) for given in (background, response))
-    if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
-        raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
-    one, each = cubes.shape[-1:], cubes.shape[-3:]
-    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
-    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
-        raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
+    cubes, levels, taps = checked_histograms(counts, background, response)
     place = torch_device(device)
     tap = torch.from_numpy((taps / taps.sum())[None]).to(place)
     level = torch.from_numpy(levels if levels.ndim == 3 else levels[None, None])[None].to(place)
@@ -85,14 +78,31 @@ def histogram_tensors(
         yield torch.from_numpy(cube.astype(np.float32)[None]).to(place), level, tap
 
 
+def checked_histograms(
+    counts: ArrayLike, background: ArrayLike, response: ArrayLike
+) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
+    """Counts, background and response as arrays. Arguments and errors are those of `features_of_histograms`."""
+    cubes = np.asarray(on_host(counts))
+    if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
+        raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
+    low, high = cubes.min(), cubes.max()
+    if not (low >= 0 and high < np.inf):
+        raise ArgumentError(f"counts = {low} … {high} are outside [0, inf)")
+    levels, taps = real_array("background", background), real_array("response", response)
+    one, each = cubes.shape[-1:], cubes.shape[-3:]
+    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
+        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
+    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
+        raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
+    return cubes, levels, taps
+
+
 def target_bins(
-    counts: NDArray[Any], background: ArrayLike, response: ArrayLike, gate: tuple[float, float]
+    counts: NDArray[Any], background: NDArray[Any], response: NDArray[Any], gate: tuple[float, float]
 ) -> tuple[int, int, tuple[float, float]]:
     """First and last bin of the part of the gate that holds the target, and that part in depth [m]."""
-    cubes, level = np.asarray(counts), np.asarray(background, np.float32)
-    if cubes.ndim not in (3, 4) or level.shape not in (cubes.shape[-1:], cubes.shape[-3:]):
-        return 0, cubes.shape[-1], gate  # refused by what follows
-    first, stop = bins_of_target(cubes, level, np.asarray(response, np.float32))
+    cubes, levels, taps = checked_histograms(counts, background, response)
+    first, stop = bins_of_target(cubes, levels, taps)
     width = (gate[1] - gate[0]) / cubes.shape[-1]
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
 

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
-from spadwarp.denoise.frames import MARGIN, DepthFrames, depth_frames
+from spadwarp.denoise.frames import MARGIN, DepthFrames, checked_gate, checked_profile, depth_frames, depth_values
 from spadwarp.denoise.gates import narrowed_input
-from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
+from spadwarp.denoise.histogram_inputs import checked_histograms, features_of_histograms, target_bins
 from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.denoise.target_probability import corrected_target
 from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_choice
+from spadwarp.limits import check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "denoise_frames", "estimate", "estimate_frames", "target_threshold"]
 
@@ -72,8 +72,7 @@ def apply(
     Raises:
         ArgumentError, SpadwarpError: See `estimate`.
     """
-    if mask is not None and not 0.0 <= mask <= 1.0:
-        raise ArgumentError(f"mask = {mask} is outside [0, 1]")
+    mask = None if mask is None else check_real("mask", mask, "[0, 1]")
     found = estimate(depth, gate=gate, **options)
     return found.depth if mask is None else found.masked(mask)
 
@@ -121,6 +120,10 @@ def estimate(
     """
     if model == "pyramid" and counts is not None:
         model = "histograms"
+    check_choice("model", model, METHODS)
+    gate, depth = checked_gate(gate), depth_values(depth)
+    if precision is not None:
+        check_choice("precision", precision, get_args(Precision))
     if model not in ("histograms", *CLASSICAL):
         frames = depth_frames(depth, gate=gate, profile=profile)
         found = estimate_frames(
@@ -129,18 +132,23 @@ def estimate(
     else:
         if counts is None or background is None or response is None:
             raise ArgumentError(f"model = {model!r} needs counts, background and response, of which some are missing")
-        found = _from_histograms(depth, gate, model, profile, np.asarray(counts), background, response, weights, device)
+        cubes, levels, taps = checked_histograms(counts, background, response)
+        if depth.shape != cubes.shape[:-1]:
+            raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
+        if model in CLASSICAL and weights is not None:
+            raise ArgumentError(f"weights are for a network, not for {model!r}")
+        found = _from_histograms(depth, gate, model, profile, cubes, levels, taps, weights, device)
     return Estimate(*(values.reshape(np.shape(depth)) for values in found))
 
 
 def _from_histograms(
-    depth: ArrayLike,
+    depth: NDArray[Any],
     gate: tuple[float, float],
     model: str,
     profile: ArrayLike | None,
     counts: NDArray[Any],
-    background: ArrayLike,
-    response: ArrayLike,
+    background: NDArray[np.float32],
+    response: NDArray[np.float32],
     weights: str | Path | None,
     device: str | None,
 ) -> Estimate:
@@ -153,7 +161,7 @@ def _from_histograms(
         return part[0] + (part[1] - part[0]) * place
 
     given: dict[str, Any] = {
-        "counts": counts[..., first:stop], "background": np.asarray(background)[..., first:stop], "response": response,
+        "counts": counts[..., first:stop], "background": background[..., first:stop], "response": response,
         "device": device,
     }  # fmt: skip
     if model in CLASSICAL:
@@ -161,7 +169,7 @@ def _from_histograms(
         return Estimate(found, np.ones_like(found), np.full_like(found, np.nan))
     features = features_of_histograms(**given, total=counts.sum(axis=-1), to_depth=to_depth)
     if profile is not None and (first, stop) != (0, counts.shape[-1]):
-        bins = np.asarray(profile)
+        bins = checked_profile(profile)
         profile = bins[int(first / counts.shape[-1] * len(bins)) : max(1, int(stop / counts.shape[-1] * len(bins)))]
     with warnings.catch_warnings():
         if (first, stop) != (0, counts.shape[-1]):
@@ -170,16 +178,13 @@ def _from_histograms(
     return estimate_frames(frames, model=model, weights=weights, device=device)
 
 
-def _leaves_frames_empty(depth: ArrayLike, gate: tuple[float, float], part: tuple[float, float]) -> bool:
+def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:
     """Whether a frame has reports near the gate, but none near this part of it."""
-    values = np.asarray(depth)
-    if values.ndim not in (2, 3) or values.dtype.kind not in "iuf":
-        return False  # refused by what follows
 
     def reports(start: float, stop: float) -> NDArray[np.bool_]:
         margin = MARGIN * (stop - start)
         with np.errstate(invalid="ignore"):
-            near = (values > 0) & (values >= start - margin) & (values <= stop + margin)
+            near = (depth > 0) & (depth >= start - margin) & (depth <= stop + margin)
         return np.asarray(near.any(axis=(-2, -1)))
 
     return bool((reports(*gate) & ~reports(*part)).any())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from functools import lru_cache
@@ -12,6 +13,7 @@ from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory
 from spadwarp.io.parsing import parse_json
 from spadwarp.io.paths import existing_file
+from spadwarp.limits import shown
 
 __all__ = ["WEIGHTS", "Precision", "fast_precision", "load_network", "own_weights", "require_torch", "torch_device"]
 __all__ += ["weights_metadata"]
@@ -129,8 +131,8 @@ def torch_device(name: str | None) -> Any:
     torch = require_torch()
     if name is None:
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    if not (name == "cpu" or name.split(":")[0] == "cuda"):
-        raise DeviceError(f"device = {name!r} is not 'cpu' or 'cuda:N'")
+    if not (isinstance(name, str) and re.fullmatch(r"cpu|cuda(:\d{1,4})?", name, re.ASCII)):
+        raise DeviceError(f"device = {shown(name)} is not 'cpu' or 'cuda:N'")
     if name != "cpu":
         index = int(name.partition(":")[2] or 0)
         if not (torch.cuda.is_available() and index < torch.cuda.device_count()):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.histogram_inputs import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.errors import ArgumentError
@@ -46,8 +47,7 @@ def second_return(
     torch = require_torch()
     from spadwarp.denoise.histogram_features import highest, toeplitz
 
-    first = np.asarray(depth, np.float32)
-    cubes = np.asarray(counts)
+    first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
     if first.shape != cubes.shape[:-1]:
         raise ArgumentError(f"depth has shape {first.shape}; {cubes.shape[:-1]} is needed")
     frames = first.reshape(-1, *first.shape[-2:])

@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
 
@@ -112,7 +112,9 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
     from spadwarp_kernels.detection import first_invalid_row
 
     bins = rows.shape[1]
-    shape = tuple(background.shape) if np.ndim(background) else ()
+    if not (is_torch(background) or isinstance(background, wp.array)):
+        background = real_array("background", background)
+    shape = tuple(background.shape)
     if shape not in ((), (bins,), *((*frame[i:], last) for i in range(len(frame)) for last in (bins, 1))):
         raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
     last = shape[-1] if shape else 1
@@ -123,7 +125,7 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
         values = values.to(rows.device).contiguous().reshape((values.size // last, last))
         valid = first_invalid_row(values) is None
     else:
-        array = np.ascontiguousarray(np.asarray(background, np.float32).reshape(-1, last))
+        array = np.ascontiguousarray(background.reshape(-1, last))
         valid = bool(np.isfinite(array).all() and (array >= 0).all())
         values = wp.array(array, dtype=wp.float32, device=rows.device)
     if not valid:
@@ -169,7 +171,7 @@ def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np
 
 
 def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
-    weights = np.asarray(irf, np.float64)
+    weights = real_array("irf", irf, np.float64)
     if weights.ndim != 1 or weights.size == 0:
         raise ArgumentError(f"irf has shape {weights.shape}; one value per bin is needed")
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, tensor_of
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import check_integer
 
 __all__ = ["coates", "first_photon_probabilities"]
 
@@ -52,6 +53,9 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
         if rows.dtype not in (wp.int32, wp.int64):
             raise ArgumentError(f"counts are {rows.dtype.__name__}; integers are needed")
         values = rows.numpy()
+        if values.max() > 2**31 - 1:
+            raise ArgumentError(f"counts = {values.max()} is above {2**31 - 1}")
+        pulses = check_integer("pulses", pulses, "[1, 9007199254740992]")
         most = int(values.sum(axis=1, dtype=np.int64).max())
         if most > pulses:
             raise ArgumentError(

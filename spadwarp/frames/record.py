@@ -17,6 +17,7 @@ from spadwarp.frames.frames import Frames
 from spadwarp.frames.monte_carlo_noise import MonteCarloNoise, monte_carlo_noise
 from spadwarp.frames.response import detector_response
 from spadwarp.frames.spad import detect
+from spadwarp.limits import check_integer
 from spadwarp.result.result import Result
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 
@@ -109,6 +110,7 @@ def record_frames(
         ArgumentError: An argument out of range.
         FileError: The file cannot be written.
     """
+    frames = check_integer("frames", frames, "[1, 2147483647]")
     scene = result.scene
     pulses = scene.detector.pulses_per_frame if pulses is None else pulses
     bins = scene.gate.bins if window is None else window[1]

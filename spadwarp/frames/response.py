@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import real_array
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.npy import read_npy
 from spadwarp.io.parsing import read_columns, read_text
 from spadwarp.io.paths import file_problem
-from spadwarp.limits import check_real, shown
+from spadwarp.limits import BIN_WIDTH, TIME, check_integer, check_real, shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -35,6 +36,9 @@ Floats = NDArray[np.float64]
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _SUPPORT_SIGMAS = 6.0  # 1e-9 of a Gaussian lies beyond on either side
 _SUPPORT_TAILS = 16.0  # 1e-7 of an exponential lies beyond
+
+
+_MOST_BINS = 1e7  # of a response on one side
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,6 +133,11 @@ class InstrumentResponse:
         return -np.diff(self.cumulative(self._edges_about(bin_width)), 2)
 
     def _edges_about(self, bin_width: float) -> Floats:
+        bin_width, longest = check_real("bin_width", bin_width, BIN_WIDTH), max(map(abs, self.support))
+        if longest > _MOST_BINS * bin_width:
+            raise ArgumentError(
+                f"a response of {longest:.3g} s on a side is longer than {_MOST_BINS:g} bins of {bin_width:g} s"
+            )
         reach = math.ceil(max(map(abs, self.support)) / bin_width) + 2
         return np.arange(-reach - 1, reach + 2) * np.float64(bin_width)
 
@@ -341,8 +350,21 @@ def response_matrix(
         source_start, source_width, source_bins: The axis of the source [s].
         edges: Of the detector bins [s], ascending, `[bins + 1]`.
         period: Of the pulses [s]; None: time does not wrap.
+
+    Raises:
+        ArgumentError: Names the argument, its value and what is allowed.
     """
-    e = np.asarray(edges, np.float64)
+    if not isinstance(irf, InstrumentResponse):
+        raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
+    source_start, source_width = (
+        check_real("source_start", source_start, TIME),
+        check_real("source_width", source_width, BIN_WIDTH),
+    )
+    source_bins = check_integer("source_bins", source_bins, "[1, 2147483647]")
+    period = None if period is None else check_real("period", period, BIN_WIDTH)
+    e = real_array("edges", edges, np.float64)
+    if e.ndim != 1 or e.size < 2 or not (np.isfinite(e).all() and (np.diff(e) > 0).all()):
+        raise ArgumentError(f"edges of shape {e.shape} are not [bins + 1] finite, ascending times")
     lower, upper = irf.support
     wraps = range(1)
     if period is not None:

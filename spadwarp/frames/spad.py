@@ -20,7 +20,7 @@ from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
 from spadwarp.frames.receiver import Receiver
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.frames.window import Window, missing_light
-from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real
+from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real, shown
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
@@ -92,7 +92,14 @@ def detect(
     """
     source = as_result(source) if isinstance(source, str | os.PathLike) else source
     result, scene = source, getattr(source, "scene", None)
+    for name, value, kind in (("detector", detector, Detector), ("laser", laser, Laser)):
+        if not (value is None or isinstance(value, kind)):
+            raise ArgumentError(f"{name} = {shown(value)} is not the section {name} of a scene")
     if scene is not None:
+        if gate_start is not None or bin_width is not None:
+            raise ArgumentError(
+                "gate_start and bin_width are for arrays: a result has its own; window gives the camera's"
+            )
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
         detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure
+from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, pilot
 from spadwarp.scene import Laser, Scene
 from spadwarp.units import range_from_time
 
@@ -139,6 +139,18 @@ def test_largest_range_falls_with_the_extinction():
     assert turbid.range_limit
 
 
+def test_the_brightest_pixel_has_light_where_a_run_is_so_short_that_few_have():
+    scene = make(gate={"start_ns": 40.0, "bins": 600})
+    runs = pilot.trace(pilot.window(scene), 20_000, 1, "cpu")
+    row, column = np.unravel_index(runs[0].detections.sum(axis=-1).argmax(), runs[0].detections.shape[:2])
+    for run in runs:
+        kept = run.tallies[:, row, column].copy()
+        run.tallies[...] = 0
+        run.tallies[:, row, column] = kept
+    detected = sum(run.detections[row, column].sum() for run in runs) / 2
+    assert pilot.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
+
+
 def test_ranges_stand_for_an_unknown_target():
     anywhere = proposal(ranges=(3.0, 5.0))
     assert anywhere.target_range == (3.0, 5.0) and anywhere.gate_range[0] < 2.75 and anywhere.gate_range[1] > 5.25
@@ -152,6 +164,7 @@ def test_ranges_stand_for_an_unknown_target():
         ({"ranges": ("3 m", "2 m")}, "least <= largest"),
         ({"depth_error": 0.0}, "depth_error = 0.0"),
         ({"ranges": (5.0, 3.0)}, "least <= largest"),
+        ({"ranges": 5.0}, "ranges = 5.0 is not (least"),
         ({"method": "guess"}, "'guess' is not one of"),
         ({"margin": -1.0}, "margin = -1.0"),
         ({"eye_exposure": 1e9}, "exposure = 1000000000.0"),
@@ -227,6 +240,9 @@ def test_mpe_is_continuous():
     assert permissible_exposure(5e-6, 532.0) == pytest.approx(2e-3, rel=0.05)
     with pytest.raises(spadwarp.ArgumentError, match="outside \\[400, 1050\\]"):
         permissible_exposure(1.0, 1550.0)
+    for duration in (-1.0, math.nan, None):
+        with pytest.raises(spadwarp.ArgumentError, match="duration = "):
+            permissible_exposure(duration, 532.0)
 
 
 @pytest.mark.parametrize("profile", ["uniform_cone", "gaussian"])

@@ -1,5 +1,7 @@
 """Features of histograms, and the scattered light that networks are trained on."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,8 @@ from scipy.linalg import toeplitz
 from scipy.stats import exponnorm, norm
 
 from helpers.stepped_frames import denoised
-from spadwarp import ArgumentError
-from spadwarp.denoise import histogram_inputs, synthetic_noise
+from spadwarp import ArgumentError, DeviceError
+from spadwarp.denoise import apply, estimate, histogram_inputs, synthetic_noise
 from spadwarp.denoise.guide import GUIDES
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features
 from spadwarp.denoise.recipe import Noise
@@ -150,13 +152,45 @@ def test_depths_far_from_the_counts_are_answered():
         ({"background": np.zeros(5)}, "background has shape"),
         ({"background": None}, "needs counts, background and response"),
         ({"response": np.ones(4)}, "response has shape"),
-        ({"counts": np.zeros((20, 16, 8))}, "histograms are 1 frames"),
+        ({"counts": np.zeros((20, 16, 8))}, r"depth has shape \(16, 16\); \(20, 16\) is needed"),
+        ({"counts": -np.ones((16, 16, 8))}, r"counts = -1.0 … -1.0 are outside \[0, inf\)"),
+        ({"counts": np.full((16, 16, 8), np.nan)}, "counts = nan"),
+        ({"counts": np.zeros((16, 16, 8), complex)}, "counts are complex128"),
+        ({"background": np.ones(8, complex)}, "background = .* is not an array of real numbers"),
+        ({"response": "gaussian"}, "response = 'gaussian' is not an array of real numbers"),
+        ({"gate": (16.0, 14.0)}, r"gate = \(16.0, 14.0\) m is not \(start, stop\)"),
+        ({"gate": (math.nan, 14.0)}, "gate = nan is outside"),
+        ({"precision": "float8"}, "precision = 'float8' is not one of"),
     ],
 )
 def test_errors_name_what_is_wrong(changed, message):
     given = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3), **changed}
     with pytest.raises(ArgumentError, match=message):
         denoised(np.full((16, 16), 15.0), **given)
+
+
+@pytest.mark.parametrize("model", ["likelihood", "histograms"])
+def test_what_a_method_cannot_use_is_refused(model):
+    given = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3), "gate": (14.0, 16.0)}
+    depth = np.full((16, 16), 15.0)
+    with pytest.raises(ArgumentError, match=r"gate = \(16.0, 14.0\)"):
+        estimate(depth, model=model, **{**given, "gate": (16.0, 14.0)})
+    with pytest.raises(ArgumentError, match="counts = nan"):
+        estimate(depth, model=model, **{**given, "counts": np.full((16, 16, 8), np.nan)})
+    with pytest.raises(DeviceError, match="device = True is not 'cpu' or 'cuda:N'"):
+        estimate(depth, model=model, device=True, **given)
+    if model == "likelihood":
+        with pytest.raises(ArgumentError, match="weights are for a network, not for 'likelihood'"):
+            estimate(depth, model=model, weights="own.safetensors", **given)
+
+
+def test_masked_pixels_and_tensors_are_depth_too():
+    values = np.full((16, 16), 15.0)
+    masked = np.ma.masked_array(values, np.eye(16) > 0)
+    holes = apply(np.where(np.eye(16) > 0, np.nan, values), gate=(14.0, 16.0), model="gating")
+    assert np.array_equal(apply(masked, gate=(14.0, 16.0), model="gating"), holes, equal_nan=True)
+    learned = torch.tensor(values, requires_grad=True)
+    assert np.array_equal(apply(learned, gate=(14.0, 16.0), model="median"), np.full((16, 16), 15.0, np.float32))
 
 
 def test_shapes_of_features():

@@ -1,5 +1,7 @@
 """The instrument response against quadrature."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
@@ -197,3 +199,28 @@ def test_wrong_input_is_named():
         InstrumentResponse(sigma=np.inf)
     with pytest.raises(ValueError, match="no density"):
         InstrumentResponse().density(0.0)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"irf": 1e-10}, "irf = 1e-10 is not an InstrumentResponse"),
+        ({"source_width": -1e-10}, "source_width = -1e-10 is outside"),
+        ({"source_start": math.nan}, "source_start = nan is outside"),
+        ({"source_bins": 0}, "source_bins = 0 is outside"),
+        ({"period": 0.0}, "period = 0.0 is outside"),
+        ({"edges": [2.0, 1.0]}, "finite, ascending times"),
+        ({"edges": []}, "finite, ascending times"),
+    ],
+)
+def test_axes_that_cannot_be_are_named(changes, message):
+    given = {"irf": RESPONSES["gaussian"], **AXIS, "edges": np.linspace(0.0, 1e-9, 11), **changes}
+    with pytest.raises(ArgumentError, match=message):
+        response_matrix(given.pop("irf"), **given)
+
+
+def test_a_response_in_the_wrong_unit_is_refused_and_fills_no_memory():
+    with pytest.raises(ArgumentError, match=r"a response of .* s on a side is longer than 1e\+07 bins of 1e-10 s"):
+        InstrumentResponse(sigma=1.0).per_bin(100e-12)
+    with pytest.raises(ArgumentError, match="bin_width = -1e-10 is outside"):
+        InstrumentResponse(sigma=1e-10).per_bin(-100e-12)

@@ -1,10 +1,14 @@
 """The camera: from expected detections to frames of counts and depth."""
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
 
 from helpers.synthetic_result import make_result, make_scene
+from spadwarp import ArgumentError
 from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities
 from spadwarp.scene import Detector, Laser
 
@@ -248,10 +252,23 @@ def test_wrong_input_is_named(changes, message):
         detect(call.pop("source"), **call)
 
 
+def test_a_result_has_its_own_time_axis():
+    with pytest.raises(ArgumentError, match="gate_start and bin_width are for arrays"):
+        detect(SimpleNamespace(scene=object()), pulses=10, seed=1, gate_start=0.0)
+    for name in ("detector", "laser"):
+        with pytest.raises(ArgumentError, match=f"{name} = .* is not the section {name} of a scene"):
+            detect(_spike(3), pulses=10, seed=1, **{**CALL, name: {}})
+
+
 def test_wrong_counts_are_named():
     with pytest.raises(ValueError, match="pulses = 5 is below the 7 counts"):
         coates(np.array([[3, 4]]), pulses=5)
     with pytest.raises(ValueError, match="integers are needed"):
         coates(np.array([[3.0, 4.0]]), pulses=50)
+    with pytest.raises(ArgumentError, match="counts = 4611686018427387904 is above"):
+        coates(np.full((1, 64), 2**62), pulses=50)
+    for pulses in (None, math.nan, 0):
+        with pytest.raises(ArgumentError, match="pulses = "):
+            coates(np.array([[3, 4]]), pulses=pulses)
     with pytest.raises(ValueError, match="hazard holds a negative"):
         first_photon_probabilities(np.array([[0.1, -0.2]]))
