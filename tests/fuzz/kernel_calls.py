@@ -9,10 +9,10 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
-from fuzz import world_calls
+from fuzz import optics_calls, world_calls
 from fuzz.isolation import run_isolated
 from helpers.lit_box import lit_box
-from spadwarp_kernels import analytic, detection
+from spadwarp_kernels import PortKind, analytic, detection
 
 NUMBERS = (0, -1, 1, 2, 1.5, -0.5, math.nan, math.inf, -math.inf, 1e30, 1e-30, 2**31 - 1, 2**31, 2**63, 2**64, -(2**31))
 NUMBERS += (1e300, True, 10**40)
@@ -211,7 +211,7 @@ def _valid_calls():
     }
     for method in ("peak", "centroid", "matched", "likelihood"):
         calls[f"arrival_{method}"] = (sk.arrival_bins, {"histogram": counts, "method": method, **bins, "half_width": 2})
-    return calls | world_calls.valid_calls(mesh)
+    return calls | world_calls.valid_calls(mesh) | optics_calls.valid_calls(mesh)
 
 
 _DTYPES = (float, int, wp.float64, wp.int64, wp.vec3, wp.vec3d, wp.vec4, wp.uint8, wp.bool)
@@ -238,6 +238,8 @@ def _changed(r, value):
             "lens": (sk.CALIBRATED, None, "x"),
         }
         return value._replace(**{name: r.choice(others.get(name, (not getattr(value, name), "yes", None)))})
+    if isinstance(value, PortKind):
+        return r.choice((sk.DOME_PORT, None, *JUNK))
     if isinstance(value, (list, tuple)):
         items = list(value)
         if items and r.random() < 0.7:
@@ -303,7 +305,8 @@ def _struct(r, struct):
     elif isinstance(now, float):
         odd = r.choice((0.0, -1.0, 1.5, math.nan, math.inf, -math.inf, 1e30, 1e-30))
     else:
-        odd = type(now)(r.choice((0.0, 2.0, math.nan, math.inf, 1e30)))
+        whole = isinstance(now, wp.vec3i)
+        odd = type(now)(r.choice((0, 2, -1, 2**31 - 1) if whole else (0.0, 2.0, math.nan, math.inf, 1e30)))
     try:
         setattr(made, name, odd)
     except (TypeError, RuntimeError, ValueError):  # Warp refuses another dtype

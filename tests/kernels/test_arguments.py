@@ -121,6 +121,51 @@ def test_a_mesh_that_is_not_there(box):
     launch(box, sk.TransportSpec("next_event", mesh=False), model=model)
 
 
+def test_a_public_tree_is_read_from_the_mesh_that_the_model_keeps(box):
+    """With a mesh that nobody keeps this was a segmentation fault, too."""
+    surfaces = sk.make_surfaces(box, 0.5, public_tree=True)
+    spec = sk.TransportSpec("next_event", public_tree=True)
+    for mesh in (None, wp.Mesh(wp.clone(box.points), wp.clone(box.indices))):
+        model = sk.Model(device="cpu", mesh=mesh, surfaces=surfaces, scale=2.0**50, **structs())
+        with pytest.raises(
+            sk.ArgumentError, match=r"spec\.public_tree = True reads the mesh that the surfaces were made"
+        ):
+            launch(box, spec, model=model)
+    model = sk.Model(device="cpu", mesh=box, surfaces=surfaces, scale=2.0**50, **structs())
+    assert launch(box, spec, model=model).tally.numpy().any()
+
+
+PORT = {"index": (1.0, 1.5, 1.34), "group_index": (1.0, 1.5, 1.36)}
+NONE = {"kinds": (), "value": (), "scale": (1.0,), "channels": 1, "device": "cpu"}
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "text"),
+    [
+        (sk.reflection_images, ([1, 0, 0], [0, 0], 2), r"high = \[0, 0\] is not three numbers"),
+        (sk.reflection_images, ([1, 0, 0], [0, 0, 0], 10**9), r"max_reflections = 1000000000 is outside \[0, 8\]"),
+        (sk.make_boundary, (None, [0, 0, 0]), "low is .* a list is needed"),
+        (sk.sphere_integral, (3.0,), "function = 3.0 is not a function"),
+        (sk.sphere_integral, (lambda t: None,), "what function returns has shape"),
+        (sk.surface_choices, (None,), "surfaces is .* a Surfaces is needed"),
+        (sk.surface_choices, (sk.Surfaces(),), "surfaces.corner_reflectance is missing"),
+        (analytic.make_optics, ([],), r"port = \[\] is not a PortKind"),
+        (sk.make_polarisation, {"laser": 1.0, "device": "cpu"}, "laser = 1.0 is not a Stokes vector"),
+        (sk.make_polarisation, {"matrix": 1.0, "device": "cpu"}, "matrix = 1.0 is not a function"),
+        (sk.make_polarisation, {"channels": [1.0], "device": "cpu"}, r"channels\[0\] is .* a list is needed"),
+        (sk.make_derivatives, {**NONE, "kinds": None}, "kinds is .* a list is needed"),
+        (sk.make_derivatives, {**NONE, "waters": [0.5]}, "waters holds numbers that are not whole"),
+        (sk.make_derivatives, {**NONE, "faces": "x"}, "faces is .* not an array of numbers"),
+        (sk.make_derivatives, {**NONE, "blocks": 3}, "blocks is .* a Blocks is needed"),
+        (sk.make_dome_port, {"radius": 1e300, "thickness": 0.01, **PORT}, r"radius = 1e\+300 is outside \(0, 1e9\]"),
+    ],
+)
+def test_parts_of_a_model_name_what_is_wrong(make, arguments, text):
+    positional, named = ((), arguments) if isinstance(arguments, dict) else (arguments, {})
+    with pytest.raises(sk.ArgumentError, match=text):
+        make(*positional, **named)
+
+
 @pytest.mark.parametrize(
     ("spec", "text"),
     [

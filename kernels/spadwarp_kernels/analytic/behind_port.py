@@ -361,7 +361,6 @@ def _make_illuminated(kind: PortKind | None, light: wp.Function) -> wp.Function:
     return illuminated
 
 
-@made_once
 def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None) -> Optics:
     """The optics of a camera and a laser behind kinds of ports; None: in the water.
 
@@ -370,8 +369,11 @@ def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None
     for name, kind in {"port": port, "laser_port": laser_port}.items():
         if not isinstance(kind, PortKind | None):
             raise ArgumentError(f"{name} = {kind!r} is not a PortKind or None")
-    if port is None and laser_port is None:
-        return IN_WATER
+    return IN_WATER if port is None and laser_port is None else _make_optics(port, laser_port)
+
+
+@made_once
+def _make_optics(port: PortKind | None, laser_port: PortKind | None) -> Optics:
     camera, beam = _make_camera(port), _make_beam(laser_port)
     return Optics(
         kinds=(port, laser_port),

@@ -9,10 +9,11 @@ which it meets the faces, and crosses each on the face.
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_device, check_integer, check_number
+from spadwarp_kernels.arguments import ArgumentError, check_device, check_integer, check_items, check_number
 
 
 @wp.struct
@@ -127,13 +128,29 @@ def image_reflectance(boundary: Boundary, image: wp.vec3i, u: wp.vec3) -> float:
     return product
 
 
+def _checked_faces(low: Any, high: Any, max_reflections: Any) -> tuple[list[float], list[float], int]:
+    found = {}
+    for name, indices in (("low", low), ("high", high)):
+        items = check_items(name, indices)
+        if len(items) != 3:
+            raise ArgumentError(f"{name} = {indices!r} is not three numbers")
+        found[name] = [
+            check_number(f"{name}, {axis},", one, "[0, 1e9]") for axis, one in zip("xyz", items, strict=True)
+        ]
+    return found["low"], found["high"], check_integer("max_reflections", max_reflections, 0, 8)
+
+
 def reflection_images(low: Sequence[float], high: Sequence[float], max_reflections: int) -> list[tuple[int, int, int]]:
     """All chains of at most so many reflections as the numbers of `Boundary.images`, those of few reflections first.
 
     Args:
         low, high: See `Boundary`.
-        max_reflections: >= 0.
+        max_reflections: 0 ... 8.
+
+    Raises:
+        ArgumentError: A number out of range.
     """
+    low, high, max_reflections = _checked_faces(low, high, max_reflections)
     numbers = [
         [
             k
@@ -160,14 +177,9 @@ def make_boundary(
     Raises:
         ArgumentError: A number out of range, or all faces let light out.
     """
-    for name, indices in (("low", low), ("high", high)):
-        if len(indices) != 3:
-            raise ArgumentError(f"{name} = {indices!r} is not three numbers")
-        for axis, index in zip("xyz", indices, strict=True):
-            check_number(f"{name}, {axis},", index, "[0, 1e9]")
+    low, high, max_reflections = _checked_faces(low, high, max_reflections)
     if not any((*low, *high)):
         raise ArgumentError("low and high: all faces let all light out; such a spec is not `reflecting`")
-    max_reflections = check_integer("max_reflections", max_reflections, 0, 8)
     boundary = Boundary()
     boundary.low, boundary.high = wp.vec3(*low), wp.vec3(*high)
     images = reflection_images(low, high, max_reflections)

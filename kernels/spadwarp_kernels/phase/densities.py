@@ -104,4 +104,9 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
 def sphere_integral(function: Callable[[Floats], Floats]) -> float:
     """Integral over the unit sphere of a function of t = 1 - cos(theta)."""
     z, weight = folded_quadrature()
-    return float(4.0 * np.pi * (function(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)) * weight).sum())
+    if not callable(function):
+        raise ArgumentError(f"function = {function!r} is not a function of t")
+    found = check_numbers("what function returns", function(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
+    if found.shape != z.shape and not (found.shape == () and np.isfinite(found)):
+        raise ArgumentError(f"what function returns has shape {found.shape}; {z.shape} is needed, that of t")
+    return float(4.0 * np.pi * (found * weight).sum())

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.arguments import ArgumentError, check_device, check_number, check_numbers
+from spadwarp_kernels.arguments import ArgumentError, check_device, check_items, check_number, check_numbers
 
 # Points of the tables of a scattering matrix; an odd number.
 MATRIX_POINTS = 1025
@@ -69,6 +69,8 @@ def make_polarisation(
     polarisation.laser = wp.vec4(*check_stokes("laser", laser))
     cosines = matrix_cosines()
     table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
+    if not (matrix is None or callable(matrix)):
+        raise ArgumentError(f"matrix = {matrix!r} is not a function of cosines")
     if matrix is not None:
         table = check_numbers("matrix", matrix(cosines))
     if table.shape != (cosines.size, 5):
@@ -77,10 +79,11 @@ def make_polarisation(
         raise ArgumentError("matrix holds elements that are not finite or beyond m11: outside [-1, 1]")
     polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
     polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
-    if len(channels) > MOST_CHANNELS or any(len(row) != 4 for row in channels):
+    given = [check_items(f"channels[{k}]", row) for k, row in enumerate(check_items("channels", channels))]
+    if len(given) > MOST_CHANNELS or any(len(row) != 4 for row in given):
         raise ArgumentError(f"channels are not up to {MOST_CHANNELS} rows of 4 numbers")
     rows = np.zeros((MOST_CHANNELS, 4))
-    for k, row in enumerate(channels):
+    for k, row in enumerate(given):
         rows[k] = [check_number(f"channels[{k}]", one, "[-1, 1]") for one in row]
     polarisation.channels = Channels(*rows.ravel().tolist())
     facets = np.ravel(check_numbers("facet_index", facet_index))
@@ -94,7 +97,7 @@ def check_stokes(name: str, stokes: Any) -> list[float]:
     """Four numbers of light with I = 1 that is polarised by 1 at most; raises `ArgumentError`."""
     found = check_numbers(name, stokes)
     if found.shape != (4,) or not np.isfinite(found).all() or found[0] != 1.0:
-        raise ArgumentError(f"{name} = {list(stokes)} is not a Stokes vector with I = 1")
+        raise ArgumentError(f"{name} = {stokes!r} is not a Stokes vector with I = 1")
     if float(np.linalg.norm(found[1:])) > 1.0 + 1e-6:
-        raise ArgumentError(f"{name} = {list(stokes)} is polarised by more than 1")
+        raise ArgumentError(f"{name} = {stokes!r} is polarised by more than 1")
     return [float(value) for value in found]

@@ -120,7 +120,7 @@ def make_dome_port(
         ArgumentError: A number out of its range, or a lens so far from the centre that some of its light could not get
             through.
     """
-    check_number("radius", radius, "(0, inf)")
+    check_number("radius", radius, "(0, 1e9]")
     check_vector("centre", centre)
     _check_layers(thickness, index, group_index, origin, aperture_radius)
     check_number("largest_angle", largest_angle, "[0, 1.5707963]")
@@ -165,8 +165,8 @@ def _check_layers(
     aperture_radius: float,
 ) -> None:
     check_vector("origin", origin)
-    check_number("thickness", thickness, "[0, inf)")
-    check_number("aperture_radius", aperture_radius, "[0, inf)")
+    check_number("thickness", thickness, "[0, 1e9]")
+    check_number("aperture_radius", aperture_radius, "[0, 1e9]")
     for name, values in (("index", index), ("group_index", group_index)):
         check_vector(name, values)
         for k, value in enumerate(values):

@@ -275,6 +275,10 @@ def _check_sum(surfaces: Surfaces) -> None:
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `public_tree`."""
+    check_struct("surfaces", surfaces, Surfaces)
+    for name in ("corner_reflectance", "specular", "nodes"):
+        if not isinstance(getattr(surfaces, name), wp.array):
+            raise ArgumentError(f"surfaces.{name} is missing; see make_surfaces")
     return {
         "pattern": surfaces.corner_reflectance.size > 0,
         "specular": surfaces.specular.size > 0,

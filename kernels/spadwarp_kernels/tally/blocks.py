@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_integer, check_number, check_struct
+from spadwarp_kernels.arguments import ArgumentError, check_integer, check_items, check_number, check_struct
 from spadwarp_kernels.medium.grid import Grid
 
 # What a derivative by block may be with respect to: a at fixed b, b at fixed a, or c at fixed albedo, the same addition
@@ -82,6 +82,7 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
         ArgumentError: A number that does not divide that of the cells, or is out of range; too many derivatives.
     """
     check_struct("grid", grid, Grid)
+    shape, scale = check_items("shape", shape), check_items("scale", scale)
     kinds = check_integer("kinds of derivatives by block", len(scale), 1, len(BLOCK_DERIVATIVES))
     for q, value in enumerate(scale):
         check_number(f"scale[{q}]", value, "(0, inf)")

@@ -7,9 +7,19 @@ has met: flights, scatterings, bounces (the score function or likelihood ratio m
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_choice, check_device, check_integer, check_number
+from spadwarp_kernels.arguments import (
+    ArgumentError,
+    check_choice,
+    check_device,
+    check_integer,
+    check_items,
+    check_number,
+    check_numbers,
+    check_struct,
+)
 from spadwarp_kernels.math.once import made_once
 
 from .blocks import Blocks, met_count, met_entry, score_entry
@@ -60,6 +70,8 @@ def make_derivatives(
     kind that is not one of DERIVATIVES, or a number out of range.
     """
     channels = check_integer("channels", channels, 0, MOST_DERIVATIVES)
+    given = {"kinds": kinds, "value": value, "scale": scale}
+    kinds, value, scale = (check_items(name, items) for name, items in given.items())
     device, count = check_device("device", device), check_integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
     least = 1 if blocks is None else 0
     tallies = check_integer("derivatives and channels", count + channels, least, MOST_DERIVATIVES)
@@ -76,11 +88,20 @@ def make_derivatives(
     derivatives = Derivatives()
     derivatives.value = Scores(*value, *[0.0] * (MOST_DERIVATIVES - count))
     derivatives.scale = Scores(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
-    derivatives.waters = wp.array(waters, dtype=int, device=device, shape=len(waters))
-    derivatives.faces = wp.array(faces, dtype=int, device=device, shape=len(faces))
+    derivatives.waters = _numbers_of_parts("waters", waters, device)
+    derivatives.faces = _numbers_of_parts("faces", faces, device)
     if blocks is not None:
+        check_struct("blocks", blocks, Blocks)
         derivatives.blocks = blocks
     return derivatives
+
+
+def _numbers_of_parts(name: str, values: Any, device: wp.Device) -> wp.array:
+    numbers = check_numbers(name, values, 1)
+    whole = np.nan_to_num(numbers).astype(np.int32) if np.abs(numbers).max(initial=0.0) < 2**31 else None
+    if whole is None or not np.array_equal(whole, numbers):
+        raise ArgumentError(f"{name} holds numbers that are not whole or beyond 2^31")
+    return wp.array(whole, dtype=int, device=device, shape=whole.size)
 
 
 @made_once

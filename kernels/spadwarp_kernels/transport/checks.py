@@ -268,6 +268,11 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
     check_faces("model.surfaces", surfaces, faces, device)
+    if spec.public_tree and (model.mesh is None or model.mesh.id != surfaces.mesh):
+        raise ArgumentError(
+            "spec.public_tree = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
+            "model keeps it"
+        )
     if spec.brute_force and device.is_cuda:
         check_patches("model.surfaces", surfaces, faces, device)
     check_array("model.surfaces.nodes", surfaces.nodes, wp.vec4, (None,), device)
