@@ -35,7 +35,8 @@ def train(
 
     New noise is drawn for each step; after the first ones it says how long it will take. Writes weights (safetensors),
     log.jsonl, curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command
-    resumes the training. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
+    resumes the training. Another recipe or number of steps needs a new folder. On several GPUs: torchrun
+    --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

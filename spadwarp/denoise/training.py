@@ -103,7 +103,8 @@ def fit(
             run.save_checkpoint()
             workers.close()
             raise KeyboardInterrupt(
-                f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}"
+                f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}; "
+                "another number of steps needs a new folder"
             )
     trained = run.finish(psnr or validation_psnr(run.average, validation, recipe))
     workers.close()
@@ -126,13 +127,9 @@ def _prepared(run: Run, interrupted: threading.Event, notify: Callable[[str], No
 
 def _duration(workers: Workers, seconds: float, steps: int) -> str:
     """How long the rest of a training takes."""
-    minutes = seconds * steps / 60.0
-    text = (
-        f"{steps} steps to go, about {minutes:.0f} minutes"
-        if minutes < 120
-        else (f"{steps} steps to go, about {minutes / 60.0:.0f} hours")
-    )
-    return f"{text}{_advice(workers)}"
+    left = seconds * steps
+    number, unit = (left, "s") if left < 120 else (left / 60, "minutes") if left < 7200 else (left / 3600, "hours")
+    return f"{steps} step{'s' * (steps != 1)} to go, about {max(number, 1):.0f} {unit}{_advice(workers)}"
 
 
 def _advice(workers: Workers) -> str:
@@ -141,8 +138,8 @@ def _advice(workers: Workers) -> str:
         return ""
     return (
         " on this CPU; a data-centre GPU trains in minutes. The package has trained weights, which `spadwarp denoise` "
-        "uses; fewer steps (--steps), or start from these weights (start in the recipe), take less. Ctrl-C keeps a "
-        "checkpoint from which the same command resumes"
+        "uses; fewer steps (--steps, in a new folder), or start from these weights (start in the recipe), take less. "
+        "Ctrl-C keeps a checkpoint from which the same command resumes"
     )
 
 

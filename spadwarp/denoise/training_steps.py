@@ -77,6 +77,28 @@ def learning_rate(step: int, recipe: TrainingRecipe) -> float:
     return settings.learning_rate * rise * (0.01 + 0.99 * fall)
 
 
+def _difference(stored: Any, recipe: TrainingRecipe) -> str:
+    """In which fields the recipe of a checkpoint, a text, differs from this one."""
+    try:
+        before, now = _fields(json.loads(stored)), _fields(recipe.model_dump(mode="json"))
+    except (AttributeError, TypeError, ValueError):  # no recipe of ours
+        return ""
+    names = [name for name in now if before.get(name) != now[name]]
+    parts = [
+        f"{name} = {before.get(name)}, here {now[name]}" if name != "mixture" else "mixture" for name in names[:3]
+    ] + ["…"] * (len(names) > 3)
+    why = "; its learning rate decreases over all steps" if names == ["optimiser.steps"] else ""
+    return f" ({'; '.join(parts)}{why})" if parts else ""
+
+
+def _fields(tables: dict[str, Any]) -> dict[str, Any]:
+    """Values by name, those of a table as `optimiser.steps`."""
+    named: dict[str, Any] = {}
+    for name, value in tables.items():
+        named |= {f"{name}.{one}": inner for one, inner in value.items()} if isinstance(value, dict) else {name: value}
+    return named
+
+
 class Workers:
     """The processes of a run: this one alone, or those that torchrun started."""
 
@@ -156,8 +178,12 @@ class Run:
             kept = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
         except Exception as error:  # what a damaged file raises depends on where it is damaged
             raise FileError(f"{self.checkpoint}: damaged; remove it to start anew ({type(error).__name__})") from error
-        if not isinstance(kept, dict) or kept.get("recipe") != self.recipe.model_dump_json():
-            raise ConfigError(f"{self.checkpoint} belongs to another recipe; remove it, or choose another folder")
+        stored = kept.get("recipe") if isinstance(kept, dict) else None
+        if stored != self.recipe.model_dump_json():
+            raise ConfigError(
+                f"{self.checkpoint} belongs to another recipe{_difference(stored, self.recipe)}; choose another folder "
+                "with --out, or remove this file to start anew"
+            )
         try:
             for name, part in self.state.items():
                 part.load_state_dict(kept[name])

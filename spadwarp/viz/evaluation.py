@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from spadwarp.viz.panels import mark_pixels
@@ -68,6 +70,8 @@ SCORES = {
 }
 """Title and format of each score."""
 
+_MARKS = _NO_TARGET, _MISSED, _INVENTED = "grey: no target", "black: target missed", "red: target invented"
+
 Sample = tuple[NDArray[np.float32], tuple[float, float], Mapping[str, NDArray[np.float32]], str]
 
 
@@ -93,7 +97,7 @@ def draw_scores(
     axes = figure.subplots(len(fields), len(targets), squeeze=False, sharex=True, sharey="row")
     counted = any("photons" in level for level in levels)
     places = [float(k) for k in range(len(levels))] if counted else [float(level) for level in levels]
-    labels = [level.removesuffix(" photons") if counted else level.lstrip("0") for level in levels]
+    labels = [level.removesuffix(" photons") if counted else level for level in levels]
     every = -(-len(labels) // max(2, int((width - 0.6) / len(targets) / 0.4)))
     lines: dict[str, Any] = {}
     for column, target in enumerate(targets):
@@ -133,7 +137,8 @@ def draw_samples(
 ) -> Path:
     """A row for each sample: truth, then the methods. Returns the path.
 
-    Grey: neither the truth nor the method sees a target. Black: a target is missed. Red: a target is invented.
+    Grey: neither the truth nor the method sees a target. Black: a target is missed. Red: a target is invented. The
+    note below explains those that there are.
     `rescaled`: colours over the depth of the target, not over the gate. `enlarged`: only the part with most edges.
     `width`: of the picture [inch], more where there are too many methods for it.
     """
@@ -143,10 +148,11 @@ def draw_samples(
     height, across = samples[0][0].shape
     ratio = 1.0 if enlarged else height / across
     figure = new_figure(cell * columns + 0.5, (cell * ratio + 0.28) * len(samples) + 0.75)
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)  # type: ignore[call-arg,union-attr]
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.0, wspace=0.02)  # type: ignore[call-arg,union-attr]
     axes = figure.subplots(len(samples), columns, squeeze=False)
     for axis, title in zip(axes[0], ["truth", *(TITLES[name] for name in methods)], strict=True):
         axis.set_title(wrapped(title, cell - 0.05, size=7), fontsize=7)
+    marks: set[str] = set()
     for row, (clean, gate, images, caption) in zip(axes, samples, strict=True):
         part = _detail(clean, gate) if enlarged else (slice(None), slice(None))
         low, high = _limits(clean[part], gate) if rescaled else gate
@@ -160,16 +166,23 @@ def draw_samples(
             shown = np.where(target, image, np.nan)[part]
             drawn = axis.imshow(shown, cmap=colour_map(DEPTH_MAP), vmin=low, vmax=high)
             found = np.isfinite(image)
+            missed, invented = (target & ~found)[part], (found & ~target)[part]
             if name != "truth":
-                mark_pixels(axis, (target & ~found)[part], (found & ~target)[part])
+                mark_pixels(axis, missed, invented)
+                marks |= {text for text, of in ((_MISSED, missed), (_INVENTED, invented)) if of.any()}
+            marks |= {_NO_TARGET} if not (found | target)[part].all() else set()
         bar = figure.colorbar(drawn, ax=list(row), fraction=0.02, pad=0.01)
         bar.set_label("depth z [m]", fontsize=7)
         bar.ax.locator_params(axis="y", nbins=4)
         bar.ax.tick_params(labelsize=6)
         bar.outline.set_visible(False)
-        text = row[0].text(0.0, -0.04, caption, fontsize=6.5, va="top", transform=row[0].transAxes)
-        text.set_in_layout(False)  # may extend below the other images
-    return save(figure, path, note=f"grey: no target; black: target missed; red: target invented; {note}")
+        row[0].set_xlabel(" ", fontsize=6.5)  # the place of the caption, which may extend below the other images
+        row[0].annotate(
+            caption, (0.0, 0.0), (0.0, -2.0), xycoords="axes fraction", textcoords="offset points", fontsize=6.5,
+            va="top",
+        ).set_in_layout(False)  # fmt: skip
+    _fit_height(figure, axes[:, 0], ratio)
+    return save(figure, path, note="; ".join([*(text for text in _MARKS if text in marks), note]))
 
 
 @paper()
@@ -279,6 +292,16 @@ def draw_reliability(
 
 
 # Parts
+
+
+def _fit_height(figure: Figure, column: Sequence[Axes], ratio: float) -> None:
+    """Gives a figure the height at which images above each other, whose width decides how large they are, fill their
+    rows; `ratio`: of an image, its height over its width."""
+    for _ in range(2):  # texts take the place that is left free in the first layout
+        figure.draw_without_rendering()
+        width, height = figure.get_size_inches()
+        cells = [axis.get_position(original=True) for axis in column]
+        figure.set_figheight(height + sum(ratio * width * cell.width - height * cell.height for cell in cells))
 
 
 def _line(method: str, bold: bool) -> dict[str, Any]:

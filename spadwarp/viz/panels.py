@@ -50,7 +50,7 @@ class Panels:
         self._cell = min(width / columns, _LARGEST)
         height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
         # Titles, numbers and labels; more below for its labels and a legend.
-        self.figure = new_figure(width, lines * (height + 1.1) + (below + 0.7) * bool(below) + 0.25)
+        self.figure = new_figure(width, lines * (height + 1.1) + (below + 0.7) * bool(below))
         self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.05)  # type: ignore[call-arg,union-attr]
         ratios = [height, 0.1] * lines + [below] * bool(below)
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
@@ -64,7 +64,7 @@ class Panels:
     def caption(self, text: str) -> None:
         """Writes what the figure shows above it."""
         text = wrapped_items(text, self.figure.get_figwidth() - 0.3)
-        self.figure.set_figheight(self.figure.get_figheight() + 0.14 * text.count("\n"))
+        self.figure.set_figheight(self.figure.get_figheight() + 0.25 + 0.14 * text.count("\n"))
         self.figure.suptitle(text, color=TEXT)
 
     def place(self, title: str) -> tuple[Axes, Axes]:

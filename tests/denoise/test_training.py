@@ -9,13 +9,14 @@ import torch
 from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
-from spadwarp.denoise import network_files, networks, pyramid, selection
+from spadwarp.denoise import network_files, networks, pyramid, selection, training
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.losses import loss_of
 from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training import fit
+from spadwarp.denoise.training_steps import Workers
 
 
 def scenes(count=4, size=64):
@@ -306,7 +307,21 @@ def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
 def test_training_says_how_long_it_takes_and_what_to_do_instead(tmp_path):
     said = []
     fit(TrainingRecipe.from_dict(RECIPE), scenes(), scenes(), tmp_path, device="cpu", notify=said.append)
-    assert "1 steps to go" in said[0] and "Ctrl-C keeps a checkpoint" in said[0]
+    assert "1 step to go, about 1 s" in said[0] and "Ctrl-C keeps a checkpoint" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"),
+    [
+        (50, "about 50 s"),
+        (119, "about 119 s"),
+        (120, "about 2 minutes"),
+        (7199, "about 120 minutes"),
+        (7200, "2 hours"),
+    ],
+)
+def test_how_long_a_training_takes_in_words(steps, text):
+    assert text in training._duration(Workers("cpu"), 1.0, steps)
 
 
 def test_scenes_are_drawn_where_there_is_no_dataset(tmp_path):
@@ -317,8 +332,12 @@ def test_scenes_are_drawn_where_there_is_no_dataset(tmp_path):
 
 def test_a_folder_holds_one_recipe(tmp_path):
     train(tmp_path)
-    with pytest.raises(ConfigError, match="another recipe"):
+    with pytest.raises(ConfigError, match=r"another recipe \(seed = 4, here 5\); choose another folder"):
         train(tmp_path, seed=5)
+    with pytest.raises(ConfigError, match=r"optimiser.steps = 6, here 3; its learning rate decreases over all steps\)"):
+        train(tmp_path, optimiser={**OPTIMISER, "steps": 3})
+    with pytest.raises(ConfigError, match=r"\(noise.hot = 0.01, here 0.02\)"):
+        train(tmp_path, noise={"hot": 0.02})
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(FileError, match="damaged"):
         train(tmp_path)

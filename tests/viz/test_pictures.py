@@ -1,6 +1,7 @@
 """Every kind of picture at the widths of a page and of a column: no texts overlap, none is cut."""
 
 import importlib.util
+import itertools
 import json
 import os
 import sys
@@ -268,6 +269,46 @@ class _no_file:
 
     def __exit__(self, *_):
         pass
+
+
+def test_images_of_samples_fill_their_rows_and_the_note_explains_what_is_there(tmp_path, monkeypatch):
+    truth = np.full((24, 32), 15.0, np.float32)
+    whole = [(truth, (13.5, 16.0), {"median": truth}, "staircase, backscatter fraction 0.183")] * 3
+    marks = ["grey: no target", "black: target missed", "red: target invented"]
+    for images, explained in ((samples(), marks), (whole, [])):
+        for enlarged in (False, True):
+            named = {"methods": METHODS, "note": "split test", "enlarged": enlarged}
+            figure = drawn(monkeypatch, lambda of=images, named=named: evaluation.draw_samples(of, tmp_path, **named))
+            boxes = [axis.get_position() for axis in figure.axes if axis.images]
+            height = figure.get_figheight()
+            lines = sorted({(round(box.y0 * height, 3), round(box.y1 * height, 3)) for box in boxes})[: len(images)]
+            assert all(upper[0] - lower[1] < 0.3 for lower, upper in itertools.pairwise(lines))
+            if not enlarged:
+                assert figure.get_supxlabel().split("; ") == [*explained, "split test"]
+
+
+def test_levels_are_written_in_full(tmp_path, monkeypatch):
+    figure = drawn(monkeypatch, lambda: draw_scores(tmp_path, 7.2))
+    assert figure.axes[-1].get_xticklabels()[0].get_text() == "0.042"
+
+
+def test_a_depth_frame_begins_with_its_titles(tmp_path, monkeypatch):
+    image = np.linspace(1.0, 2.0, 48 * 64).reshape(48, 64)
+    given = {"label": "depth z [m]", "title": "Depth (matched)"}
+    figure = drawn(monkeypatch, lambda: spadwarp.viz.draw_depth(image, image, tmp_path, **given))
+    top = max(axis.title.get_window_extent().y1 for axis in figure.axes) / figure.dpi
+    assert figure.get_figheight() - top < 0.1
+
+
+def drawn(monkeypatch, draw):
+    """The figure that a function saves."""
+    figures = []
+    with monkeypatch.context() as changed:
+        changed.setattr(style.PaperFigure, "savefig", lambda figure, *_, **__: figures.append(figure))
+        changed.setattr(style, "atomic_path", _no_file)
+        draw()
+    figures[0].draw_without_rendering()
+    return figures[0]
 
 
 def test_methods_differ_in_colour_and_marker():
