@@ -181,7 +181,7 @@ def draw_samples(
             caption, (0.0, 0.0), (0.0, -2.0), xycoords="axes fraction", textcoords="offset points", fontsize=6.5,
             va="top",
         ).set_in_layout(False)  # fmt: skip
-    _fit_height(figure, axes[:, 0], ratio)
+    _fit_height(figure, list(axes[:, 0]), ratio)
     return save(figure, path, note="; ".join([*(text for text in _MARKS if text in marks), note]))
 
 
