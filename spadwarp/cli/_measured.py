@@ -16,7 +16,7 @@ Dataset = Annotated[
         "--dataset",
         "--variable",
         metavar="NAME",
-        help="Array in a .mat or .h5 file; by default the histograms, if there is one answer.",
+        help="Array in a .mat or .h5 file; by default the only one that fits.",
     ),
 ]
 Axes = Annotated[

@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -143,13 +144,26 @@ def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: 
 
 
 def check_writable(directory: Path) -> None:
-    """Raises `FileError` where no file can be made in the directory, which is made if it is not there."""
+    """Raises `FileError` where no file can be made in the directory, which is made if it is not there, and removed
+    again if it is empty when the command ends."""
+    until_the_end(_not_left_empty([place for place in (directory, *directory.parents) if not os.path.exists(place)]))
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
         raise FileError(f"{directory}: cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def _not_left_empty(folders: list[Path]) -> Iterator[None]:
+    """Removes folders in the end, in this order, unless something is in them."""
+    try:
+        yield
+    finally:
+        for folder in folders:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def in_bytes(number: float) -> str:

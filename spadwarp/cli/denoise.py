@@ -23,8 +23,9 @@ def denoise(
         Path,
         typer.Argument(
             metavar="IN",
-            help="A result, frames, an analytic file, a dataset or a shard (.h5, or their directory), depth (.exr, "
-            ".npy, .mat), measured histograms (.npy, .mat, .h5, .ptu), or a folder of them.",
+            help="A result or frames (.h5, or their directory); an analytic file, a dataset or a shard, of which the "
+            "stored depth counts; depth (.exr, .npy, .mat, .h5), measured histograms (.npy, .mat, .h5, .ptu), or a "
+            "folder of them.",
             show_default=False,
         ),
     ],
@@ -53,7 +54,8 @@ def denoise(
         Path | None, typer.Option(metavar="FILE", help="Weights of spadwarp train. By default the package's.")
     ] = None,
     depth: Annotated[
-        bool, typer.Option("--depth", help="Three dimensions in .npy and .mat are frames of depth, not a histogram.")
+        bool,
+        typer.Option("--depth", help="Three dimensions in .npy, .mat and .h5 are frames of depth, not a histogram."),
     ] = False,
     channel: Annotated[
         str | None, typer.Option(metavar="NAME", help="Channel of an EXR that holds depth; of a result: co or cross.")
@@ -95,8 +97,9 @@ def denoise(
     that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
     Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
     counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
-    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel. Needs
-    pip install "spadwarp[denoise]".
+    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel. Datasets do not keep the
+    background that this needs: their depth frames are denoised without their histograms, as one line of the output
+    says. Needs pip install "spadwarp[denoise]".
 
     \b
     Examples:
@@ -131,7 +134,7 @@ def denoise(
         try:
             done = denoise_file(one, out, **settings)
         except (ConfigError, FileError, ArgumentError) as error:
-            text = str(error) if isinstance(error, FileError) else f"{one}: {error}"
+            text = str(error) if str(one) in str(error) else f"{one}: {error}"
             if len(paths) == 1:
                 raise type(error)(text) from None
             complain(f"error: {text}")

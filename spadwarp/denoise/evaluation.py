@@ -171,7 +171,8 @@ class _Comparison:
             check_choice("models: an item", name, METHODS)
         if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
             raise ArgumentError(
-                f"models: {counting[0]!r} needs histograms, which datasets do not keep; evaluate a result"
+                f"models: {counting[0]!r} needs histograms with their background, which datasets do not keep; "
+                "evaluate a result"
             )
         frames = check_integer("frames", frames, "[1, 1000000000]")
         bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")

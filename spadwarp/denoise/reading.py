@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.dataset import FrameReader
 from spadwarp.denoise.frames import checked_gate
 from spadwarp.denoise.histogram_inputs import dim_pixels
 from spadwarp.errors import ArgumentError, FileError
@@ -18,6 +19,7 @@ from spadwarp.files import Held, gate_of, is_own_file, load, locate, sequence, s
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.estimators import Method
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
+from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.exr import read_exr
 from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
@@ -70,12 +72,12 @@ def read_depth(
     """Depth from a file.
 
     `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
-    depth in `channel`. `.npy`, `.mat`: one frame `[H, W]` of depth, or histograms, see
+    depth in `channel`. `.npy`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
     `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
 
     Args:
         path: The file.
-        as_depth: Three dimensions in `.npy` and `.mat` are frames `[N, H, W]` of depth, not a histogram.
+        as_depth: Three dimensions in `.npy`, `.mat` and `.h5` are frames `[N, H, W]` of depth, not a histogram.
         channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
             "co" or "cross", see `spadwarp.result.received`; default: "I", all light.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
@@ -105,9 +107,8 @@ def read_depth(
         of_result = {"channel": channel or "I"} if isinstance(held, Result) else {}
         if own is not None:
             frames = own.values.astype(np.float32)
-            return DepthReading(
-                depth=frames, frames=True, gate=gate_of(held), profile=None, source="depth as it is", truth=truth
-            )
+            source = f"depth as it is{_unused(held)}"
+            return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source=source, truth=truth)
     stored = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if stored is not None:
         if stored.dtype.kind not in "iuf":
@@ -127,6 +128,15 @@ def read_depth(
         if gate is not None:
             histograms = _within(histograms, gate, float(group_index or 1.0))
     return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
+
+
+def _unused(held: Held) -> str:
+    """Why histograms that a file holds beside its depth are not used; "" where there are none."""
+    if isinstance(held, FrameReader) and held.histogram_bins:
+        return "; its histograms are not used, since a dataset does not keep their background"
+    if isinstance(held, SequenceFile):
+        return "; its histograms are not used, since each frame is of another scene"
+    return ""
 
 
 def _truth(held: Held) -> NDArray[np.float32] | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,9 +178,10 @@ def read_histograms(
 
 def stored_images(path: Path, dataset: str | None, *, several: bool) -> NDArray[Any] | None:
     """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
-    the file or the dataset of that name holds histograms.
+    the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
+    of a `.h5` without them the only one.
 
-    Raises `FileError`.
+    Raises `FileError`, and `ArgumentError` where there are several in a `.h5`.
     """
     ending = path.suffix.lower()
     if ending == ".npy":
@@ -196,12 +197,28 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> NDArray[
         if name not in images or (len(images[name].shape) == 3 and not several):
             return None
         return np.asarray(read_mat(path, name, images[name]))
-    if ending in (".h5", ".hdf5") and dataset is not None and not _is_own(path):
+    if ending in (".h5", ".hdf5") and not _is_own(path):
         with read_hdf5(path) as file:
-            shape, dtype = file.arrays().get(dataset, ((), np.dtype(float)))
-            if len(shape) == 2 or (several and len(shape) == 3):
-                return file.array(dataset, dtype, shape)
+            arrays = file.arrays()
+        name = _only_image(path, arrays, several=several) if dataset is None else dataset
+        shape, dtype = arrays.get(name, ((), np.dtype(float)))
+        if len(shape) == 2 or (several and len(shape) == 3):
+            with read_hdf5(path) as file:
+                return file.array(name, dtype, shape)
     return None
+
+
+def _only_image(path: Path, arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]], *, several: bool) -> str:
+    """Name of the only array of an HDF5 file that may be an image, or if there may be `several` images; "" where it may
+    hold histograms, or has no images. Raises `ArgumentError` where there are more."""
+    numbers = {name: len(shape) for name, (shape, dtype) in arrays.items() if dtype.kind in "biuf"}
+    cubes = [name for name, axes in numbers.items() if axes in (3, 4)]
+    found = [name for name in cubes if several and numbers[name] == 3]
+    if not found and not cubes:
+        found = [name for name, axes in numbers.items() if axes == 2 and math.prod(arrays[name][0]) > 1]
+    if len(found) > 1:
+        raise _unnamed(path, _listed(arrays))
+    return found[0] if found else ""
 
 
 # Kinds of files
@@ -257,14 +274,24 @@ def _read(path: Path, ending: str, asked: _Asked) -> _Raw:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
+def _listed(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> str:
+    return ", ".join(f"{name} {shape}" for name, (shape, _) in arrays.items()) or "nothing"
+
+
+def _unnamed(path: Path, listed: str) -> ArgumentError:
+    return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
+
+
 def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
     with read_hdf5(path) as file:
         arrays = file.arrays()
-        listed = ", ".join(f"{name} {shape}" for name, (shape, _) in arrays.items()) or "nothing"
+        listed = _listed(arrays)
         cubes = [name for name, (shape, dtype) in arrays.items() if len(shape) in (3, 4) and dtype.kind in "biuf"]
     name = asked.dataset or (cubes[0] if len(cubes) == 1 else None)
+    if name is None and not cubes:
+        raise FileError(f"{path}: no array of 3 or 4 dimensions; it holds {listed}")
     if name is None:
-        raise ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
+        raise _unnamed(path, listed)
     if name not in arrays:
         raise FileError(f"{path}: no array {name!r}; it holds {listed}")
     shape, dtype = arrays[name]

@@ -53,6 +53,15 @@ def test_refused_before_the_work_begins(scene, tmp_path, monkeypatch):
     assert mine.read_text() == "mine" and not list(out.glob("*"))
 
 
+def test_a_command_that_fails_leaves_no_empty_folder(tmp_path):
+    (tmp_path / "bad.npy").write_bytes(b"junk")
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for out in (tmp_path / "new" / "out", kept):
+        run("denoise", tmp_path / "bad.npy", "--out", out, "--json", tmp_path / "other" / "a.json", code=1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.npy", "kept"] and not list(kept.iterdir())
+
+
 @pytest.mark.parametrize("command", [("view",), ("video", "--pictures", "1")], ids=lambda command: command[0])
 def test_a_page_or_a_video_never_replaces_what_it_shows(command, done, tmp_path):
     pytest.importorskip("plotly")

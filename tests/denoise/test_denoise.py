@@ -11,6 +11,7 @@ import time
 import warnings
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -139,6 +140,31 @@ def test_files_of_every_kind(tmp_path):
         assert np.nanmax(np.abs(np.load(out / f"{name}.npy") - found)) < 1e-4
     assert (out / "one.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "one.json").read_text())["files"][0]["gate"] == [13.5, 16.0]
+
+
+def test_the_only_array_of_a_file_needs_no_name(tmp_path):
+    noisy = noisy_frame(scene())
+    several, flags = np.stack([noisy, noisy]), np.ones(noisy.shape, np.uint8)
+    for name, arrays in {
+        "one": {"camera/depth": noisy, "exposure": 3.0},
+        "two": {"depth": noisy, "flags": flags},
+        "frames": {"depth": several, "flags": flags},
+        "none": {"exposure": np.ones(4)},
+    }.items():
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file.update(arrays)
+    assert np.array_equal(reading.read_depth(tmp_path / "one.h5").depth[0], noisy, equal_nan=True)
+    assert np.array_equal(reading.read_depth(tmp_path / "two.h5", dataset="depth").depth[0], noisy, equal_nan=True)
+    assert reading.read_depth(tmp_path / "frames.h5", as_depth=True).depth.shape == several.shape
+    with pytest.raises(FileError, match=r"none.h5: no array of 3 or 4 dimensions; it holds exposure \(4,\)"):
+        reading.read_depth(tmp_path / "none.h5")
+    out = tmp_path / "new" / "out"
+    output = invoke("denoise", tmp_path / "two.h5", "--model", "median", "--out", out, code=2)
+    assert output.count("two.h5") == 1 and "(--dataset); the file holds depth (" in output
+    assert not out.parent.exists()
+    invoke("denoise", tmp_path / "one.h5", "--model", "median", "--out", out)
+    output = invoke("depth", tmp_path / "one.h5", "--out", tmp_path / "depth", code=1)
+    assert re.search(r"no array of 3 or 4 dimensions; it holds .*camera/depth \(48, 64\)", output)
 
 
 def test_a_folder_is_denoised_file_by_file(tmp_path):
@@ -270,7 +296,10 @@ def test_evaluation_and_report(dataset, tmp_path):
     ("options", "message"),
     [
         ({"models": ("unet",)}, "'unet' is not one of"),
-        ({"models": ("histograms",)}, "'histograms' needs histograms, which datasets do not keep"),
+        (
+            {"models": ("histograms",)},
+            "'histograms' needs histograms with their background, which datasets do not keep",
+        ),
         ({"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
         ({"models": ("dncnn",), "weights": network_files.WEIGHTS / "usdn.safetensors"}, "not among models: dncnn"),
     ],

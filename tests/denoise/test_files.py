@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+from helpers.datasets import make, recipe
+from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file
+from spadwarp.denoise.reading import read_depth
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import instrument_response
 
@@ -49,3 +52,14 @@ def test_dim_pixels_of_expected_light_are_noted(tmp_path):
     assert "25 % of the pixels receive less than 5 % of the light" in found.notes[0]
     np.save(tmp_path / "rates.npy", rates[:, 4:])
     assert "of the light" not in denoise_file(tmp_path / "rates.npy", tmp_path / "out", **options).notes[0]
+
+
+def test_histograms_of_a_dataset_are_not_used_and_it_is_said_why(tmp_path):
+    traced = {"targets.builtin": ["staircase"], "targets.test": [], "targets.validation": [], "gate.bins": 32}
+    traced |= {"scenes_per_target": 1, "monte_carlo.share": 1.0, "monte_carlo.photons": 20_000}
+    make(recipe(**traced), tmp_path / "set")
+    stored = [item["noisy"][0] for item in FrameReader(tmp_path / "set", "all")]
+    for name in ("histograms-00000.h5", "frames-00000.h5"):
+        found = denoise_file(tmp_path / "set" / name, tmp_path / "out", model="median", device="cpu")
+        assert "histograms are not used, since a dataset does not keep their background" in found.notes[0]
+        assert np.array_equal(read_depth(tmp_path / "set" / name).depth, stored, equal_nan=True)
