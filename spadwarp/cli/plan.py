@@ -116,7 +116,7 @@ def plan(
         heading = (
             f"# Proposed by `spadwarp plan {scene_path.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         )
-        spadwarp.io.write_text(heading + found.scene.to_toml(), write)
+        spadwarp.io.write_text(heading + found.scene.to_toml(folder=write.parent), write)
     if not quiet:
         say(opt.rows(_lines(found)))
         opt.show_table(_terms(found))

@@ -83,7 +83,7 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
             if output.result:
                 written.append(_save(result, folder / "result.h5"))
             with atomic_path(folder / "scene.toml") as temporary:
-                temporary.write_text(scene.to_toml(), encoding="utf-8")
+                temporary.write_text(scene.to_toml(folder=folder), encoding="utf-8")
             written.append(folder / "scene.toml")
             if output.exr:
                 written.append(save_depth_exr(result, depth, folder / "depth.exr"))

@@ -32,7 +32,7 @@ def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
     from spadwarp.viz import draw_fit
 
     folder = Path(directory)
-    written = [draw_fit(fit, folder / "fit.png"), write_text(fit.scene.to_toml(), folder / "scene.toml")]
+    written = [draw_fit(fit, folder / "fit.png"), write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
     for one in fit.maps.values():
         for ending, array in (("", one.value), ("_error", one.standard_error)):
             path = folder / f"{_file_name(one.name)}{ending}.npy"

@@ -22,6 +22,7 @@ from spadwarp.scene.camera import Camera
 from spadwarp.scene.daylight import Daylight
 from spadwarp.scene.detector import Detector
 from spadwarp.scene.domain import Domain
+from spadwarp.scene.file_paths import FILE_FIELDS, with_absolute_paths, with_paths_from
 from spadwarp.scene.gate import Gate
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.matrix import check_polarisation
@@ -168,7 +169,7 @@ class Scene(BaseModel):
     def files(self) -> list[Path]:
         """Files that the scene refers to: meshes, tables and images, all that `to_dict` names."""
         tables = self.to_dict()
-        named = [tables[section].get(name, "") for section, name, _ in _FILE_FIELDS]
+        named = [tables[section].get(name, "") for section, name, _ in FILE_FIELDS]
         named += [target.get("mesh", "") for target in tables.get("targets", ())]
         named.append(tables["medium"].get("grid", {}).get("file", ""))
         return [Path(path) for path in named if Path(path).suffix]
@@ -230,9 +231,14 @@ class Scene(BaseModel):
             del tables["targets"]
         return tables
 
-    def to_toml(self) -> str:
-        """The full text that `load_scene` reads back to an equal scene."""
-        return load.toml_text(self.to_dict())
+    def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
+        """The full text that `load_scene` reads back to an equal scene.
+
+        `folder`: of the file that the text is for. Paths of files in it or in the folder above it, with the folders in
+        these, are then relative to it: they still hold where all were moved together. Others stay absolute.
+        """
+        tables = self.to_dict()
+        return load.toml_text(tables if folder is None else with_paths_from(tables, folder))
 
     def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
         """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
@@ -328,10 +334,10 @@ def _build(
     items: dict[load.Key, Any] = {}
     try:
         if source is not None and resolve:
-            tables = _with_paths(tables, Path(source).absolute().parent)
+            tables = with_absolute_paths(tables, Path(source).absolute().parent)
         if overrides:
             layer, items = load.override_layer(overrides)
-            tables = load.merge_scene(_with_units(tables), _with_paths(_with_units(layer), Path.cwd()))
+            tables = load.merge_scene(_with_units(tables), with_absolute_paths(_with_units(layer), Path.cwd()))
         scene = Scene.model_validate(tables)
         for key, value in items.items():  # of lists that may be defaults
             scene = Scene.model_validate(load.set_item(scene.to_dict(), key, value))
@@ -349,40 +355,4 @@ def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
     for name, model in (("medium", Medium), ("laser", Laser)):
         if isinstance(fields := tables.get(name), Mapping):
             changed[name] = with_units(model, fields)
-    return changed
-
-
-# Fields with the path of a file beside `mesh` of a target: section, name, the ending that makes text a path.
-_FILE_FIELDS = (
-    ("medium", "phase_table", ".csv"),
-    ("medium", "matrix_table", ".csv"),
-    ("detector", "irf", ".csv"),
-    ("camera", "calibration", ""),
-    ("laser", "profile_image", ""),
-    ("laser", "spectrum", ".csv"),
-    ("detector", "filter_table", ".csv"),
-)
-
-
-def _with_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables with relative paths of files made absolute."""
-
-    def absolute(fields: Any, name: str, ending: str = "") -> Any:
-        value = fields.get(name) if isinstance(fields, Mapping) else None
-        if isinstance(value, str) and value.lower().endswith(ending):
-            return {**fields, name: str(folder / os.path.expanduser(value))}
-        return fields
-
-    changed = dict(tables)
-    targets = tables.get("targets")
-    if isinstance(targets, Mapping):
-        changed["targets"] = {index: absolute(target, "mesh") for index, target in targets.items()}
-    elif isinstance(targets, (list, tuple)):
-        changed["targets"] = [absolute(target, "mesh") for target in targets]
-    for section, name, ending in _FILE_FIELDS:
-        if section in changed:
-            changed[section] = absolute(changed[section], name, ending)
-    medium = changed.get("medium")
-    if isinstance(medium, Mapping) and "grid" in medium:
-        changed["medium"] = {**medium, "grid": absolute(medium["grid"], "file")}
     return changed

@@ -118,6 +118,8 @@ def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):
     run("simulate", scene, "--out", out, "--mesh", mesh, *scale, "--quiet", *DEVICE)
     (target,) = spadwarp.load_result(out / "result.h5").scene.targets
     assert (target.mesh, target.builtin, target.translation[2]) == (str(mesh), None, 2.0)
+    assert 'mesh = "../square.obj"' in (out / "scene.toml").read_text()
+    assert spadwarp.load_scene(out / "scene.toml").targets == (target,)
     depth = load_truth_maps(out / "truth.exr").depth
     assert np.allclose(depth[2:4, 2:6], 2.0) and np.isnan(depth[0, 0])  # 40 cm of the 70 that are seen
 

@@ -188,3 +188,41 @@ def test_older_words_load_as_the_words_for_them_now(section):
     assert scene(**{section: older}) == scene(**{section: now})
     paths = {f"{section}.{name}": value for name, value in older.items()}
     assert scene().with_overrides(paths) == scene().with_overrides(**{section: now})
+
+
+@pytest.mark.parametrize(
+    ("mesh", "written"),
+    [
+        ("project/run/part.stl", "part.stl"),
+        ("project/part.stl", "../part.stl"),
+        ("project/run/../meshes/part.stl", "../meshes/part.stl"),
+        ("elsewhere/part.stl", None),
+        ("project/linked/part.stl", "../linked/part.stl"),
+    ],
+)
+def test_files_beside_a_scene_file_move_with_it(mesh, written, tmp_path):
+    for name in ("project/run", "project/meshes", "elsewhere"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "project" / "linked").symlink_to(tmp_path / "elsewhere")
+    place = tmp_path / mesh
+    place.write_bytes(b"")
+    made = scene(targets=[{"mesh": str(place)}], detector={"irf": str(place.with_suffix(".csv"))})
+    file = tmp_path / "project" / "run" / "scene.toml"
+    file.write_text(made.to_toml(folder=file.parent))
+    assert tomllib.loads(file.read_text())["targets"][0]["mesh"] == (written or str(place))
+    back = load_scene(file)
+    assert [Path(name).resolve() for name in back.files] == [Path(name).resolve() for name in made.files]
+    assert load_scene(file).to_toml(folder=file.parent) == file.read_text()
+    if written is not None and "linked" not in mesh:
+        (tmp_path / "project").rename(tmp_path / "moved")
+        moved = load_scene(tmp_path / "moved" / "run" / "scene.toml")
+        assert all(path.is_relative_to(tmp_path / "moved") for path in moved.files)
+        assert ".." not in str(moved.files[0])
+
+
+def test_a_path_with_dots_and_one_without_are_one_scene(tmp_path):
+    (tmp_path / "run").mkdir()
+    text = Scene.from_dict({**MINIMAL, "targets": [{"mesh": "NAME"}]}).to_toml()
+    (tmp_path / "a.toml").write_text(text.replace("NAME", "part.stl"))
+    (tmp_path / "run" / "b.toml").write_text(text.replace("NAME", "../part.stl"))
+    assert load_scene(tmp_path / "a.toml") == load_scene(tmp_path / "run" / "b.toml")
