@@ -76,7 +76,7 @@ def denoise(
     mask: Annotated[
         float | None,
         typer.Option(
-            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.07."
+            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.08."
         ),
     ] = None,
     device: opt.TorchDevice = None,
