@@ -80,8 +80,13 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     """
     sin_theta = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
     turn = cos_sin_turn(xi)
-    b1, b2 = orthonormal_basis(u)
-    v = (1.0 - t) * u + (sin_theta * turn[0]) * b1 + (sin_theta * turn[1]) * b2
+    # (1 - t) u + a b1 + b b2 of `orthonormal_basis`, of which the two last have common factors.
+    a = sin_theta * turn[0]
+    b = sin_theta * turn[1]
+    s = wp.where(u[2] < 0.0, -1.0, 1.0)
+    down = s * u[0] * a + u[1] * b
+    along = (1.0 - t) - down / (s + u[2])
+    v = wp.vec3(u[0] * along + a, u[1] * along + s * b, u[2] * (1.0 - t) - down)
     # One Newton step of the inverse square root keeps |v| = 1 over any number of events.
     return v * (1.5 - 0.5 * wp.dot(v, v))
 
