@@ -129,6 +129,19 @@ def sum_bounces(b: Bounces) -> Bounces:
 
 
 @wp.struct
+class Turn:
+    """What the lanes of a warp count in a turn of its loop; a struct for the reason of `PhotonState`.
+
+    Attributes:
+        done: Lanes for which no photons are left.
+        waiting: Lanes that wait for a ray or, where there are none, for nothing but the others.
+    """
+
+    done: int
+    waiting: int
+
+
+@wp.struct
 class PhotonState:
     """State of a thread between the stages.
 

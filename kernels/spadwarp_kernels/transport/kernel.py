@@ -42,6 +42,7 @@ from spadwarp_kernels.photon.state import (
     SHADOW_RAY,
     START,
     SURFACE_RAY,
+    Turn,
     first_state,
     next_bounce,
     shorten,
@@ -67,7 +68,7 @@ from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
 from .flight import make_draw_albedo, make_fly
 from .scatter import make_leave, make_scatter
-from .traverse import make_aim, make_begin_walk, make_counts, make_look, next_ray
+from .traverse import make_aim, make_begin_walk, make_free_lanes, make_look, next_ray
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
 # in the water.
@@ -121,7 +122,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
     scatter, leave = make_scatter(spec, estimator.direct, crosses), make_leave(crosses)
     flown, arrives = make_arrives(flights, has_bvh, queues, at_once)
-    free_lanes, count_waiting = make_counts(has_bvh)
+    free_lanes = make_free_lanes(has_bvh)
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     warp_memory, push, pop = make_queue(
@@ -183,15 +184,15 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         else:
             words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
         memory = warp_memory()
-        done = int(0)
+        turn = Turn()
         queued = int(0)
         if wp.static(queues):
             queued = queue_size(memory, SET_SIZE, 0)
 
         while count_lanes(s.stage == DONE and not s.hidden) < 32 or (wp.static(has_bvh and queues) and queued > 0):
             # ---- Water: until enough lanes of the warp wait for a ray
-            waiting = int(0)
-            while waiting < wp.static(ray_lanes):
+            turn.waiting = 0
+            while turn.waiting < wp.static(ray_lanes):
                 flying = s.stage == FLIGHT
                 if flying:
                     id = base + wp.uint64(s.photon)
@@ -256,7 +257,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(queues):
                             queued = queue_size(memory, READ_SIZE, 0)
                             free = free_lanes(s)
-                            ready = (queued >= 32 or (done == 32 and queued > 0)) and free >= wp.static(FREE_LANES)
+                            ready = (queued >= 32 or (turn.done == 32 and queued > 0)) and free >= wp.static(FREE_LANES)
                         while ready:
                             if wp.static(queues):
                                 asked.request = pop(memory, lane, not s.hidden, queued, free)
@@ -334,8 +335,10 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.scores = begin_history(derivatives)
                             s.stokes = first_stokes(polarisation, laser, scan, s.target, emitted, s.x, s.u)
 
-                    done = count_lanes(s.stage == DONE)
-                waiting = count_waiting(s, done, queued)
+                    turn.done = count_lanes(s.stage == DONE)
+                    turn.waiting = wp.where(queued > 0, 0, turn.done)
+                if wp.static(has_bvh):
+                    turn.waiting = count_lanes(s.stage != FLIGHT)
 
             # ---- Surfaces: the warp traces its rays together
             if wp.static(has_bvh):

@@ -8,7 +8,7 @@ from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.lanes import count_lanes
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import FLIGHT, NO_RAY, RAY, SHADOW_RAY, SURFACE_RAY, PhotonState
+from spadwarp_kernels.photon.state import NO_RAY, RAY, SHADOW_RAY, SURFACE_RAY, PhotonState
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.visibility import may_be_hidden
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -109,10 +109,9 @@ def next_ray(s: PhotonState) -> int:
 
 
 @made_once
-def make_counts(traces: bool) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions that all lanes call together: ``s -> int``, how many have room for a contribution that waits
-    for its shadow ray; ``(s, done, queued) -> int``, how many wait for a ray or for others. `traces`: whether rays wait
-    at all."""
+def make_free_lanes(traces: bool) -> wp.Function:
+    """The Warp function ``s -> int``, which all lanes call together: how many have room for a contribution that waits for
+    its shadow ray. `traces`: whether rays wait at all."""
 
     @wp.func
     def free_lanes(s: PhotonState) -> int:
@@ -121,11 +120,4 @@ def make_counts(traces: bool) -> tuple[wp.Function, wp.Function]:
             free = count_lanes(not s.hidden)
         return free
 
-    @wp.func
-    def count_waiting(s: PhotonState, done: int, queued: int) -> int:
-        waiting = wp.where(queued > 0, 0, done)
-        if wp.static(traces):
-            waiting = count_lanes(s.stage != FLIGHT)
-        return waiting
-
-    return free_lanes, count_waiting
+    return free_lanes
