@@ -111,7 +111,8 @@ class ScoredPoint:
 @made_once
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
-    view_of, shows = spec.lens.view, port_view(spec.port).shows
+    view_of = spec.lens.view
+    shows = spec.lens.shows if spec.port is None else port_view(spec.port).shows
     reflecting, tracks, derives = spec.reflecting, spec.grid is not None, bool(spec.derivatives)
     polarised, has_mesh = spec.polarised, spec.mesh
 

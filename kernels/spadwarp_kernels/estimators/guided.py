@@ -252,7 +252,8 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
     water_at, extinction_at, lens_chance = spec.water.at, _make_extinction_at(spec), _make_lens_chance(spec)
     view_of = spec.lens.view
-    has_mesh, specular, in_view = spec.mesh, spec.specular, port_view(spec.port).shows
+    has_mesh, specular = spec.mesh, spec.specular
+    in_view = spec.lens.shows if spec.port is None else port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)
 
     @wp.func

@@ -62,12 +62,24 @@ def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
 @wp.func
 def project(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
     """Row-major index of the pixel that images the point x by way of the lens point o, or -1 outside the view."""
+    scale = 1.0 / camera.pixel_tangent
+    centre = wp.vec2(0.5 * float(camera.width), 0.5 * float(camera.height))
+    return _pixel(camera, wp.vec2(scale, scale), centre, x, o)
+
+
+@wp.func
+def project_about_axis(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
+    """`project` for a camera from `with_field`."""
+    return _pixel(camera, camera.focal, camera.principal, x, o)
+
+
+@wp.func
+def _pixel(camera: Camera, focal: wp.vec2, principal: wp.vec2, x: wp.vec3, o: wp.vec3) -> int:
     if x[2] <= 0.0:
         return -1
     t = image_tangents(camera, x, o)
-    scale = 1.0 / camera.pixel_tangent
-    column = t[0] * scale + 0.5 * float(camera.width)
-    row = t[1] * scale + 0.5 * float(camera.height)
+    column = t[0] * focal[0] + principal[0]
+    row = t[1] * focal[1] + principal[1]
     # Compared as floats: a float beyond the int range has no defined int value. Also false for what is not a number.
     if not (column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)):
         return -1
@@ -160,13 +172,16 @@ def field(camera: Camera) -> wp.vec4:
 
 
 def with_field(camera: Any) -> Any:
-    """A copy of the camera whose view is its `field`, rounded as there, so that no thread need compute it."""
+    """A copy of the camera that has what threads would otherwise compute: as its view its `field`, rounded as there,
+    and the focal lengths and principal point of square pixels about the axis."""
     copy = Camera()
     for name in Camera.vars:
         setattr(copy, name, getattr(camera, name))
     tangent = np.float32(camera.pixel_tangent)
     half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
     copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
+    copy.focal = wp.vec2(np.float32(1.0) / tangent, np.float32(1.0) / tangent)
+    copy.principal = wp.vec2(0.5 * camera.width, 0.5 * camera.height)
     return copy
 
 
@@ -189,6 +204,15 @@ def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
     # Radius of the circle of confusion, at the distance of x.
     blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
     inside = wp.min(wp.min(x[0] - view[0] * z, view[2] * z - x[0]), wp.min(x[1] - view[1] * z, view[3] * z - x[1]))
+    return z > 0.0 and inside > -blur
+
+
+@wp.func
+def in_field(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+    """`in_view` of a view about the optical axis, with its bits."""
+    z = x[2]
+    blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
+    inside = wp.min(view[2] * z - wp.abs(x[0]), view[3] * z - wp.abs(x[1]))
     return z > 0.0 and inside > -blur
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, project, project_calibrated
+from .camera import Camera, in_field, in_view, project_about_axis, project_calibrated
 
 
 class Lens(NamedTuple):
@@ -19,16 +19,18 @@ class Lens(NamedTuple):
         project: Warp function (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
         view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
             or the pixel of a scan, shows.
+        shows: As `in_view`, for such a view without a port.
     """
 
     name: str
     project: wp.Function
     view: wp.Function
+    shows: wp.Function
 
 
 @wp.func
 def _project_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
-    return project(camera, x, o)
+    return project_about_axis(camera, x, o)
 
 
 @wp.func
@@ -41,8 +43,8 @@ def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
     return view
 
 
-PLAIN = Lens("plain", _project_plain, _view_plain)
-"""Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
+PLAIN = Lens("plain", _project_plain, _view_plain, in_field)
+"""Square pixels about the optical axis: of `Camera` the first six attributes, and `with_field` fills others."""
 
-CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
+CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated, in_view)
 """Focal lengths and principal point in pixels, Brown's distortion: all of `Camera`."""
