@@ -209,11 +209,10 @@ def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
 
 @wp.func
 def in_field(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
-    """`in_view` of a view about the optical axis, with its bits."""
+    """`in_view` of a view about the optical axis."""
     z = x[2]
     blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
-    inside = wp.min(view[2] * z - wp.abs(x[0]), view[3] * z - wp.abs(x[1]))
-    return z > 0.0 and inside > -blur
+    return wp.abs(x[0]) < view[2] * z + blur and wp.abs(x[1]) < view[3] * z + blur and z > 0.0
 
 
 @wp.func
