@@ -8,7 +8,7 @@ of d ln p/dg over the scatterings, and one over the reflectance for each bounce.
 import warp as wp
 
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine, snap_direction
+from spadwarp_kernels.math.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.medium.layers import Layers, boundary_ahead, layer_index
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import henyey_greenstein_score
@@ -91,7 +91,7 @@ def make_event_scores(spec: TransportSpec) -> wp.Function:
         here = int(wp.static(in_water))
         if wp.static(layered):
             here = here & derivatives.waters[layer_index(layers, wp.dot(layers.axis, x))]
-        t = one_minus_cosine(snap_direction(u, medium.axis_threshold), v)
+        t = one_minus_cosine(snap_from(u, medium.axis_threshold), v)
         for p in range(wp.static(count)):
             if (wp.static(by_scattering) >> p) & 1 == 1:
                 scores[p] = scores[p] + wp.where((here >> p) & 1 == 1, 1.0 / derivatives.value[p], 0.0)

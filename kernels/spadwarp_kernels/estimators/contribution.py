@@ -4,7 +4,7 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import from_bits
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine, set_apart, snap_direction
+from spadwarp_kernels.math.rotations import one_minus_cosine, set_apart, snap_from
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
@@ -281,7 +281,7 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
                         surfaces.specular[face] * ggx_brdf(request.u, v, normal, surfaces.roughness[face]) * cos_out
                     )
         if not on_surface:
-            snapped = snap_direction(request.u, medium.axis_threshold)
+            snapped = snap_from(request.u, medium.axis_threshold)
             if wp.static(divides):
                 quotient, to = set_apart(way) / distance, set_apart(v)
                 for axis in range(wp.static(fused)):

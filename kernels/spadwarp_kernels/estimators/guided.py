@@ -8,7 +8,7 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_direction
+from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_from
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
 from spadwarp_kernels.medium.water import Medium
@@ -279,7 +279,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         at_surface = guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
         to_lens_chance = wp.where(on_surface, at_surface, lens_chance(s.u, guiding))
         met = s.surface_count + wp.where(on_surface, 1, 0)
-        snapped = snap_direction(s.u, medium.axis_threshold)
+        snapped = snap_from(s.u, medium.axis_threshold)
         v = toward_centre(camera, s.x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could

@@ -61,6 +61,18 @@ def set_apart(v: wp.vec3) -> wp.vec3:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float((__float_as_uint(number) & 0x80000000u) | 0x3f800000u);
+#else
+    return wp::sign(number);
+#endif
+""")
+def one_with_sign(number: float) -> float:
+    """1 with the sign of a number, of either sign for 0."""
+    ...
+
+
 @wp.func
 def orthonormal_basis(n: wp.vec3):
     """Two unit vectors that complete the unit vector n to a right-handed basis (Duff et al. 2017)."""
@@ -83,7 +95,7 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     # (1 - t) u + a b1 + b b2 of `orthonormal_basis`, of which the two last have common factors.
     a = sin_theta * turn[0]
     b = sin_theta * turn[1]
-    s = wp.where(u[2] < 0.0, -1.0, 1.0)
+    s = one_with_sign(u[2])
     down = s * u[0] * a + u[1] * b
     along = (1.0 - t) - down / (s + u[2])
     v = wp.vec3(u[0] * along + a, u[1] * along + s * b, u[2] * (1.0 - t) - down)
@@ -91,16 +103,8 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     return v * (1.5 - 0.5 * wp.dot(v, v))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __uint_as_float((__float_as_uint(number) & 0x80000000u) | 0x3f800000u);
-#else
-    return wp::sign(number);
-#endif
-""")
-def one_with_sign(number: float) -> float:
-    """1 with the sign of a number that is not 0."""
-    ...
+# A threshold that no |u_z| reaches, with its rounding.
+OFF_AXIS = wp.constant(2.0)
 
 
 @wp.func
@@ -110,7 +114,13 @@ def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
     A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase
     function; the flight keeps u. A threshold of 0.9998 drops up to 1.15 degrees of tilt, 1 switches the rule off.
     """
-    if axis_threshold < 1.0 and wp.abs(u[2]) >= axis_threshold:
+    return snap_from(u, wp.where(axis_threshold < 1.0, axis_threshold, OFF_AXIS))
+
+
+@wp.func
+def snap_from(u: wp.vec3, least: float) -> wp.vec3:
+    """`snap_direction`, for a threshold that is OFF_AXIS in place of 1."""
+    if wp.abs(u[2]) >= least:
         return wp.vec3(0.0, 0.0, one_with_sign(u[2]))
     return u
 

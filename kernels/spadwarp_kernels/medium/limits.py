@@ -43,6 +43,19 @@ class Limits:
     boundary: Boundary
 
 
+# Least normal float32: a weight below it is 0 to a GPU.
+_LEAST_WEIGHT = 1.1754943508222875e-38
+
+
+def ready_limits(limits: Limits) -> Limits:
+    """A copy for a kernel, whose cut-off is above 0, so that it takes a weight of 0 as well."""
+    copy = Limits()
+    for name in Limits.vars:
+        setattr(copy, name, getattr(limits, name))
+    copy.weight_cutoff = max(limits.weight_cutoff, _LEAST_WEIGHT)
+    return copy
+
+
 @wp.func
 def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
     # Selected rather than branched to: the lanes of a warp go either way.

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from spadwarp_kernels.math.rotations import OFF_AXIS
 from spadwarp_kernels.random.density_tables import DensityTables
 
 
@@ -23,6 +24,15 @@ class Medium:
     anisotropy: float
     axis_threshold: float
     phase: DensityTables
+
+
+def ready_medium(medium: Medium) -> Medium:
+    """A copy for a kernel: a threshold of 1 is OFF_AXIS."""
+    copy = Medium()
+    for name in Medium.vars:
+        setattr(copy, name, getattr(medium, name))
+    copy.axis_threshold = medium.axis_threshold if medium.axis_threshold < 1.0 else OFF_AXIS
+    return copy
 
 
 @wp.func

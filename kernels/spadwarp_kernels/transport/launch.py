@@ -7,8 +7,8 @@ import warp as wp
 from spadwarp_kernels.arguments import check_array, check_device, check_integer, check_kind, check_seed
 from spadwarp_kernels.math.memory import zeros
 from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.medium.limits import Limits, ready_limits
+from spadwarp_kernels.medium.water import Medium, ready_medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.records import Records, make_records
@@ -192,7 +192,8 @@ def launch_transport(
         derivatives = _with_memory(derivatives, threads, model.device)
     data.cursor.zero_()
     camera = with_field(model.camera) if spec.lens == PLAIN else model.camera
-    inputs = [model.medium, model.layers, model.laser, camera, model.gate, model.limits, model.guiding]
+    medium, limits = ready_medium(model.medium), ready_limits(model.limits)
+    inputs = [medium, model.layers, model.laser, camera, model.gate, limits, model.guiding]
     inputs += [model.surfaces, model.scan, derivatives, model.polarisation]
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda),

@@ -6,7 +6,7 @@ from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.history import make_event_scores
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import rotate_direction, snap_direction
+from spadwarp_kernels.math.rotations import rotate_direction, snap_from
 from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -109,7 +109,7 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
-        axis = snap_direction(s.u, medium.axis_threshold)
+        axis = snap_from(s.u, medium.axis_threshold)
         t = phase_sample(u01_fine(s.flight.block[1]), water_at(medium, layers, s.x))
         if on_surface:
             axis = s.hit.normal
@@ -177,7 +177,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
         ledger: wp.array(dtype=wp.int64),
         thread: int,
     ) -> Scattering:
-        if new.analog_weight < limits.weight_cutoff or new.analog_weight <= 0.0:
+        if new.analog_weight < limits.weight_cutoff:
             new.reason = WEIGHT_CUTOFF
             if wp.static(roulette):
                 chance = u01(random_block_keyed(keys, id, wp.uint32(collisions), STREAM_ROULETTE)[0])
