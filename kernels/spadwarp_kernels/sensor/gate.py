@@ -29,12 +29,10 @@ AFTER = wp.constant(-2)
 @wp.func
 def gate_bin(gate: Gate, path: float) -> int:
     """Bin of a path length [m], or BEFORE or AFTER the gate."""
-    if path < gate.start:
-        return BEFORE
+    # Selected rather than branched to: the lanes of a warp go either way.
     k = (path - gate.start) * gate.bins_per_metre
-    if k >= float(gate.bins) or path >= gate.stop:
-        return AFTER
-    return int(k)
+    inside = wp.where(k >= float(gate.bins) or path >= gate.stop, AFTER, int(k))
+    return wp.where(path < gate.start, BEFORE, inside)
 
 
 @wp.func

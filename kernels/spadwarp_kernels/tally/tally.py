@@ -152,19 +152,20 @@ def deposit(
     Returns what `add_pending` returns, which the next call takes as `pending`.
     """
     exact = c.value * scale
+    units = wp.int64(exact + c.rounding_sample)
     if not exact <= DEPOSIT_LIMIT:
         add_to_ledger(ledger, thread, wp.where(exact > DEPOSIT_LIMIT, CLIPPED, INVALID), wp.int64(1))
     elif c.index >= 0:
-        units = wp.int64(exact + c.rounding_sample)
-        if units > wp.int64(0):
+        if exact >= 1.0:
             pending = add_pending(tally, pending, c.index, units)
-        if exact < 1.0:
+        else:
+            if units > wp.int64(0):
+                pending = add_pending(tally, pending, c.index, units)
             voxels = tally.shape[0] // wp.static(len(COMPONENTS))
             component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
             add_to_ledger(ledger, thread, BELOW_UNIT + component, wp.int64(1))
     else:
         # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
         entry = wp.where(c.index == BEFORE, BEFORE_GATE, AFTER_GATE)
-        units = wp.int64(exact + c.rounding_sample)
         add_to_ledger(ledger, thread, entry, (units + wp.int64(128)) >> OUTSIDE_SHIFT)
     return pending
