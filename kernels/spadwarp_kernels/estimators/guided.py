@@ -8,7 +8,7 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import one_minus_cosine, rotate_direction, snap_from
+from spadwarp_kernels.math.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits, exit_distance, exit_distance_rotated
 from spadwarp_kernels.medium.water import Medium
@@ -309,7 +309,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         # Selected rather than branched to, so that what is left out stays in no register.
         if wp.static(has_mesh):
             t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
-        new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
+        new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
         if wp.static(specular):
             if on_surface and not directed:
                 new.u = reflected

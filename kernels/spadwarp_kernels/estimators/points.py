@@ -10,6 +10,7 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
@@ -55,6 +56,22 @@ def make_push_points(points: int, push: wp.Function) -> wp.Function:
             push(memory, point_of(request, i + 1))
 
     return push_points
+
+
+@made_once
+def make_ask_flight(request_flight: wp.Function | None, push: wp.Function) -> wp.Function | None:
+    """The Warp function ``(s, memory) -> Request`` that asks for a flight to be scored, once; None where none is."""
+    if request_flight is None:
+        return None
+
+    @wp.func
+    def ask_flight(s: wp.ref[PhotonState], memory: int) -> Request:
+        request = request_flight(s)
+        push(memory, request)
+        s.flight.interval = wp.vec2(0.0, 0.0)
+        return request
+
+    return ask_flight
 
 
 @made_once

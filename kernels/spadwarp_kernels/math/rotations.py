@@ -7,12 +7,12 @@ import warp as wp
 #if defined(__CUDA_ARCH__)
     // The hardware's sine and cosine, good to 4e-7 on (-pi, pi): far below the resolution of a float32 direction.
     float s, c;
-    __sincosf(6.2831853f * (xi - 0.5f), &s, &c);
+    __sincosf(angle, &s, &c);
     return wp::vec2(c, s);
 #else
     // Both at once, and without a branch on the quadrant: the polynomials and the bits of the C library's cosf and sinf
     // (ARM's optimized routines, in glibc since 2.28) for each multiple of 2^-25.
-    const double phi = 6.2831853f * (xi - 0.5f);
+    const double phi = angle;
     const int quarter = static_cast<int>(phi * 0x1.45F306DC9C883p-1 + (phi < 0.0 ? -0.5 : 0.5));
     const double x = phi - quarter * 0x1.921FB54442D18p0, x2 = x * x, x3 = x * x2, x4 = x2 * x2;
     const double s = x + x3 * -0x1.555545995a603p-3
@@ -24,9 +24,31 @@ import warp as wp
     return wp::vec2(static_cast<float>(sign * (odd ? -s : c)), static_cast<float>(sign * (odd ? c : s)));
 #endif
 """)
+def _cos_sin(angle: float) -> wp.vec2:
+    """(cos, sin) of an angle in [-pi, pi)."""
+    ...
+
+
+@wp.func
 def cos_sin_turn(xi: float) -> wp.vec2:
     """(cos, sin) of a turn of 2 pi (xi - 1/2), xi in [0, 1): a uniform azimuth for uniform xi."""
-    ...
+    return _cos_sin(6.2831853 * (xi - 0.5))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return fmaf(static_cast<float>(word >> 8u), 3.7450704e-7f, -3.14159265f);
+#else
+    return 6.2831853f * (static_cast<float>(word >> 8u) * 5.9604644775390625e-08f - 0.5f);
+#endif
+""")
+def _azimuth(word: wp.uint32) -> float: ...
+
+
+@wp.func
+def cos_sin_word(word: wp.uint32) -> wp.vec2:
+    """`cos_sin_turn` of `u01(word)`."""
+    return _cos_sin(_azimuth(word))
 
 
 @wp.func_native("""
@@ -90,8 +112,13 @@ def rotate_direction(u: wp.vec3, t: float, xi: float) -> wp.vec3:
     Exact on an orthonormal basis; equal in distribution to eq 15 of Lu et al. 2024, which divides by zero along the
     axis.
     """
+    return rotate_by(u, t, cos_sin_turn(xi))
+
+
+@wp.func
+def rotate_by(u: wp.vec3, t: float, turn: wp.vec2) -> wp.vec3:
+    """`rotate_direction` for (cos, sin) of an azimuth."""
     sin_theta = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
-    turn = cos_sin_turn(xi)
     # (1 - t) u + a b1 + b b2 of `orthonormal_basis`, of which the two last have common factors.
     a = sin_theta * turn[0]
     b = sin_theta * turn[1]

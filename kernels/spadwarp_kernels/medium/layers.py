@@ -21,7 +21,7 @@ from spadwarp_kernels.arguments import (
 )
 
 from .grid import Grid
-from .water import Medium, free_path
+from .water import Medium, ready_free_path
 
 _RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)"}
 
@@ -138,7 +138,7 @@ def _layered_extinction(
 
 @wp.func
 def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
-    return free_path(xi, medium.extinction)
+    return ready_free_path(xi, medium)
 
 
 @wp.func

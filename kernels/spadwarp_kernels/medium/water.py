@@ -1,5 +1,7 @@
 """The scattering medium and the free flight through it."""
 
+import math
+
 import warp as wp
 
 from spadwarp_kernels.math.rotations import OFF_AXIS
@@ -16,6 +18,7 @@ class Medium:
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
         axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
             switches it off.
+        per_bit: -ln(2)/c [m], from `ready_medium`; 0 in vacuum.
         phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
     """
 
@@ -23,15 +26,17 @@ class Medium:
     albedo: float
     anisotropy: float
     axis_threshold: float
+    per_bit: float
     phase: DensityTables
 
 
 def ready_medium(medium: Medium) -> Medium:
-    """A copy for a kernel: a threshold of 1 is OFF_AXIS."""
+    """A copy for a kernel: a threshold of 1 is OFF_AXIS, and `per_bit` is filled."""
     copy = Medium()
     for name in Medium.vars:
         setattr(copy, name, getattr(medium, name))
     copy.axis_threshold = medium.axis_threshold if medium.axis_threshold < 1.0 else OFF_AXIS
+    copy.per_bit = -math.log(2.0) / medium.extinction if medium.extinction > 0.0 else 0.0
     return copy
 
 
@@ -42,3 +47,15 @@ def free_path(xi: float, extinction: float) -> float:
     if extinction <= 0.0:
         return 1.0e30
     return -wp.log(xi) / extinction
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return medium.per_bit < 0.0f ? __log2f(xi) * medium.per_bit : 1.0e30f;
+#else
+    return medium.extinction > 0.0f ? -wp::log(xi) / medium.extinction : 1.0e30f;
+#endif
+""")
+def ready_free_path(xi: float, medium: Medium) -> float:
+    """`free_path` in a medium from `ready_medium`."""
+    ...

@@ -6,6 +6,8 @@ one id gives the same numbers however a launch is cut up.
 
 import warp as wp
 
+from spadwarp_kernels.math.held import held_word
+
 _M0 = wp.constant(wp.uint32(0xD2511F53))
 _M1 = wp.constant(wp.uint32(0xCD9E8D57))
 _W0 = wp.constant(wp.uint32(0x9E3779B9))
@@ -100,6 +102,16 @@ def round_keys(seed: int) -> RoundKeys:
     for name, first, step in (("x", seed, int(_W0)), ("y", seed >> 32, int(_W1))):
         setattr(keys, name, _Keys(*((first + i * step) & 0xFFFFFFFF for i in range(_ROUNDS))))
     return keys
+
+
+@wp.func
+def hold_keys(keys: RoundKeys) -> RoundKeys:
+    """The keys in registers, see `held_word`, for a kernel that draws in a loop."""
+    kept = RoundKeys()
+    for i in range(wp.static(_ROUNDS)):
+        kept.x[i] = held_word(keys.x[i])
+        kept.y[i] = held_word(keys.y[i])
+    return kept
 
 
 @wp.func

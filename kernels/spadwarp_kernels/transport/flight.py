@@ -7,7 +7,7 @@ from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Flight, PhotonState, is_planned
+from spadwarp_kernels.photon.state import EVENT, RAY, Flight, PhotonState, is_planned, shorten
 from spadwarp_kernels.random.ahead import block_ahead, make_draw_ahead
 from spadwarp_kernels.random.philox import (
     STREAM_FLIGHT_SAMPLE,
@@ -19,8 +19,13 @@ from spadwarp_kernels.random.philox import (
     u01_tail,
 )
 from spadwarp_kernels.random.splitmix import join_words
+from spadwarp_kernels.intersect.box import segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.intersect.pairs import NOWHERE
+from spadwarp_kernels.intersect.patches import nearest_patch
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.trace import patch_hit
 
 
 @made_once
@@ -87,3 +92,42 @@ def make_draw_albedo(spec: TransportSpec) -> wp.Function:
         return s.albedo
 
     return draw_albedo
+
+
+@made_once
+def make_depart(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
+    """The Warp function ``(s, medium, layers, camera, gate, limits, surfaces, keys, id, words)`` that lets a photon fly:
+    to EVENT, or where a tree of faces may be in its way to RAY. `brute_force`: every face is tried on the spot."""
+    fly, draw_albedo = make_fly(spec, plan_flight, cuda), make_draw_albedo(spec)
+    has_bvh = spec.mesh and not brute_force
+    meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
+
+    @wp.func
+    def depart(
+        s: wp.ref[PhotonState],
+        medium: Medium,
+        layers: Layers,
+        camera: Camera,
+        gate: Gate,
+        limits: Limits,
+        surfaces: Surfaces,
+        keys: RoundKeys,
+        id: wp.uint64,
+        words: wp.array(dtype=int),
+    ):
+        s.flight = fly(s, medium, layers, camera, gate, limits, keys, id, words)
+        s.hit.face = -1
+        s.stage = EVENT
+        s.albedo = draw_albedo(s, medium, keys, id)
+        if wp.static(has_bvh):
+            if meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper):
+                s.stage = RAY
+        if wp.static(brute_force):
+            # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
+            met = nearest_patch(surfaces.patches, s.x, s.u, NOWHERE)
+            s.surface_queries += 1
+            if met[0] < s.flight.distance:
+                s.hit = patch_hit(surfaces, met)
+            s.flight = shorten(s.flight, met[0])
+
+    return depart

@@ -16,13 +16,11 @@ from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_his
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
-from spadwarp_kernels.estimators.points import make_push_points, make_score_points
+from spadwarp_kernels.estimators.points import make_ask_flight, make_push_points, make_score_points
 from spadwarp_kernels.estimators.queue import long_queue_fits, make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.intersect.box import inverse_direction, segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.intersect.box import inverse_direction
 from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, place, step_leaf, step_node
-from spadwarp_kernels.intersect.pairs import NOWHERE
-from spadwarp_kernels.intersect.patches import nearest_patch
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -44,6 +42,7 @@ from spadwarp_kernels.photon.state import (
     SURFACE_RAY,
     Turn,
     first_state,
+    is_planned,
     next_bounce,
     shorten,
     sum_bounces,
@@ -51,13 +50,13 @@ from spadwarp_kernels.photon.state import (
 from spadwarp_kernels.polarisation.emission import make_first_stokes
 from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.ahead import WORDS_AHEAD
-from spadwarp_kernels.random.philox import RoundKeys
+from spadwarp_kernels.random.philox import RoundKeys, hold_keys
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.source.laser import Laser
 from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import patch_hit, surface_hit
+from spadwarp_kernels.surface.trace import surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import TOO_LONG
@@ -66,7 +65,7 @@ from .checks import check_spec
 from .collide import make_arrives, make_collide
 from .emit import make_emit, make_enter, make_first_photon, make_take_emitted
 from .finish import make_finish, make_flush
-from .flight import make_draw_albedo, make_fly
+from .flight import make_depart
 from .scatter import make_leave, make_scatter
 from .traverse import make_aim, make_begin_walk, make_free_lanes, make_look, next_ray
 
@@ -101,7 +100,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     cross, score = make_derived_cross(spec, estimator.cross), make_derived_score(spec, estimator.score)
     request_flight, request_event = estimator.request_flight, estimator.request_event
     crosses, flights, scores = estimator.cross is not None, request_flight is not None, estimator.score is not None
-    has_mesh, reflecting, confocal, draw_albedo = spec.mesh, spec.reflecting, spec.confocal, make_draw_albedo(spec)
+    has_mesh, reflecting, confocal = spec.mesh, spec.reflecting, spec.confocal
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
     brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
@@ -111,26 +110,26 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     # Where nothing waits for a shadow ray, a photon flies, collides and scatters in one branch, so that a warp pays for
     # these once. Otherwise a new direction comes before the score, or after it: measured, which of the two is faster.
     # Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
-    at_once = cuda and not has_bvh and ((queues and flights and spec.grid is None) or not scores)
-    at_once = at_once and long_queue_fits(spec)
+    at_once = cuda and not has_bvh and ((queues and (flights or not has_mesh) and spec.grid is None) or not scores)
+    at_once = at_once and (long_queue_fits(spec) or not flights)
+    asks_twice = at_once and flights
     # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
-    drains = at_once or (queues and not has_bvh and spec.points > 1)
+    drains = asks_twice or (queues and not has_bvh and spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
     start_lanes = START_LANES if scores and spec.grid is None and (flights or not has_bvh) else FEWER_START_LANES
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
-    fly, collide = make_fly(spec, estimator.plan_flight, cuda), make_collide(spec, crosses)
+    depart, collide = make_depart(spec, estimator.plan_flight, brute_force, cuda), make_collide(spec, crosses)
     scatter, leave = make_scatter(spec, estimator.direct, crosses), make_leave(crosses)
     flown, arrives = make_arrives(flights, has_bvh, queues, at_once)
     free_lanes = make_free_lanes(has_bvh)
-    meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     warp_memory, push, pop = make_queue(
-        flights, queues, at_once, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points
+        flights, queues, asks_twice, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points
     )
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
-    push_flight = make_push_points(spec.points, push)
+    ask_flight = make_ask_flight(request_flight, make_push_points(spec.points, push))
     score_more, scores_more = make_score_images(spec, flights, brute_force), reflecting
     if spec.points > 1 and not queues:
         score_more, scores_more = make_score_points(spec, score, look), True
@@ -174,6 +173,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         thread = ledger_slot(wp.tid(), first_id)
         base = first_photon(first_id, offset)
         s = first_state(medium, camera)
+        kept = hold_keys(keys)
         if wp.static(in_blocks):
             derivatives.blocks.thread = wp.tid()
         if wp.static(has_bvh and cuda):
@@ -194,32 +194,23 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             turn.waiting = 0
             while turn.waiting < wp.static(ray_lanes):
                 flying = s.stage == FLIGHT
-                if flying:
+                if wp.static(not at_once) and flying:
                     id = base + wp.uint64(s.photon)
-                    s.flight = fly(s, medium, layers, camera, gate, limits, keys, id, words)
-                    s.hit.face = -1
-                    s.stage = EVENT
-                    s.albedo = draw_albedo(s, medium, keys, id)
-                    if wp.static(has_bvh):
-                        if meets_box(s.x, s.u, s.flight.reach, surfaces.lower, surfaces.upper):
-                            s.stage = RAY
-                    if wp.static(brute_force):
-                        # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
-                        met = nearest_patch(surfaces.patches, s.x, s.u, NOWHERE)
-                        s.surface_queries += 1
-                        if met[0] < s.flight.distance:
-                            s.hit = patch_hit(surfaces, met)
-                        s.flight = shorten(s.flight, met[0])
+                    depart(s, medium, layers, camera, gate, limits, surfaces, kept, id, words)
                 # Round 0 scores the flight, round 1 the event at its end.
                 round = int(wp.static(0 if flights and not at_once else 1))
                 while round < 2:
                     asked = Asked()
-                    if wp.static(flights):
-                        if (wp.static(at_once) or round == 0) and flown(s, queued, flying):
-                            asked.request = request_flight(s)
-                            push_flight(memory, asked.request)
-                            s.flight.interval = wp.vec2(0.0, 0.0)
+                    if wp.static(flights and not at_once):
+                        if round == 0 and flown(s, queued):
+                            asked.request = ask_flight(s, memory)
                     if round == 1 and arrives(s, queued, flying):
+                        if wp.static(at_once):
+                            id = base + wp.uint64(s.photon)
+                            depart(s, medium, layers, camera, gate, limits, surfaces, kept, id, words)
+                            if wp.static(flights):
+                                if is_planned(s.flight):
+                                    asked.request = ask_flight(s, memory)
                         if wp.static(crosses):
                             crossing = cross(s, camera, gate, limits, layers, derivatives, polarisation)
                             if wp.static(reflecting):

@@ -6,7 +6,7 @@ from spadwarp_kernels.derivatives.blocks import make_block_scores
 from spadwarp_kernels.derivatives.history import make_event_scores
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import rotate_direction, snap_from
+from spadwarp_kernels.math.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -114,7 +114,7 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
         if on_surface:
             axis = s.hit.normal
             t = sample_cosine_law(u01(s.flight.block[1]))
-        new.u = rotate_direction(axis, t, u01(s.flight.block[2]))
+        new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
         if wp.static(specular):
             if on_surface:
                 new.u = reflected
