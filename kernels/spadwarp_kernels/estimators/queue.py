@@ -10,10 +10,13 @@ from spadwarp_kernels.photon.lanes import (
     count_lanes_before,
     fits_in_block,
     make_warp_memory,
+    queue_pair,
     queue_size,
     queue_vector,
 )
 from spadwarp_kernels.photon.spec import TransportSpec
+
+from spadwarp_kernels.tally.tally import BACKSCATTER
 
 from .contribution import Request
 
@@ -56,6 +59,7 @@ def make_queue(
     derivatives: int = 0,
     polarised: bool = False,
     points: int = 1,
+    short: bool = False,
 ) -> tuple[wp.Function, wp.Function, wp.Function]:
     """Three Warp functions: ``warp_memory()``, see `make_warp_memory`; ``push(memory, request)`` adds what is wanted;
     ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take one.
@@ -69,6 +73,7 @@ def make_queue(
         derivatives: How many scores requests have.
         polarised: Whether they have a Stokes vector.
         points: Requests that a flight adds, one for each of its points.
+        short: Whether requests are of scatterings in water alone, and need one random word beside that of the tally.
     """
     more, rank_of = flights or confocal, _among_takers if traces else _lane
     score_vectors = -(-derivatives // 4)
@@ -83,17 +88,21 @@ def make_queue(
         queue_vector(
             memory, True, entry + wp.static(entries), wp.vec4(request.u[0], request.u[1], request.u[2], request.path)
         )
-        queue_vector(
-            memory,
-            True,
-            entry + 2 * wp.static(entries),
-            wp.vec4(
-                from_bits(int(request.first)),
-                from_bits(int(request.second)),
-                from_bits(packed),
-                from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
-            ),
-        )
+        if wp.static(short):
+            words = wp.vec2(from_bits(int(request.first)), from_bits(int(request.rounding_sample)))
+            queue_pair(memory, True, 2 * wp.static(entries), entry, words)
+        else:
+            queue_vector(
+                memory,
+                True,
+                entry + 2 * wp.static(entries),
+                wp.vec4(
+                    from_bits(int(request.first)),
+                    from_bits(int(request.second)),
+                    from_bits(packed),
+                    from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
+                ),
+            )
         if wp.static(more):
             lens = wp.vec2(request.lens[0], request.lens[1])
             if request.interval[0] >= request.interval[1]:
@@ -126,24 +135,31 @@ def make_queue(
         entry = wp.min(index, size - 1)
         a = queue_vector(memory, False, entry, wp.vec4())
         b = queue_vector(memory, False, entry + wp.static(entries), wp.vec4())
-        c = queue_vector(memory, False, entry + 2 * wp.static(entries), wp.vec4())
         request.x = wp.vec3(a[0], a[1], a[2])
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
         request.path = b[3]
-        request.first = wp.uint32(bits_of(c[0]))
-        request.second = wp.uint32(bits_of(c[1]))
-        packed = bits_of(c[2])
-        request.component = packed & 3
-        request.rounding_sample = wp.uint32(packed)
         request.target = -1
-        request.slot = bits_of(c[3])
+        request.slot = -1
+        if wp.static(short):
+            words = queue_pair(memory, False, 2 * wp.static(entries), entry, wp.vec2())
+            request.first = wp.uint32(bits_of(words[0]))
+            request.rounding_sample = wp.uint32(bits_of(words[1]))
+            request.component = BACKSCATTER
+        else:
+            c = queue_vector(memory, False, entry + 2 * wp.static(entries), wp.vec4())
+            request.first = wp.uint32(bits_of(c[0]))
+            request.second = wp.uint32(bits_of(c[1]))
+            packed = bits_of(c[2])
+            request.component = packed & 3
+            request.rounding_sample = wp.uint32(packed)
+            request.slot = bits_of(c[3])
         if wp.static(more):
             d = queue_vector(memory, False, entry + 3 * wp.static(entries), wp.vec4())
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
-            request.target = bits_of(c[3])
+            request.target = request.slot
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
         for i in range(wp.static(score_vectors)):
             part = queue_vector(memory, False, entry + (wp.static(first_score) + i) * wp.static(entries), wp.vec4())

@@ -139,6 +139,23 @@ def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
     ...
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE} + begin;
+    float2* pairs = reinterpret_cast<float2*>(mine);
+    if (put) pairs[entry] = make_float2(value[0], value[1]);
+    const float2 held = pairs[entry];
+    return wp::vec2(held.x, held.y);
+#else
+    return value;
+#endif
+""")
+def queue_pair(memory: int, put: bool, begin: int, entry: int, value: wp.vec2) -> wp.vec2:
+    """Writes or reads one of the pairs of numbers that the warp's queue has in place of its vectors from `begin` on; CUDA
+    alone."""
+    ...
+
+
 ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
 
 

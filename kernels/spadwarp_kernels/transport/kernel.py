@@ -113,6 +113,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     at_once = cuda and not has_bvh and ((queues and (flights or not has_mesh) and spec.grid is None) or not scores)
     at_once = at_once and (long_queue_fits(spec) or not flights)
     asks_twice = at_once and flights
+    short = not (has_mesh or flights or confocal or spec.derivatives or spec.polarised or spec.grid)
     # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
     drains = asks_twice or (queues and not has_bvh and spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
@@ -125,7 +126,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     free_lanes = make_free_lanes(has_bvh)
     aim, look, begin_walk = make_aim(spec, scores), make_look(spec, brute_force), make_begin_walk(spec, cuda)
     warp_memory, push, pop = make_queue(
-        flights, queues, asks_twice, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points
+        flights, queues, asks_twice, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points, short
     )
     deposit = make_deposit(spec.signed, len(spec.blocks))
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
