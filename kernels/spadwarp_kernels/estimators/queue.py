@@ -15,7 +15,6 @@ from spadwarp_kernels.photon.lanes import (
     queue_vector,
 )
 from spadwarp_kernels.photon.spec import TransportSpec
-
 from spadwarp_kernels.tally.tally import BACKSCATTER
 
 from .contribution import Request
@@ -50,6 +49,56 @@ def long_queue_fits(spec: TransportSpec) -> bool:
 
 
 @made_once
+def _make_words(confocal: bool, short: bool, begin: int) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
+    what a request has beside x, u, weight and path; `confocal`, `short`: see `make_queue`, `begin`: where it is."""
+
+    @wp.func
+    def write_pair(memory: int, entry: int, request: Request):
+        words = wp.vec2(from_bits(int(request.first)), from_bits(int(request.rounding_sample)))
+        queue_pair(memory, True, wp.static(begin), entry, words)
+
+    @wp.func
+    def read_pair(memory: int, entry: int, request: Request) -> Request:
+        words = queue_pair(memory, False, wp.static(begin), entry, wp.vec2())
+        request.first = wp.uint32(bits_of(words[0]))
+        request.rounding_sample = wp.uint32(bits_of(words[1]))
+        request.component = BACKSCATTER
+        request.target = -1
+        request.slot = -1
+        return request
+
+    @wp.func
+    def write_vector(memory: int, entry: int, request: Request):
+        packed = request.component + int(request.rounding_sample & _UPPER_24)
+        queue_vector(
+            memory,
+            True,
+            entry + wp.static(begin),
+            wp.vec4(
+                from_bits(int(request.first)),
+                from_bits(int(request.second)),
+                from_bits(packed),
+                from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
+            ),
+        )
+
+    @wp.func
+    def read_vector(memory: int, entry: int, request: Request) -> Request:
+        c = queue_vector(memory, False, entry + wp.static(begin), wp.vec4())
+        request.first = wp.uint32(bits_of(c[0]))
+        request.second = wp.uint32(bits_of(c[1]))
+        packed = bits_of(c[2])
+        request.component = packed & 3
+        request.rounding_sample = wp.uint32(packed)
+        request.slot = bits_of(c[3])
+        request.target = wp.where(wp.static(confocal), bits_of(c[3]), -1)
+        return request
+
+    return (write_pair, read_pair) if short else (write_vector, read_vector)
+
+
+@made_once
 def make_queue(
     flights: bool,
     used: bool,
@@ -79,30 +128,16 @@ def make_queue(
     score_vectors = -(-derivatives // 4)
     first_score = 4 if more else 3
     entries = queue_entries(points, long)
+    write_words, read_words = _make_words(confocal, short, 2 * entries)
     warp_memory = make_warp_memory(_vectors(more, derivatives, polarised) * entries if used else 0, flights and long)
 
     @wp.func
     def write(memory: int, entry: int, request: Request):
-        packed = request.component + int(request.rounding_sample & _UPPER_24)
         queue_vector(memory, True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
         queue_vector(
             memory, True, entry + wp.static(entries), wp.vec4(request.u[0], request.u[1], request.u[2], request.path)
         )
-        if wp.static(short):
-            words = wp.vec2(from_bits(int(request.first)), from_bits(int(request.rounding_sample)))
-            queue_pair(memory, True, 2 * wp.static(entries), entry, words)
-        else:
-            queue_vector(
-                memory,
-                True,
-                entry + 2 * wp.static(entries),
-                wp.vec4(
-                    from_bits(int(request.first)),
-                    from_bits(int(request.second)),
-                    from_bits(packed),
-                    from_bits(wp.where(wp.static(confocal), request.target, request.slot)),
-                ),
-            )
+        write_words(memory, entry, request)
         if wp.static(more):
             lens = wp.vec2(request.lens[0], request.lens[1])
             if request.interval[0] >= request.interval[1]:
@@ -139,27 +174,12 @@ def make_queue(
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
         request.path = b[3]
-        request.target = -1
-        request.slot = -1
-        if wp.static(short):
-            words = queue_pair(memory, False, 2 * wp.static(entries), entry, wp.vec2())
-            request.first = wp.uint32(bits_of(words[0]))
-            request.rounding_sample = wp.uint32(bits_of(words[1]))
-            request.component = BACKSCATTER
-        else:
-            c = queue_vector(memory, False, entry + 2 * wp.static(entries), wp.vec4())
-            request.first = wp.uint32(bits_of(c[0]))
-            request.second = wp.uint32(bits_of(c[1]))
-            packed = bits_of(c[2])
-            request.component = packed & 3
-            request.rounding_sample = wp.uint32(packed)
-            request.slot = bits_of(c[3])
+        request = read_words(memory, entry, request)
         if wp.static(more):
             d = queue_vector(memory, False, entry + 3 * wp.static(entries), wp.vec4())
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
-            request.target = request.slot
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
         for i in range(wp.static(score_vectors)):
             part = queue_vector(memory, False, entry + (wp.static(first_score) + i) * wp.static(entries), wp.vec4())

@@ -12,6 +12,6 @@ import warp as wp
 #endif
 """)
 def held_word(word: wp.uint32) -> wp.uint32:
-    """The word, in a register that the warp shares from here on: else a compiler for CUDA reads an argument anew wherever
-    it is used, by an instruction each time."""
+    """The word, in a register that the warp shares from here on: else a compiler for CUDA reads an argument anew by an
+    instruction wherever it is used."""
     ...

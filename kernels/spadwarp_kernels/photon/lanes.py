@@ -151,8 +151,8 @@ def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
 #endif
 """)
 def queue_pair(memory: int, put: bool, begin: int, entry: int, value: wp.vec2) -> wp.vec2:
-    """Writes or reads one of the pairs of numbers that the warp's queue has in place of its vectors from `begin` on; CUDA
-    alone."""
+    """Writes or reads one of the pairs of numbers that the warp's queue has where its vectors from `begin` on would be;
+    CUDA alone."""
     ...
 
 

@@ -102,8 +102,8 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
 
 @made_once
 def make_arrives(flights: bool, traces: bool, queues: bool, at_once: bool) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions, ``(s, queued) -> bool``: whether the photon's flight is to be scored, and ``(s, queued, flies)
-    -> bool``: whether, that being done, it is at the end of its flight and free to collide.
+    """Two Warp functions: ``(s, queued) -> bool``, whether the photon's flight is to be scored, and
+    ``(s, queued, flies) -> bool``, whether, that being done, it is at the end of its flight and free to collide.
 
     Args:
         flights: Whether flights are scored; then collisions in the water are not.

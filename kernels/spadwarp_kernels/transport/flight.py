@@ -2,6 +2,9 @@
 
 import warp as wp
 
+from spadwarp_kernels.intersect.box import segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.intersect.pairs import NOWHERE
+from spadwarp_kernels.intersect.patches import nearest_patch
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.medium.layers import Layers
 from spadwarp_kernels.medium.limits import Limits
@@ -19,9 +22,6 @@ from spadwarp_kernels.random.philox import (
     u01_tail,
 )
 from spadwarp_kernels.random.splitmix import join_words
-from spadwarp_kernels.intersect.box import segment_meets_box, segment_meets_box_on_cpu
-from spadwarp_kernels.intersect.pairs import NOWHERE
-from spadwarp_kernels.intersect.patches import nearest_patch
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.surface.mesh import Surfaces
@@ -96,8 +96,8 @@ def make_draw_albedo(spec: TransportSpec) -> wp.Function:
 
 @made_once
 def make_depart(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
-    """The Warp function ``(s, medium, layers, camera, gate, limits, surfaces, keys, id, words)`` that lets a photon fly:
-    to EVENT, or where a tree of faces may be in its way to RAY. `brute_force`: every face is tried on the spot."""
+    """The Warp function ``(s, medium, layers, camera, gate, limits, surfaces, keys, id, words)``: lets a photon fly, to
+    EVENT or, where a tree of faces may be in its way, to RAY. `brute_force`: every face is tried on the spot."""
     fly, draw_albedo = make_fly(spec, plan_flight, cuda), make_draw_albedo(spec)
     has_bvh = spec.mesh and not brute_force
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu

@@ -35,7 +35,6 @@ from spadwarp_kernels.photon.state import (
     EVENT,
     FLIGHT,
     NO_RAY,
-    RAY,
     SCATTER,
     SHADOW_RAY,
     START,

@@ -110,8 +110,8 @@ def next_ray(s: PhotonState) -> int:
 
 @made_once
 def make_free_lanes(traces: bool) -> wp.Function:
-    """The Warp function ``s -> int``, which all lanes call together: how many have room for a contribution that waits for
-    its shadow ray. `traces`: whether rays wait at all."""
+    """The Warp function ``s -> int``, called by all lanes together: how many have room for a contribution that waits
+    for its shadow ray. `traces`: whether rays wait at all."""
 
     @wp.func
     def free_lanes(s: PhotonState) -> int:
