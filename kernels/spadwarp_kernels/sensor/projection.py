@@ -25,7 +25,7 @@ class Lens(NamedTuple):
     name: str
     project: wp.Function
     view: wp.Function
-    shows: wp.Function
+    shows: wp.Function = in_view
 
 
 @wp.func
