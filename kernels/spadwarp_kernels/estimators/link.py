@@ -37,7 +37,13 @@ def next_event_value(
     unit vector."""
     cos_lens = wp.max(-to_lens[2], 0.0)
     return (
-        weight * scattering * wp.exp(-extinction * distance) * camera.aperture_area * cos_lens / (distance * distance)
+        # Times -1: Warp's unary minus is 0 - x, an addition.
+        weight
+        * scattering
+        * wp.exp((-1.0 * extinction) * distance)
+        * camera.aperture_area
+        * cos_lens
+        / (distance * distance)
     )
 
 

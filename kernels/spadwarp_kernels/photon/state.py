@@ -135,10 +135,12 @@ class Turn:
     Attributes:
         done: Lanes for which no photons are left.
         waiting: Lanes that wait for a ray or, where there are none, for nothing but the others.
+        enough: Requests in the queue that are to be scored: 32 or, when no photons are left, any.
     """
 
     done: int
     waiting: int
+    enough: int
 
 
 @wp.struct

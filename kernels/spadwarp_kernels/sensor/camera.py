@@ -75,13 +75,12 @@ def project_about_axis(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
 
 @wp.func
 def _pixel(camera: Camera, focal: wp.vec2, principal: wp.vec2, x: wp.vec3, o: wp.vec3) -> int:
-    if x[2] <= 0.0:
-        return -1
     t = image_tangents(camera, x, o)
     column = t[0] * focal[0] + principal[0]
     row = t[1] * focal[1] + principal[1]
     # Compared as floats: a float beyond the int range has no defined int value. Also false for what is not a number.
-    if not (column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)):
+    inside = column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)
+    if not (inside and x[2] > 0.0):
         return -1
     return int(row) * camera.width + int(column)
 

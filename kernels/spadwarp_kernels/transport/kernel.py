@@ -185,6 +185,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
             words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
         memory = warp_memory()
         turn = Turn()
+        turn.enough = 32
         queued = int(0)
         if wp.static(queues):
             queued = queue_size(memory, SET_SIZE, 0)
@@ -248,7 +249,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         if wp.static(queues):
                             queued = queue_size(memory, READ_SIZE, 0)
                             free = free_lanes(s)
-                            ready = (queued >= 32 or (turn.done == 32 and queued > 0)) and free >= wp.static(FREE_LANES)
+                            ready = queued >= turn.enough and free >= wp.static(FREE_LANES)
                         while ready:
                             if wp.static(queues):
                                 asked.request = pop(memory, lane, not s.hidden, queued, free)
@@ -327,6 +328,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             s.stokes = first_stokes(polarisation, laser, scan, s.target, emitted, s.x, s.u)
 
                     turn.done = count_lanes(s.stage == DONE)
+                    turn.enough = wp.where(turn.done == 32, 1, 32)
                     turn.waiting = wp.where(queued > 0, 0, turn.done)
                 if wp.static(has_bvh):
                     turn.waiting = count_lanes(s.stage != FLIGHT)
