@@ -8,16 +8,18 @@ leaves, and new rays join while old ones still walk (Aila & Laine, High-Performa
 steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
 
 A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; `nodes` says
-how it is kept. Faces are three vec4 each, see `face_distance`, in the order of the leaves.
+how it is kept. Faces are three vec4 each, see `meet_planes`, in the order of the leaves; two that make a parallelogram
+may be one leaf, see `leaves`.
 """
 
 import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of, from_bits
 
+from .leaves import join_leaves
 from .nodes import Corners, box_entries, box_of, child_of, children_of, empty_nodes, leaf_at, set_node, slot_of
 from .pairs import DEEPEST, NO_NODE, NOWHERE, read_tree
-from .triangle import box_padding, face_distance, face_in, pack_faces, set_faces
+from .triangle import box_padding, face_in, meet_face, pack_faces, set_faces
 
 # Nodes that a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
@@ -111,7 +113,7 @@ def _gather_kernel(
             nodes[4 * place[node] + 3][k] = from_bits(child)
 
 
-def _open(pairs: wp.array, order: wp.array) -> wp.array:
+def open_pairs(pairs: wp.array, order: wp.array) -> wp.array:
     """Nodes of four children, as they are described above, from pairs."""
     count, device = pairs.size // 4, pairs.device
     wide = wp.zeros(pairs.size, dtype=wp.vec4, device=device)
@@ -125,20 +127,25 @@ def _open(pairs: wp.array, order: wp.array) -> wp.array:
     return nodes
 
 
-def pack_bvh(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `step_node` and `face_distance`; see `refit_bvh` for moved points.
+def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of a mesh's tree, for `step_node` and `step_leaf`; see `refit_bvh` for moved points.
 
     Args:
         mesh: Any `wp.Mesh` on a GPU.
         extent: Its largest coordinate [m], for the padding of the boxes.
+        join: Whether two faces may be one leaf, see `leaves`: not where the points will move.
 
     Returns:
         nodes: vec4 [4 * nodes], see above; boxes are padded against rounding.
-        faces: vec4 [3 * slots], see `face_distance`.
-        order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf.
+        faces: vec4 [3 * slots], see `meet_planes`.
+        order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf, of which
+            each face is tried by itself.
     """
     pairs, order = read_tree(mesh, extent)
-    return _open(pairs, order), pack_faces(mesh, extent, order), order
+    faces = pack_faces(mesh, extent, order)
+    if join:
+        join_leaves(mesh, extent, pairs, order, faces)
+    return open_pairs(pairs, order), faces, order
 
 
 @wp.kernel(enable_backward=False)
@@ -267,10 +274,10 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
 
 @wp.struct
 class LeafStep:
-    """A face of a leaf against a ray.
+    """A face of a leaf, or two that are one leaf, against a ray.
 
     Attributes:
-        slot: Of the face.
+        slot: Of the face, of two that which the ray would hit.
         distance: At which the ray meets it [m]; of no meaning for a miss.
         hit: Whether it does, nearer than the nearest face so far.
         node: The next face of the leaf, or NO_NODE after the last: then the walk returns to its stack.
@@ -294,10 +301,12 @@ def step_leaf(
         x, u: Origin and unit direction of the ray.
     """
     step = LeafStep()
-    step.slot = slot_of(walk.node)
-    step.distance = face_distance(faces, step.slot, x, u)
+    slot = slot_of(walk.node)
+    distance, met = meet_face(faces, slot, x, u)
+    step.slot = met
+    step.distance = distance
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
     step.node = NO_NODE
     if (walk.node & 1) != 0:
-        step.node = leaf_at(order, step.slot + 1)
+        step.node = leaf_at(order, slot + 1)
     return step

@@ -15,7 +15,7 @@ import warp as wp
 
 from spadwarp_kernels.math.bits import bits_of
 
-from .triangle import WIDENING
+from .triangle import WIDENING, middle_planes
 
 PATCH_ROWS = wp.constant(5)
 
@@ -23,9 +23,9 @@ PATCH_ROWS = wp.constant(5)
 BRUTE_FORCE_FACES = 12
 
 # Corners of two faces are taken for one, and four for a parallelogram, within this part of the largest coordinate.
-_SAME = 5.0e-7
+SAME = 5.0e-7
 # Triangles less high than so many of these distances stay by themselves.
-_LEAST_HEIGHT = 100.0
+LEAST_HEIGHT = 100.0
 
 
 def pair_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[int, int, int]]:
@@ -37,10 +37,10 @@ def pair_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[int, int, in
         faces: Indices of vertices, integers [faces, 3]. Faces that turn opposite ways are not paired.
     """
     corners = np.asarray(points, np.float64)[np.asarray(faces)]
-    same = _SAME * np.abs(corners).max(initial=0.0)
+    same = SAME * np.abs(corners).max(initial=0.0)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    free = [bool(one) for one in doubled > _LEAST_HEIGHT * same * longest]
+    free = [bool(one) for one in doubled > LEAST_HEIGHT * same * longest]
     patches = []
     taken: set[int] = set()
     for first in range(len(corners)):
@@ -79,20 +79,12 @@ def _patches_kernel(mesh: wp.uint64, patches: wp.array(dtype=wp.vec4), normals: 
     p = m.points[m.indices[3 * face + k]]
     q = m.points[m.indices[3 * face + (k + 1) % 3]]
     r = m.points[m.indices[3 * face + (k + 2) % 3]]
-    e1 = q - p
-    e2 = r - p
-    n = wp.cross(e1, e2)
-    inverse = 1.0 / wp.dot(n, n)  # infinite for a face without area, whose normal is 0, so that no ray hits it
-    a = inverse * wp.cross(e2, n)
-    b = inverse * wp.cross(n, e1)
-    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), triangle * wp.length(a + b))
-    middle = p + 0.5 * (e1 + e2)
-    largest = wp.max(wp.max(_size(p), _size(q)), wp.max(_size(r), (1.0 - triangle) * _size(q + e2)))
-    n = wp.normalize(n)
-    patches[row] = wp.vec4(n[0], n[1], n[2], wp.dot(n, middle))
-    patches[row + 1] = 2.0 * wp.vec4(a[0], a[1], a[2], -wp.dot(a, middle))
-    patches[row + 2] = 2.0 * wp.vec4(b[0], b[1], b[2], -wp.dot(b, middle))
-    patches[row + 3] = wp.vec4(0.5 / (steepest * WIDENING), triangle, largest, corner)
+    a, b, n, height = middle_planes(p, q - p, r - p, triangle)
+    largest = wp.max(wp.max(_size(p), _size(q)), wp.max(_size(r), (1.0 - triangle) * _size(q + r - p)))
+    patches[row] = n
+    patches[row + 1] = a
+    patches[row + 2] = b
+    patches[row + 3] = wp.vec4(height / WIDENING, triangle, largest, corner)
     named = patches[row + 4]
     normals[bits_of(named[0])] = wp.vec4(n[0], n[1], n[2], named[1])
     normals[bits_of(named[2])] = wp.vec4(n[0], n[1], n[2], named[3])

@@ -1,12 +1,14 @@
-"""Rays against triangles, laid out as planes: see `face_distance`.
+"""Rays against triangles, laid out as planes: see `meet_planes`.
 
-On CUDA the three planes of a face are three vec4 in a row. On the CPU eight faces make a block of 36 vec4, as 18 rows
-of eight numbers: the components of the planes, then the lower and the upper corner of each face's own box.
+On CUDA a face is three vec4 in a row, which may also stand for a parallelogram, see `meet_planes`. On the CPU eight
+faces make a block of 36 vec4, as 18 rows of eight numbers: the components of three planes, of the first two barycentric
+coordinates and of the face itself, then the lower and the upper corner of each face's own box.
 """
 
 import warp as wp
 
 from spadwarp_kernels.arguments import check_integer
+from spadwarp_kernels.math.bits import bits_of
 from spadwarp_kernels.math.memory import zeros
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
@@ -36,6 +38,32 @@ def load_plane(faces: wp.array(dtype=wp.vec4), slot: int, plane: int) -> wp.vec4
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    return plane;
+#else
+    if (which < 2) return wp::vec4(2.0f * plane[0], 2.0f * plane[1], 2.0f * plane[2], 2.0f * plane[3] - 1.0f);
+    const float half = plane[3] < 0.0f ? -0.5f : 0.5f;
+    return wp::vec4(half * plane[0], half * plane[1], half * plane[2], fabsf(half * plane[3]));
+#endif
+""")
+def _from_middle(plane: wp.vec4, which: int) -> wp.vec4:
+    """Plane 0, 1 or 2 of a face as `meet_planes` takes it: on CUDA it is kept so."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
+#else
+    return __builtin_signbit(sign) ? -x : x;
+#endif
+""")
+def _times_sign(x: float, sign: float) -> float:
+    """x, negated where the sign bit is set, also of a zero."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     return __ldg(order.data + slot);
 #else
     return order.data[slot];
@@ -55,7 +83,7 @@ def face_in(order: wp.array(dtype=int), slot: int) -> int:
 
 @wp.func
 def _planes(mesh: wp.uint64, face: int):
-    """Normals and offsets of the three planes of a face, see `face_distance`."""
+    """Normals and offsets of the three planes of a face on the CPU."""
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face]]
     e1 = m.points[m.indices[3 * face + 1]] - p
@@ -73,14 +101,57 @@ def _planes(mesh: wp.uint64, face: int):
     )
 
 
-@wp.kernel(enable_backward=False)
-def _rows_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
-    """Launch: slots; CUDA."""
-    slot = wp.tid()
-    a, b, n = _planes(mesh, face_in(order, slot))
+@wp.func
+def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
+    """Planes of a triangle with corner p and edges e1, e2 from it, or with `triangle` = 0 of the parallelogram.
+
+    Returns:
+        Two coordinates as normals and offsets, -1 to 1 from edge to edge of the parallelogram; the unit normal and the
+        offset of its plane; half its least height [m]. Without area nothing is finite or the normal is 0.
+    """
+    n = wp.cross(e1, e2)
+    inverse = 1.0 / wp.dot(n, n)
+    a = inverse * wp.cross(e2, n)
+    b = inverse * wp.cross(n, e1)
+    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), triangle * wp.length(a + b))
+    middle = p + 0.5 * (e1 + e2)
+    n = wp.normalize(n)
+    return (
+        2.0 * wp.vec4(a[0], a[1], a[2], -wp.dot(a, middle)),
+        2.0 * wp.vec4(b[0], b[1], b[2], -wp.dot(b, middle)),
+        wp.vec4(n[0], n[1], n[2], wp.dot(n, middle)),
+        0.5 / steepest,
+    )
+
+
+@wp.func
+def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array(dtype=wp.vec4)):
+    """Writes a face, or the parallelogram that it is a half of: then `triangle` is 0, and the corner is the one that is
+    not on the diagonal."""
+    m = wp.mesh_get(mesh)
+    p = m.points[m.indices[3 * face + corner]]
+    q = m.points[m.indices[3 * face + (corner + 1) % 3]]
+    r = m.points[m.indices[3 * face + (corner + 2) % 3]]
+    a, b, n, height = middle_planes(p, q - p, r - p, triangle)
     faces[3 * slot] = a
     faces[3 * slot + 1] = b
-    faces[3 * slot + 2] = n
+    turned = _times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
+    if triangle == 0.0:
+        turned = -1.0 * turned
+    offset = height * wp.abs(n[3])
+    faces[3 * slot + 2] = wp.vec4(turned[0], turned[1], turned[2], _times_sign(offset, triangle - 0.5))
+
+
+@wp.kernel(enable_backward=False)
+def _rows_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+    """Launch: slots."""
+    slot = wp.tid()
+    set_row(mesh, face_in(order, slot), 0, 1.0, slot, faces)
+
+
+def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array) -> None:
+    """Writes the faces in their slots as CUDA takes them, each by itself."""
+    wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
 
 
 @wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
@@ -137,7 +208,7 @@ def face_vectors(slots: int, device: wp.Device) -> int:
 def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) -> None:
     """Writes the faces in their slots, for the mesh's points as they are."""
     if mesh.device.is_cuda:
-        wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
+        set_rows(mesh, order, faces)
     else:
         wp.launch(_blocks_kernel, order.size, [mesh.id, box_padding(extent), order], [faces], device=mesh.device)
 
@@ -155,26 +226,50 @@ def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
 
 
 @wp.func
-def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance from x along the unit vector u at which the ray meets a face, >= 0, or -1 for a miss.
+def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> wp.vec2:
+    """A ray from x along the unit vector u against a triangle or a parallelogram, two triangles side by side.
 
-    Of each face `faces` holds three planes, as normals and offsets: of its first two barycentric coordinates, and its
-    own, with a normal as long as the least height of the triangle. A ray may pass a hair outside, measured across the
-    ray, so that none slips between two faces; more than that beyond the short edges of a sliver, where its box ends it.
+    Args:
+        a, b: Two coordinates in its plane as normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
+            parallelogram. The sum of a triangle's is not above 0.
+        n: Normal and offset of the plane; the normal is half as long as the least height. The sign of the offset, also
+            of a zero, says what it is: negative for a parallelogram.
+
+    Returns:
+        The distance, >= 0, or -1 for a miss; the sum of the coordinates there, which is above 0 in the second triangle
+        of a parallelogram. A ray may pass a hair outside, measured across the ray, so that none slips between two
+        faces; more than that beyond the short edges of a sliver, where its box ends it.
     """
-    a = load_plane(faces, slot, 0)
-    b = load_plane(faces, slot, 1)
-    n = load_plane(faces, slot, 2)
     rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
     height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
     distance = height / rate  # infinite or not a number for a ray in the plane, which fails below
     y = x + distance * u
     first = a[0] * y[0] + a[1] * y[1] + a[2] * y[2] + a[3]
     second = b[0] * y[0] + b[1] * y[1] + b[2] * y[2] + b[3]
-    least = wp.min(wp.min(first, second), 1.0 - first - second)
+    both = first + second
+    # Of a parallelogram the last does not count: negated it is the largest only beyond a corner.
+    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), _times_sign(both + 1.0, n[3]))
     hair = WIDENING * (wp.abs(y[0]) + wp.abs(y[1]) + wp.abs(y[2]) + distance)
-    if not (least * wp.abs(rate) >= -hair and distance >= 0.0):
+    if not ((1.0 - most) * wp.abs(rate) >= -hair and distance >= 0.0):
         distance = -1.0
+    return wp.vec2(distance, both)
+
+
+@wp.func
+def meet_face(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3):
+    """Distance at which a ray meets what is kept in a slot, see `meet_planes`; the slot of the triangle that it is."""
+    a = _from_middle(load_plane(faces, slot, 0), 0)
+    b = _from_middle(load_plane(faces, slot, 1), 1)
+    n = _from_middle(load_plane(faces, slot, 2), 2)
+    met = meet_planes(a, b, n, x, u)
+    return met[0], slot + wp.where(met[1] > 0.0 and bits_of(n[3]) < 0, 1, 0)
+
+
+@wp.func
+def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
+    CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
+    distance, _ = meet_face(faces, slot, x, u)
     return distance
 
 

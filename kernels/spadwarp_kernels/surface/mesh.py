@@ -172,7 +172,7 @@ def make_surfaces(
         surfaces.order = wp.array(numbers, dtype=int, device=device)  # each face in the slot of its own number
         surfaces.faces = pack_faces(mesh, surfaces.extent, surfaces.order)
     elif device.is_cuda:
-        surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent)
+        surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent, join=extent is None)
         if extent is not None:
             surfaces.depth = node_depths(surfaces.nodes)
             surfaces.levels = int(surfaces.depth.numpy().max()) + 1

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
+from helpers.brute_force import brute_force
 from helpers.launch import Vectors, launched, on_device
 from spadwarp_kernels.intersect.patches import (
     nearest_patch,
@@ -50,22 +51,6 @@ def packed(shape, pairs=True, device="cpu"):
     return mesh, *pack_patches(mesh, np.arange(len(shape.faces))[::-1], pairs)
 
 
-def reference(corners, x, u):
-    """Distance to every face [rays, faces], infinite for a miss, and how far inside all edges the ray passes [m]."""
-    p, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    n = np.cross(e1, e2)
-    size = np.linalg.norm(n, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = ((p - x[:, None]) * n).sum(axis=2) / (u @ n.T)
-        y = x[:, None] + distance[..., None] * u[:, None]
-        inside = np.full(distance.shape, np.inf)
-        for k in range(3):
-            a, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
-            height = (np.cross(edge, y - a) * n).sum(axis=2) / (size * np.linalg.norm(edge, axis=1))
-            inside = np.minimum(inside, height)
-    return np.where((inside >= 0) & (distance >= 0), distance, np.inf), inside
-
-
 def scenes():
     rng = np.random.default_rng(11)
     quads, triangles = [], []
@@ -105,7 +90,7 @@ def test_rays_hit_what_a_search_in_float64_hits(name, pairs, device):
     u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
 
     distance, normal, faces = launched(_cast, [patches, normals, x, u, 4.0], OUT, device, len(x))
-    expected, inside = reference(corners, x.astype(float), u.astype(float))
+    expected, inside = brute_force(corners, x.astype(float), u.astype(float))
     expected[expected >= 4.0] = np.inf
     nearest = expected.min(axis=1)
     # Within a hair of an outline a ray may hit or miss; grazing rays meet a plane where rounding has it.
