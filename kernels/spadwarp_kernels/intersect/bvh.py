@@ -9,7 +9,7 @@ steps is worth). `intersect_surfaces` walks a tree with the same steps from its 
 
 A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; `nodes` says
 how it is kept. Faces are three vec4 each, see `meet_planes`, in the order of the leaves; two that make a parallelogram
-may be one leaf, see `leaves`.
+may be tried as one, see `leaves`.
 """
 
 import warp as wp
@@ -133,13 +133,12 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
     Args:
         mesh: Any `wp.Mesh` on a GPU.
         extent: Its largest coordinate [m], for the padding of the boxes.
-        join: Whether two faces may be one leaf, see `leaves`: not where the points will move.
+        join: Whether two faces may be tried as one, see `leaves`: not where the points will move.
 
     Returns:
         nodes: vec4 [4 * nodes], see above; boxes are padded against rounding.
         faces: vec4 [3 * slots], see `meet_planes`.
-        order: int32 [slots]: the face in each slot, or ~face where the next slot belongs to the same leaf, of which
-            each face is tried by itself.
+        order: int32 [slots]: the face in each slot, or ~face where others of its leaf are tried after it.
     """
     pairs, order = read_tree(mesh, extent)
     faces = pack_faces(mesh, extent, order)
@@ -302,11 +301,11 @@ def step_leaf(
     """
     step = LeafStep()
     slot = slot_of(walk.node)
-    distance, met = meet_face(faces, slot, x, u)
+    distance, met, last = meet_face(faces, slot, x, u)
     step.slot = met
     step.distance = distance
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
     step.node = NO_NODE
     if (walk.node & 1) != 0:
-        step.node = leaf_at(order, slot + 1)
+        step.node = leaf_at(order, last + 1)
     return step

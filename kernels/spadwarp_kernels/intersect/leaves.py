@@ -1,8 +1,10 @@
-"""Leaves of the tree on CUDA: two children of a node that make a parallelogram are one leaf, tried as one face.
+"""Leaves of the tree on CUDA: two faces that make a parallelogram are tried as one, in a leaf of their own or among
+others.
 
-Both faces keep their slots, which follow each other. The leaf leads to the first, where the parallelogram is kept in
-place of the triangle, see `meet_planes`; the second keeps its own planes, of which only the normal is read. A mesh
-whose points move has leaves of triangles alone.
+They are two faces of one leaf of Warp's tree, or of two that are the children of one node: these become one leaf. Both
+keep slots, which follow each other. In the first the parallelogram is kept in place of the triangle, see `meet_planes`;
+the second keeps its own planes, of which only the normal is read. A mesh whose points move has leaves of triangles
+alone.
 """
 
 import warp as wp
@@ -11,7 +13,10 @@ from spadwarp_kernels.math.bits import bits_of
 
 from .pairs import NO_NODE
 from .patches import LEAST_HEIGHT, SAME
-from .triangle import set_row
+from .triangle import face_in, set_row
+
+# Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
+LARGEST_LEAF = wp.constant(8)
 
 
 @wp.func
@@ -55,58 +60,85 @@ def _leaf(nodes: wp.array(dtype=wp.vec4), node: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _find_kernel(
+def _siblings_kernel(
     mesh: wp.uint64,
     same: float,
     nodes: wp.array(dtype=wp.vec4),
     order: wp.array(dtype=int),
-    corners: wp.array(dtype=int),
+    joined: wp.array(dtype=int),
 ):
-    """The first face's corner of leaves that make a parallelogram, -1 for other pairs. Launch: pairs."""
+    """Two leaves of a face each that make a parallelogram become a leaf of two, which is marked. Launch: pairs."""
     pair = wp.tid()
     first = _leaf(nodes, 2 * pair)
-    corners[pair] = -1
     if pair == 0 or first < 0 or _leaf(nodes, 2 * pair + 1) != first + 1:
         return
-    if order[first] >= 0 and order[first + 1] >= 0:
-        corners[pair] = shared_corner(mesh, order[first], order[first + 1], same)
+    if order[first] < 0 or order[first + 1] < 0:
+        return
+    if shared_corner(mesh, order[first], order[first + 1], same) >= 0:
+        order[first] = ~order[first]
+        joined[pair] = 1
 
 
 @wp.kernel(enable_backward=False)
-def _join_kernel(corners: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)):
-    """In place of a pair that is a parallelogram, its leaf. Launch: nodes."""
+def _parents_kernel(joined: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)):
+    """In place of a pair that has become one leaf, that. Launch: nodes."""
     node = wp.tid()
     child = bits_of(nodes[2 * node][3])
-    if child > NO_NODE and corners[wp.max(child, 0)] >= 0:
+    if child > NO_NODE and joined[wp.max(child, 0)] > 0:
         nodes[2 * node][3] = nodes[4 * child][3]
 
 
 @wp.kernel(enable_backward=False)
-def _set_kernel(
+def _leaves_kernel(
     mesh: wp.uint64,
-    nodes: wp.array(dtype=wp.vec4),
+    same: float,
+    found: wp.array(dtype=int),
     order: wp.array(dtype=int),
-    corners: wp.array(dtype=int),
     faces: wp.array(dtype=wp.vec4),
 ):
-    """Launch: pairs."""
-    pair = wp.tid()
-    if corners[pair] >= 0:
-        slot = _leaf(nodes, 2 * pair)
-        set_row(mesh, order[slot], corners[pair], 0.0, slot, faces)
+    """Writes the faces of each leaf anew: behind a face the one with which it makes a parallelogram, if there is one.
+    Launch: slots."""
+    start = wp.tid()
+    if start > 0 and found[wp.max(start - 1, 0)] < 0:
+        return
+    stop = start + 1
+    while found[stop - 1] < 0 and stop - start <= LARGEST_LEAF:
+        stop += 1
+    if stop - start > LARGEST_LEAF:
+        return
+    taken = int(0)
+    slot = int(start)
+    for i in range(start, stop):
+        if ((taken >> (i - start)) & 1) == 0:
+            first = face_in(found, i)
+            second = int(-1)
+            corner = int(-1)
+            for j in range(i + 1, stop):
+                if corner < 0 and ((taken >> (j - start)) & 1) == 0:
+                    second = face_in(found, j)
+                    corner = shared_corner(mesh, first, second, same)
+                    taken = wp.where(corner >= 0, taken | (1 << (j - start)), taken)
+            width = wp.where(corner >= 0, 2, 1)
+            more = slot + width < stop
+            order[slot] = wp.where(more, ~first, first)
+            set_row(mesh, first, wp.max(corner, 0), wp.where(corner >= 0, 0.0, 1.0), slot, faces)
+            if corner >= 0:
+                order[slot + 1] = wp.where(more, ~second, second)
+                set_row(mesh, second, 0, 1.0, slot + 1, faces)
+            slot += width
 
 
 def join_leaves(mesh: wp.Mesh, extent: float, nodes: wp.array, order: wp.array, faces: wp.array) -> None:
-    """Makes pairs of leaves that are a parallelogram leaves of their own.
+    """Faces that are tried as one where two of a leaf, or of two leaves of a face each, make a parallelogram.
 
     Args:
         mesh: Whose points will not move.
         extent: Its largest coordinate [m].
-        nodes, order: From `read_tree`; the nodes change.
-        faces: The faces in their slots as CUDA takes them; parallelograms replace the first of theirs.
+        nodes, order: From `read_tree`; both change.
+        faces: The faces in their slots as CUDA takes them, see `pack_faces`; they change, too.
     """
-    count, device = nodes.size // 4, mesh.device
-    corners = wp.empty(count, dtype=int, device=device)
-    wp.launch(_find_kernel, count, [mesh.id, SAME * extent, nodes, order], [corners], device=device)
-    wp.launch(_join_kernel, 2 * count, [corners], [nodes], device=device)
-    wp.launch(_set_kernel, count, [mesh.id, nodes, order, corners], [faces], device=device)
+    count, device, same = nodes.size // 4, mesh.device, SAME * extent
+    joined = wp.zeros(count, dtype=int, device=device)
+    wp.launch(_siblings_kernel, count, [mesh.id, same, nodes], [order, joined], device=device)
+    wp.launch(_parents_kernel, 2 * count, [joined], [nodes], device=device)
+    wp.launch(_leaves_kernel, order.size, [mesh.id, same, wp.clone(order)], [order, faces], device=device)

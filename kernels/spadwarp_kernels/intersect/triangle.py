@@ -257,19 +257,25 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
 
 @wp.func
 def meet_face(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3):
-    """Distance at which a ray meets what is kept in a slot, see `meet_planes`; the slot of the triangle that it is."""
+    """What is kept in a slot against a ray, see `meet_planes`.
+
+    Returns:
+        The distance; the slot of the triangle that the ray would hit; the last slot that belongs to it, the next one
+        for a parallelogram.
+    """
     a = _from_middle(load_plane(faces, slot, 0), 0)
     b = _from_middle(load_plane(faces, slot, 1), 1)
     n = _from_middle(load_plane(faces, slot, 2), 2)
     met = meet_planes(a, b, n, x, u)
-    return met[0], slot + wp.where(met[1] > 0.0 and bits_of(n[3]) < 0, 1, 0)
+    last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
+    return met[0], wp.where(met[1] > 0.0, last, slot), last
 
 
 @wp.func
 def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3) -> float:
     """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
     CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
-    distance, _ = meet_face(faces, slot, x, u)
+    distance, _, _ = meet_face(faces, slot, x, u)
     return distance
 
 
