@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, in_field, in_view, project_about_axis, project_calibrated
+from .camera import Camera, in_field, in_view, project, project_about_axis, project_calibrated
 
 
 class Lens(NamedTuple):
@@ -20,16 +20,23 @@ class Lens(NamedTuple):
         view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
             or the pixel of a scan, shows.
         shows: As `in_view`, for such a view without a port.
+        image: As `project`, for a camera from `with_field`.
     """
 
     name: str
     project: wp.Function
     view: wp.Function
-    shows: wp.Function = in_view
+    shows: wp.Function
+    image: wp.Function
 
 
 @wp.func
 def _project_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    return project(camera, x, o)
+
+
+@wp.func
+def _image_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
     return project_about_axis(camera, x, o)
 
 
@@ -43,8 +50,8 @@ def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
     return view
 
 
-PLAIN = Lens("plain", _project_plain, _view_plain, in_field)
-"""Square pixels about the optical axis: of `Camera` the first six attributes, and `with_field` fills others."""
+PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain)
+"""Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
 
-CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated, in_view)
+CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated, in_view, project_calibrated)
 """Focal lengths and principal point in pixels, Brown's distortion: all of `Camera`."""
