@@ -179,9 +179,9 @@ def with_field(camera: Any) -> Any:
     tangent = np.float32(camera.pixel_tangent)
     half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
     copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
-    focal = np.float32(1.0) / tangent if tangent > 0.0 else np.float32(0.0)  # 0 where nothing asks for an image
+    focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
     copy.focal = wp.vec2(focal, focal)
-    copy.principal = wp.vec2(0.5 * camera.width, 0.5 * camera.height)
+    copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))
     return copy
 
 
