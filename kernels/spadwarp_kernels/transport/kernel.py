@@ -78,6 +78,7 @@ FREE_LANES = 12
 
 # It goes back to the water when fewer than this many still walk down the tree, and lets them wait for company.
 WALKING_LANES = 6
+GUIDED_WALKING_LANES = 4
 
 # It takes new photons when this many lanes have ended; the second where nothing is scored, in grids, and in a tree with
 # `next_event`. All measured.
@@ -117,6 +118,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     drains = asks_twice or (queues and not has_bvh and spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
+    walking_lanes = GUIDED_WALKING_LANES if flights else WALKING_LANES
     start_lanes = START_LANES if scores and spec.grid is None and (flights or not has_bvh) else FEWER_START_LANES
     emit, take_emitted, enter = make_emit(spec), make_take_emitted(spec, cuda), make_enter(spec.laser_port)
     depart, collide = make_depart(spec, estimator.plan_flight, brute_force, cuda), make_collide(spec, crosses)
@@ -347,7 +349,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                     at_faces = count_lanes(s.walk.node < NO_NODE)
                     company = int(1)
                     while in_nodes + at_faces >= company:
-                        company = wp.static(WALKING_LANES)
+                        company = wp.static(walking_lanes)
                         if in_nodes >= at_faces:
                             if s.walk.node > NO_NODE:
                                 met = step_node(surfaces.nodes, s.walk, inverse, shift)
