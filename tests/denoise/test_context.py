@@ -197,3 +197,13 @@ def test_scattered_light_beside_a_bright_target_is_water():
     assert np.mean(found.target_probability[~seen] > 0.5) < 0.05
     error = (found.depth - GATE[0]) / (GATE[1] - GATE[0]) * BINS - place
     assert np.median(np.abs(error[seen])) < 0.2
+
+
+@pytest.mark.parametrize("photons", [1.0, 30.0])
+def test_a_wall_in_a_frame_wider_than_the_crops_of_the_training_is_target(photons):
+    """Also where no border of the frame is near: crops of 64 × 64 pixels have no such place."""
+    place = 24.0 + 3.0 * np.sin(np.arange(144.0) / 40.0)
+    light = np.diff(norm.cdf(np.arange(BINS + 1.0) - place[:, None, None], scale=1.2))
+    rate = photons * light + 0.2 * photons / BINS
+    counts = np.random.default_rng(4).poisson(np.broadcast_to(rate, (144, 144, BINS))).astype(np.float32)
+    assert np.mean(found_in(counts, 0.2 * photons).target_probability < 0.5) < 0.01
