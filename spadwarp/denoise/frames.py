@@ -151,7 +151,7 @@ def depth_frames(
     """
     values = depth_values(depth)
     if values.ndim not in (2, 3):
-        raise ArgumentError(f"depth is {values.dtype} {values.shape}; real numbers [H, W] or [N, H, W] are needed")
+        raise ArgumentError(f"depth has shape {values.shape}; [H, W] or [N, H, W] is needed")
     values = values if values.ndim == 3 else values[None]
     if min(values.shape[1:]) < SMALLEST_SIDE or len(values) == 0:
         raise ArgumentError(

@@ -258,7 +258,8 @@ def test_depth_outside_the_gate_is_left_out_with_a_warning():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"depth": np.zeros(5)}, "depth is float64"),
+        ({"depth": np.zeros(5)}, r"depth has shape \(5,\)"),
+        ({"depth": np.full((32, 32), "a")}, "depth is <U1"),
         ({"depth": np.ones((4, 40))}, "4 x 40 pixels"),
         ({"depth": -np.ones((32, 32))}, "outside"),
         ({"gate": (16.0, 13.5)}, "gate"),
