@@ -76,7 +76,9 @@ def denoise(
     mask: Annotated[
         float | None,
         typer.Option(
-            metavar="P", help="Leave out pixels that see a target with less than this probability, such as 0.08."
+            metavar="P",
+            help="Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, "
+            "0.5 for histograms.",
         ),
     ] = None,
     device: opt.TorchDevice = None,

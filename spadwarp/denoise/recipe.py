@@ -96,6 +96,11 @@ class Part(Noise):
     open_water: Share = Field(0.0, description="of these, samples with a target in open water for certain")
 
 
+def _given(table: Any) -> Any:
+    """Of noise or a part from Python, the fields that were given; anything else as it is."""
+    return {name: getattr(table, name) for name in table.model_fields_set} if isinstance(table, Noise) else table
+
+
 class Optimiser(_Table):
     """How the network is trained."""
 
@@ -141,11 +146,16 @@ class TrainingRecipe(_Table):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _with_common_noise(cls, tables: Any) -> Any:
-        noise, mixture = tables.get("noise", {}), tables.get("mixture")
-        if not isinstance(noise, Mapping) or not isinstance(mixture, list):
+        if not isinstance(tables, Mapping):
             return tables
-        parts = tuple({**noise, **part} if isinstance(part, Mapping) else part for part in mixture)
-        return {**tables, "mixture": parts}
+        noise, mixture = _given(tables.get("noise", {})), tables.get("mixture")
+        if not isinstance(noise, Mapping) or not isinstance(mixture, list | tuple):
+            return tables
+        parts = [_given(part) for part in mixture]
+        return {
+            **tables,
+            "mixture": tuple({**noise, **part} if isinstance(part, Mapping) else part for part in parts),
+        }
 
     @pydantic.model_validator(mode="after")
     def _is_consistent(self) -> Self:

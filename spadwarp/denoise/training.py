@@ -118,9 +118,12 @@ def _prepared(run: Run, interrupted: threading.Event, notify: Callable[[str], No
         if run.workers.any(interrupted.is_set()):
             return False
         seconds = time.monotonic() - began
-        if not silent and notify is not None and seconds > _PATIENCE:
-            left = seconds * (total - drawn) / drawn
-            notify(f"drawing {total} samples before the first step, about {left:.0f} s{_advice(run.workers)}")
+        if not silent and notify is not None and seconds > _PATIENCE and drawn < total:
+            left = max(1.0, seconds * (total - drawn) / drawn)
+            notify(
+                f"{total - drawn} of {total} samples are still to be drawn before the next step, about {left:.0f} s"
+                f"{_advice(run.workers)}"
+            )
             silent = True
     return True
 

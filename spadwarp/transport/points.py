@@ -16,11 +16,11 @@ def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequenc
 
     Raises `ConfigError` for what does not go with several.
     """
-    import spadwarp_kernels as sk
-
     points = scene.transport.points_per_flight
     if points == 1:
         return points
+    import spadwarp_kernels as sk
+
     estimator = scene.transport.estimator
     against = {
         f'estimator = "{estimator}"': estimator != "guided",

@@ -1,11 +1,16 @@
 """The samples of a training: a pool that depends on seed and step alone, the mixture of its noises, its scenes."""
 
+import itertools
+import threading
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
-from spadwarp.denoise import samples
-from spadwarp.denoise.recipe import TrainingRecipe
+from spadwarp.denoise import samples, training
+from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
 from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
 from spadwarp.errors import DeviceError
@@ -21,6 +26,26 @@ MIXTURE[1]["open_water"] = 1.0
 def recipe(**changes):
     tables = {"model": "histograms", "seed": 4, "noise": {"counting": 1.0, "ambient": 0.4}, "mixture": MIXTURE}
     return TrainingRecipe.from_dict({**tables, "optimiser": {**OPTIMISER, **changes}})
+
+
+@pytest.mark.parametrize("sequence", [list, tuple])
+@pytest.mark.parametrize("noise", [{"counting": 1.0, "ambient": 0.4}, Noise(counting=1.0, ambient=0.4)])
+def test_parts_have_the_noise_of_the_recipe_from_python_too(sequence, noise):
+    """As tables, as objects, and as a recipe again; what a part gives itself stays."""
+    optimiser = Optimiser(pool=PORTIONS)
+    expected = recipe().mixture
+    objects = [Part(**{name: tuple(x) if isinstance(x, list) else x for name, x in one.items()}) for one in MIXTURE]
+    for mixture in (MIXTURE, objects):
+        found = TrainingRecipe(model="histograms", noise=noise, mixture=sequence(mixture), optimiser=optimiser)
+        assert found.mixture == expected
+        assert TrainingRecipe.model_validate(found) == found
+        assert TrainingRecipe.from_dict(found.model_dump()) == found
+
+
+@pytest.mark.parametrize("tables", [3, [], "histograms"])
+def test_what_is_no_table_is_refused(tables):
+    with pytest.raises(ValidationError):
+        TrainingRecipe.model_validate(tables)
 
 
 @pytest.fixture
@@ -138,3 +163,17 @@ def test_a_pool_beyond_the_memory_is_refused():
         DeviceError, match=r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
     ):
         pool(pool=9_000_000, crop=64)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(1.6, ["2 of 4 samples are still to be drawn before the next step, about 3 s"]), (0.8, [])]
+)
+def test_how_long_samples_take_is_said_only_if_some_are_left(monkeypatch, seconds, said):
+    """Once, more than three seconds after the start, and not at the last piece."""
+    clock, heard = itertools.count(0.0, seconds), []
+    monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
+    workers = SimpleNamespace(rank=0, is_cuda=True, any=bool)
+    pieces = SimpleNamespace(prepare=lambda step: ((drawn, 4) for drawn in (1, 2, 3, 4)))
+    run = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)
+    assert training._prepared(run, threading.Event(), heard.append)
+    assert heard == said
