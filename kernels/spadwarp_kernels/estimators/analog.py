@@ -19,7 +19,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
     if spec.port is not None:
         return Estimator(cross=_make_cross_port(spec, spec.port))
     reflecting = spec.reflecting
-    image_of, scatterings = spec.lens.image, _make_scatterings(spec.reflecting)
+    image_of, scatterings = spec.lens.image or spec.lens.project, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:
@@ -76,7 +76,7 @@ def _component(s: PhotonState) -> int:
 def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
     """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
     reflecting = spec.reflecting
-    image_of, leave, scatterings = spec.lens.image, port.leave, _make_scatterings(spec.reflecting)
+    image_of, leave, scatterings = spec.lens.image or spec.lens.project, port.leave, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross_port(s: PhotonState, camera: Camera, gate: Gate, limits: Limits) -> Contribution:

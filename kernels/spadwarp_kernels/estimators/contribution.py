@@ -302,7 +302,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """
     confocal, reflecting, merged, polarised = spec.confocal, spec.reflecting, spec.merged, spec.polarised
     water_extinction, collides = spec.water.extinction, flights and takes_collisions(spec)
-    image_of = spec.lens.image
+    image_of = spec.lens.image or spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec, flights)
     link_to, value_of = make_link(spec)
     in_water = spec.port is None

@@ -196,7 +196,7 @@ def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> w
     `flights`: whether requests may ask for a point of a flight, which is not scored by way of reflections: events are.
     """
     confocal, needs_way, derives = spec.confocal, spec.mesh or spec.varies, bool(spec.derivatives)
-    image_of = spec.lens.image
+    image_of = spec.lens.image or spec.lens.project
     scattering_density, way_of = make_scattering(spec), make_way(spec, brute_force)
     link_to, value_of = make_link(spec)
     flight_scores, leaving_scores = make_flight_scores(spec), make_leaving_scores(spec)

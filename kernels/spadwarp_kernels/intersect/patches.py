@@ -139,7 +139,7 @@ def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
         return v;
 #endif
     };
-    // As face_distance; the hair is that of the patch's farthest corner. One patch at a time, not two in a turn.
+    // As meet_planes; the hair is that of the patch's farthest corner. One patch at a time, not two in a turn.
     float nearest = reach, rate_there = 0.0f, side = 0.0f;
     int found = -1, row = 0;
     const int rows = patches.shape[0];

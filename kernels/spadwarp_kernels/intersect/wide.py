@@ -276,7 +276,7 @@ def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
             }
             if (node != -1) continue;
         } else {
-            // As face_distance.
+            // As meet_planes.
             const int slot = -2 - node;
             const row* f = reinterpret_cast<const row*>(faces.data) + 18 * (slot / 8);
             const row rate = f[8] * u[0] + f[9] * u[1] + f[10] * u[2];

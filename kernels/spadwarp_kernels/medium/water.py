@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.math.rotations import OFF_AXIS
@@ -17,8 +18,8 @@ class Medium:
         albedo: Single-scattering albedo b/c in [0, 1]; with random_albedo, the upper end of the uniform draw.
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
         axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
-            switches it off.
-        per_bit: -ln(2)/c [m], from `ready_medium`; 0 in vacuum.
+            switches it off, and is 2 where the transport kernel hands the medium to your functions.
+        per_bit: -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`.
         phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
     """
 
@@ -35,7 +36,7 @@ def ready_medium(medium: Medium) -> Medium:
     copy = Medium()
     for name in Medium.vars:
         setattr(copy, name, getattr(medium, name))
-    copy.axis_threshold = medium.axis_threshold if medium.axis_threshold < 1.0 else OFF_AXIS
+    copy.axis_threshold = medium.axis_threshold if np.float32(medium.axis_threshold) < 1.0 else OFF_AXIS
     copy.per_bit = -math.log(2.0) / medium.extinction if medium.extinction > 0.0 else 0.0
     return copy
 

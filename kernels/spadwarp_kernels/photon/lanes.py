@@ -164,8 +164,11 @@ ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
     int* size = static_cast<int*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + 4 * {_SIZE};
     if (act == 0) return atomicAdd(size, 1);
     __syncwarp();
-    // Each lane for itself: they meet in a vote before any adds an entry.
-    if (act == 1) return *size;
+    if (act == 1) {{
+        const int held = *size;
+        __syncwarp();  // all have read it before one adds an entry
+        return held;
+    }}
     if ((threadIdx.x & 31u) == 0u) *size = number;
     __syncwarp();
 #endif
@@ -175,6 +178,6 @@ def queue_size(memory: int, act: int, number: int) -> int:
     """The number of entries of the warp's queue; CUDA alone.
 
     ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see
-    what the entries hold; they must vote before one is added. SET_SIZE: all lanes together set it to a number.
+    what the entries hold. SET_SIZE: all lanes together set it to a number.
     """
     ...

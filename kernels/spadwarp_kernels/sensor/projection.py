@@ -20,14 +20,14 @@ class Lens(NamedTuple):
         view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
             or the pixel of a scan, shows.
         shows: As `in_view`, for such a view without a port.
-        image: As `project`, for a camera from `with_field`.
+        image: As `project`, for a camera that the transport kernel has prepared; None for `project` itself.
     """
 
     name: str
     project: wp.Function
     view: wp.Function
-    shows: wp.Function
-    image: wp.Function
+    shows: wp.Function = in_view
+    image: wp.Function | None = None
 
 
 @wp.func
@@ -53,5 +53,5 @@ def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
 PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain)
 """Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
 
-CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated, in_view, project_calibrated)
+CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
 """Focal lengths and principal point in pixels, Brown's distortion: all of `Camera`."""

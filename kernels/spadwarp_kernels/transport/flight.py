@@ -126,7 +126,7 @@ def make_depart(spec: TransportSpec, plan_flight: wp.Function | None, brute_forc
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
             met = nearest_patch(surfaces.patches, s.x, s.u, NOWHERE)
             s.surface_queries += 1
-            if met[0] < s.flight.distance:
+            if met[0] < wp.min(s.flight.distance, NOWHERE):  # in water as thin as vacuum a flight is longer than that
                 s.hit = patch_hit(surfaces, met)
             s.flight = shorten(s.flight, met[0])
 
