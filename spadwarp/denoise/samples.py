@@ -16,7 +16,7 @@ from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, pro
 from spadwarp.device import physical_memory
 from spadwarp.errors import DeviceError
 
-__all__ = ["Fresh", "Pool", "Samples", "Scenes"]
+__all__ = ["Fresh", "Pool", "Samples", "Scenes", "Sizes"]
 
 PORTIONS = 24
 """Portions of which a pool consists; each is drawn at once."""
@@ -34,10 +34,14 @@ class Scenes:
         rank: Number of this process, each of which draws its own.
         device: Of the scenes.
         given: Those of a dataset, which are the same in every step.
+        crop: Side of the crops that are cut from them [pixels]; default: the recipe's.
     """
 
-    def __init__(self, recipe: TrainingRecipe, rank: int, device: torch.device, given: CleanScenes | None) -> None:
+    def __init__(
+        self, recipe: TrainingRecipe, rank: int, device: torch.device, given: CleanScenes | None, crop: int = 0
+    ) -> None:
         self.recipe, self.rank, self.device = recipe, rank, device
+        self.crop = crop or recipe.optimiser.crop
         self.given = None if given is None else given.to(device)
         self.drawn: tuple[int, CleanScenes] | None = None
 
@@ -49,7 +53,7 @@ class Scenes:
         turn = step // settings.redraw
         if self.drawn is None or self.drawn[0] != turn:
             seed = (self.recipe.seed * 1_000_003 + turn) * 4096 + self.rank
-            scenes = procedural_scenes(settings.scenes, settings.crop + 32, seed=seed % 2**62, device=self.device)
+            scenes = procedural_scenes(settings.scenes, self.crop + 32, seed=seed % 2**62, device=self.device)
             self.drawn = turn, scenes
         return self.drawn[1]
 
@@ -100,7 +104,7 @@ class Fresh:
         scenes = self.held or self.now
         assert scenes is not None
         return draw_batch(
-            scenes, self.recipe.noise, size=self.size, crop=self.recipe.optimiser.crop, generator=self.generator,
+            scenes, self.recipe.noise, size=self.size, crop=self.scenes.crop, generator=self.generator,
             histograms=self.histograms,
         )  # fmt: skip
 
@@ -114,38 +118,26 @@ class Pool:
 
     Args:
         recipe: See `spadwarp.denoise.recipe`.
-        scenes: Clean scenes of each step.
+        scenes: Clean scenes of each step, and the side of their crops.
         size: Samples of a batch.
         generator: Chooses the samples of each batch.
-        share: Part of the pool that this process has.
-
-    Raises:
-        DeviceError: The pool is larger than the memory of the device.
+        share: Part of the recipe's number of samples that this pool has.
+        turns: Part of the steps that take a batch of this pool.
     """
 
     def __init__(
-        self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, share: float = 1.0
-    ) -> None:
+        self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, *, share: float = 1.0,
+        turns: float = 1.0,
+    ) -> None:  # fmt: skip
         settings = recipe.optimiser
         self.recipe, self.scenes, self.size, self.generator = recipe, scenes, size, generator
         self.portion = max(1, round(share * settings.pool / PORTIONS))
-        self.interval = max(1, round(settings.uses * self.portion / size))
+        self.interval = max(1, round(settings.uses * self.portion / size / turns))
         self.piece = self.portion if generator.device.type == "cuda" else min(_PIECE, self.portion)
         self.parts = recipe.parts()
         self.drawn, self.seconds = 0, 0.0
         self.filled = torch.zeros((), device=generator.device)
         self.memory: Batch | None = None
-        self._check_memory()
-
-    def _check_memory(self) -> None:
-        settings, device = self.recipe.optimiser, self.generator.device
-        needed = 4 * PORTIONS * self.portion * settings.crop**2 * (3 + FEATURES + 2)
-        available = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else physical_memory()
-        if available is not None and needed > available:
-            raise DeviceError(
-                f"optimiser.pool = {settings.pool} with optimiser.crop = {settings.crop} needs {needed / 2**30:.1f} "
-                f"GiB on {device}; {available / 2**30:.1f} GiB are available"
-            )
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         due = _FIRST + step // self.interval
@@ -169,7 +161,8 @@ class Pool:
 
     @torch.no_grad()
     def _draw(self, number: int, scenes: CleanScenes) -> Iterator[int]:
-        host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number))
+        wide = (self.scenes.crop,) if self.scenes.crop != self.recipe.optimiser.crop else ()
+        host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number, *wide))
         part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
         seed = int(host.integers(2**62))
         generator = torch.Generator(self.generator.device).manual_seed(seed)
@@ -181,7 +174,7 @@ class Pool:
         first = number % PORTIONS * self.portion
         for done in range(0, self.portion, self.piece):
             new = draw_batch(
-                scenes, part, size=min(self.piece, self.portion - done), crop=self.recipe.optimiser.crop,
+                scenes, part, size=min(self.piece, self.portion - done), crop=self.scenes.crop,
                 generator=generator, histograms=True,
             )  # fmt: skip
             if is_crowded:
@@ -193,6 +186,71 @@ class Pool:
                 kept[first + done : first + done + len(values)] = values
             yield done + len(new.frame)
         self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
+
+
+class Sizes:
+    """The samples of a training by the size of their crops: each step takes a batch of one size.
+
+    In `optimiser.wide` of the steps, drawn at random, it is a quarter as many crops of twice the recipe's side: with
+    small crops alone, the network would never see a pixel far from the border of its image.
+
+    Args:
+        recipe: See `spadwarp.denoise.recipe`.
+        rank: Number of this process.
+        processes: That share the batches.
+        generator: Of random numbers on the training's device.
+        given: Scenes of a dataset; without them, scenes are drawn.
+        histograms: Samples are of histograms.
+
+    Raises:
+        DeviceError: A pool is larger than the memory of the device.
+    """
+
+    def __init__(
+        self, recipe: TrainingRecipe, rank: int, processes: int, generator: torch.Generator,
+        given: CleanScenes | None, *, histograms: bool,
+    ) -> None:  # fmt: skip
+        settings = recipe.optimiser
+        self.recipe, self.kinds = recipe, list[Samples]()
+        if settings.pool:
+            _check_memory(recipe, generator.device, processes)
+        for turns, scale in ((1.0 - settings.wide, 1), (settings.wide, 2)):
+            if turns > 0.0:
+                scenes = Scenes(recipe, rank, generator.device, given, scale * settings.crop)
+                size = max(1, settings.batch // processes // scale**2)
+                share = turns / scale**2 / processes
+                self.kinds.append(
+                    Pool(recipe, scenes, size, generator, share=share, turns=turns)
+                    if settings.pool
+                    else Fresh(recipe, scenes, size, generator, histograms=histograms)
+                )
+
+    def prepare(self, step: int) -> Iterator[tuple[int, int]]:
+        """See `Samples`; of all sizes."""
+        for kind in self.kinds:
+            yield from kind.prepare(step)
+
+    @property
+    def seconds(self) -> float:
+        """See `Samples`; of all sizes together."""
+        return sum(kind.seconds for kind in self.kinds)
+
+    def of(self, step: int) -> Samples:
+        """Those of which the step takes a batch; the same in every process."""
+        if len(self.kinds) == 1:
+            return self.kinds[0]
+        return self.kinds[int(np.random.default_rng((self.recipe.seed, step)).random() < self.recipe.optimiser.wide)]
+
+
+def _check_memory(recipe: TrainingRecipe, device: torch.device, processes: int) -> None:
+    settings = recipe.optimiser
+    needed = 4 * settings.pool / processes * settings.crop**2 * (3 + FEATURES + 2)
+    available = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else physical_memory()
+    if available is not None and needed > available:
+        raise DeviceError(
+            f"optimiser.pool = {settings.pool} with optimiser.crop = {settings.crop} needs {needed / 2**30:.1f} "
+            f"GiB on {device}; {available / 2**30:.1f} GiB are available"
+        )
 
 
 def in_open_water(scenes: CleanScenes) -> CleanScenes:

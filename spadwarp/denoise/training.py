@@ -18,7 +18,6 @@ from torch import nn
 from spadwarp.denoise.networks import reads_histograms
 from spadwarp.denoise.recipe import Noise, TrainingRecipe
 from spadwarp.denoise.repeatable import fixed_order
-from spadwarp.denoise.samples import Scenes
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training_steps import Run, Trained, Workers
 from spadwarp.errors import ConfigError
@@ -69,18 +68,20 @@ def fit(
     """
     workers = Workers(device)
     settings = recipe.optimiser
-    if training is not None and settings.crop > min(training.depth.shape[1:]):
-        raise ConfigError(f"optimiser.crop = {settings.crop} is outside [32, {min(training.depth.shape[1:])}]")
+    if training is not None:
+        scale = 2 if settings.wide else 1
+        most, why = min(training.depth.shape[1:]) // scale, f" with optimiser.wide = {settings.wide}" * (scale - 1)
+        if settings.crop > most:
+            raise ConfigError(f"optimiser.crop = {settings.crop}{why} is outside [32, {most}]")
     if settings.batch % workers.size:
         raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {workers.size} processes")
     Path(out).mkdir(parents=True, exist_ok=True)
-    scenes = Scenes(recipe, workers.rank, workers.device, training)
     if validation is None:
         validation = procedural_scenes(
             64 if workers.is_cuda else 8, settings.crop + 32, seed=_VALIDATION_SEED, device=workers.device
         )
     validation = validation.to(workers.device)
-    run = Run(recipe, Path(out), workers, scenes)
+    run = Run(recipe, Path(out), workers, training)
     first, spent = run.step, 0.0
     psnr: dict[float, float] = {}
     with interruptible() as interrupted:

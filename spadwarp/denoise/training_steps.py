@@ -19,7 +19,8 @@ from spadwarp.denoise.losses import loss_of
 from spadwarp.denoise.network_files import load_network, torch_device
 from spadwarp.denoise.networks import build_network, reads_histograms
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.denoise.samples import Fresh, Pool, Samples, Scenes
+from spadwarp.denoise.samples import Samples, Sizes
+from spadwarp.denoise.synthetic_noise import CleanScenes
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.atomic import atomic_path
 from spadwarp.limits import environment_integer
@@ -132,7 +133,7 @@ class Workers:
 class Run:
     """Network, optimiser and files of a training; resumes from the checkpoint in its folder."""
 
-    def __init__(self, recipe: TrainingRecipe, folder: Path, workers: Workers, scenes: Scenes) -> None:
+    def __init__(self, recipe: TrainingRecipe, folder: Path, workers: Workers, given: CleanScenes | None) -> None:
         self.recipe, self.folder, self.workers = recipe, folder, workers
         self.log, self.checkpoint = folder / "log.jsonl", folder / "checkpoint.pt"
         torch.manual_seed(recipe.seed)
@@ -151,18 +152,16 @@ class Run:
             weight_decay=decay, betas=(0.9, 0.99), fused=workers.is_cuda, capturable=workers.is_cuda,
         )  # fmt: skip
         self.generator = torch.Generator(workers.device).manual_seed(recipe.seed * 1009 + workers.rank)
-        size, makes_features = recipe.optimiser.batch // workers.size, reads_histograms(network)
-        self.samples: Samples = (
-            Pool(recipe, scenes, size, self.generator, share=1.0 / workers.size)
-            if recipe.optimiser.pool
-            else Fresh(recipe, scenes, size, self.generator, histograms=makes_features)
+        self.samples = Sizes(
+            recipe, workers.rank, workers.size, self.generator, given, histograms=reads_histograms(network)
         )
         self.state = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
         self.loss_sum = torch.zeros((), device=workers.device)  # of the steps since the last report
         self.step, spent = self._resume()
-        self.steps_here, self.recorded = 0, False
-        self.graph: Any = None
-        self.graph_loss = torch.zeros(())
+        self.steps_here = 0
+        self.eager: dict[Samples, int] = {}  # steps by the size of their samples, as long as none is recorded
+        self.recorded: set[Samples] = set()
+        self.graphs: dict[Samples, tuple[Any, Tensor]] = {}  # the recorded step and its loss
         self.side: Any = torch.cuda.Stream() if workers.is_cuda else None
         self.last_report, self.timed_from = time.monotonic(), self.step
         self.began = self.last_report - spent
@@ -230,46 +229,48 @@ class Run:
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        if self.graph is not None:
-            self.graph.replay()
-            loss = self.graph_loss
+        samples = self.samples.of(self.step)
+        if samples in self.graphs:
+            graph, loss = self.graphs[samples]
+            graph.replay()
         elif self.workers.is_cuda:
             side = self.side
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
-                loss = self._work()
+                loss = self._work(samples)
             torch.cuda.current_stream().wait_stream(side)
         else:
-            loss = self._work()
+            loss = self._work(samples)
         self.loss_sum += loss
         self.step += 1
         self.steps_here += 1
-        settled = self.steps_here >= _EAGER and self.step > self.recipe.optimiser.warm_up + 1
-        if self.side is not None and self.workers.size == 1 and settled and not self.recorded:
-            self.recorded = True
-            self._capture()
+        self.eager[samples] = self.eager.get(samples, 0) + 1
+        settled = self.eager[samples] >= _EAGER and self.step > self.recipe.optimiser.warm_up + 1
+        if self.side is not None and self.workers.size == 1 and settled and samples not in self.recorded:
+            self.recorded.add(samples)
+            self._capture(samples)
 
-    def _capture(self) -> None:
+    def _capture(self, samples: Samples) -> None:
         """Records a step as a CUDA graph; where that fails, training goes on step by step."""
-        self.samples.hold()
+        samples.hold()
         graph = torch.cuda.CUDAGraph()
         torch.cuda.synchronize()
         try:
             graph.register_generator_state(self.generator)
             self.optimiser.zero_grad(set_to_none=True)
             with torch.cuda.graph(graph):
-                self.graph_loss = self._work()
+                loss = self._work(samples)
         except (RuntimeError, AttributeError) as error:
             warnings.warn(f"no CUDA graph of a training step: {error}", stacklevel=2)
             torch.cuda.synchronize()
             return
-        self.graph = graph
+        self.graphs[samples] = graph, loss
 
-    def _work(self) -> Tensor:
+    def _work(self, samples: Samples) -> Tensor:
         settings, workers = self.recipe.optimiser, self.workers
         precision = torch.bfloat16 if settings.precision == "bfloat16" and workers.is_cuda else torch.float32
         self.learner.train()
-        batch = self.samples.batch()
+        batch = samples.batch()
         mixed = precision != torch.float32
         with torch.autocast(workers.device.type, dtype=precision, enabled=mixed, cache_enabled=False):
             output = self.learner(batch.frame.contiguous(memory_format=torch.channels_last))

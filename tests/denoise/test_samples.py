@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from spadwarp.denoise import samples, training
 from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
-from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, crowded, in_open_water
+from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, Sizes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
 from spadwarp.errors import DeviceError
 
@@ -67,6 +67,11 @@ def pool(**changes):
     return Pool(chosen, Scenes(chosen, 0, CPU, None), chosen.optimiser.batch, torch.Generator().manual_seed(1))
 
 
+def sizes(**changes):
+    chosen = recipe(**changes)
+    return Sizes(chosen, 0, 1, torch.Generator().manual_seed(1), None, histograms=True)
+
+
 def prepare(ours, step):
     return list(ours.prepare(step))
 
@@ -94,6 +99,31 @@ def test_a_sample_is_used_as_often_as_asked(drawn):
         prepare(ours, step)
     taken = steps * ours.batch().frame.shape[0]
     assert taken / sum(size for _, _, size in drawn[before:]) == pytest.approx(OPTIMISER["uses"], rel=0.02)
+
+
+def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):
+    """As often as asked, with as many pixels a step, and with samples that are used as often as the others."""
+    ours, steps = sizes(batch=16, wide=0.25, pool=16 * PORTIONS), 800
+    narrow, wide = ours.kinds
+    assert (narrow.size, wide.size) == (16, 4)
+    assert (narrow.scenes.crop, wide.scenes.crop) == (32, 64)
+    first, before, taken = 300, 0, {32: 0, 64: 0}
+    for step in range(first, first + steps + 1):
+        prepare(ours, step)
+        if step == first:
+            before = len(drawn)
+        else:
+            taken[ours.of(step).scenes.crop] += ours.of(step).size
+    assert abs(taken[64] / 4 / steps - 0.25) < 4 * np.sqrt(0.25 * 0.75 / steps)
+    for crop, some in taken.items():
+        new = sum(size for scenes, _, size in drawn[before:] if scenes.depth.shape[-1] == crop + 32)
+        assert some / new == pytest.approx(OPTIMISER["uses"], rel=0.15)  # portions are of whole samples
+
+
+def test_without_them_all_steps_learn_from_the_same_size(drawn):
+    assert len(sizes().kinds) == 1
+    whole = sizes(wide=1.0).kinds
+    assert [kind.scenes.crop for kind in whole] == [64]
 
 
 def test_a_pool_takes_only_samples_that_were_drawn(drawn):
@@ -162,7 +192,7 @@ def test_a_pool_beyond_the_memory_is_refused():
     with pytest.raises(
         DeviceError, match=r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
     ):
-        pool(pool=9_000_000, crop=64)
+        sizes(pool=9_000_000, crop=64)
 
 
 @pytest.mark.parametrize(
