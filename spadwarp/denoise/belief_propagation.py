@@ -9,9 +9,11 @@ reflected frames give the same answer.
 
 from __future__ import annotations
 
+from functools import partial
+
 from torch import Tensor
 
-from spadwarp.denoise.semi_global import messages
+from spadwarp.denoise.semi_global import messages, rows_and_columns
 
 __all__ = ["JUMPS", "beliefs"]
 
@@ -36,8 +38,9 @@ def beliefs(score: Tensor, jump: Tensor, more: tuple[Tensor, Tensor] | None = No
         ahead = (jump + more[0][..., None]).clamp_min(_LEAST)
         beside = (jump + more[1].transpose(1, 2)[..., None]).clamp_min(_LEAST)
     rows = columns = score.new_zeros(())
+    send = partial(messages, slope=_SLOPE)
     for _ in range(_ROUNDS):
-        along = messages(score + columns, slope=_SLOPE, jump=ahead)
-        across = messages((score + rows).transpose(1, 2), slope=_SLOPE, jump=beside).transpose(1, 2)
-        rows, columns = along, across
+        told = score + columns, (score + rows).transpose(1, 2)
+        rows, columns = rows_and_columns(send, told, (ahead, beside))
+        columns = columns.transpose(1, 2)
     return (rows + columns).add_(score)
