@@ -262,7 +262,8 @@ def train(folder, *, progress=None, **changes):
     return fit(recipe, scenes(), scenes(), folder, device="cpu", progress=progress)
 
 
-def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path):
+@pytest.mark.parametrize("wide", [0.0, 0.5])
+def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path, wide):
     """After a checkpoint of the first step (Ctrl-C), one between two reports (SIGTERM), and one that died after it."""
 
     class Death(Exception):
@@ -274,14 +275,15 @@ def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path):
     def die():
         raise Death
 
-    whole = train(tmp_path / "whole")
+    optimiser = {**OPTIMISER, "wide": wide}
+    whole = train(tmp_path / "whole", optimiser=optimiser)
     for step, number in ((1, signal.SIGINT), (4, signal.SIGTERM)):
         with pytest.raises(KeyboardInterrupt, match=rf"interrupted at step {step} of 6; .*checkpoint\.pt"):
-            train(tmp_path / "parts", progress=at(step, lambda n=number: signal.raise_signal(n)))
+            train(tmp_path / "parts", progress=at(step, lambda n=number: signal.raise_signal(n)), optimiser=optimiser)
         assert torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["step"] == step
     with pytest.raises(Death):
-        train(tmp_path / "parts", progress=at(5, die))
-    parts = train(tmp_path / "parts")
+        train(tmp_path / "parts", progress=at(5, die), optimiser=optimiser)
+    parts = train(tmp_path / "parts", optimiser=optimiser)
     for name, values in load_file(whole.weights).items():
         assert torch.equal(values, load_file(parts.weights)[name]), name
     lines = [json.loads(line) for line in parts.log.read_text().splitlines()]
