@@ -107,7 +107,7 @@ class Optimiser(_Table):
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
     batch: Whole = Field(64, ge=1, le=10**6, description="crops per update, on all GPUs together")
     crop: Whole = Field(96, ge=32, le=16384, description="side of a crop [pixels]")
-    wide: Share = Field(0.0, description="part of the updates that learn from a quarter as many crops of twice the side")
+    wide: Share = Field(0.0, description="part of the updates with a quarter as many crops of twice the side")
     scenes: Whole = Field(512, ge=1, le=10**6, description="scenes that are drawn at a time; without a dataset")
     redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")
     learning_rate: float = Field(1e-3, ge=1e-12, le=1e3, description="highest; decreases along a cosine to a hundredth")
