@@ -45,7 +45,7 @@ def _messages(probability: Tensor, odds: Tensor) -> Tensor:
     """Logarithms of what the pixels of a row before and behind each tell it, the sum of both, `[B, H, W, T]`."""
     lines, most = probability.flatten(0, 1), odds.flatten(0, 1)
     received, last = torch.ones_like(lines), lines.shape[1] - 1
-    most = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
+    apart = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
     # Views are made once, as in `spadwarp.denoise.semi_global`.
     told, heard = lines.unbind(dim=1), received.unbind(dim=1)
     known = lines.new_empty(2, len(lines), lines.shape[2])
@@ -59,7 +59,7 @@ def _messages(probability: Tensor, odds: Tensor) -> Tensor:
         ahead.copy_(known)
         farther.add_(from_nearer, alpha=_NEXT)
         nearer.add_(from_farther, alpha=_NEXT)
-        ahead.mul_(1.0 / (1.0 + 2.0 * _NEXT)).add_(most[place])
+        ahead.mul_(1.0 / (1.0 + 2.0 * _NEXT)).add_(apart[place])
         ahead /= ahead.amax(dim=-1, keepdim=True)
         heard[place + 1].mul_(sent[0])
         heard[last - place - 1].mul_(sent[1])
