@@ -65,7 +65,8 @@ class DeviceWorker:
             if batch_size and gradients is not None:
                 self._gradient_batches = sk.Batches(gradients, len(COMPONENTS), signed=True)
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
-            sk.load_transport_kernel(spec, model.device)
+            most = min(launch_size, batch_size or launch_size)
+            sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
         self._names, self._channels = derivatives, channels
         self._closed: tuple[dict[str, int], ...] | None = None  # ledger and counters of the batches
         self._moments: dict[str, int] = {}

@@ -108,7 +108,8 @@ def build_model(
     if scene.polarised:
         model = polarised_model(model, scene, mesh)
     if camera:
-        _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
+        spare = _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
+        model = dataclasses.replace(model, low_words=spare)
     return model
 
 
@@ -362,8 +363,9 @@ def _has_rotated_domain(scene: Scene) -> bool:
     return scene.domain.shape != "unbounded" and any(scene.camera.rotation_deg)
 
 
-def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> None:
-    """Refuses what cannot fit before anything is computed."""
+def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bool:
+    """Refuses what cannot fit before anything is computed; returns whether half as much again would, which is more than
+    the low words of the histograms take."""
     camera, size = scene.camera, model.tally_size
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
     if signed and size * signed >= 2**31:
@@ -380,3 +382,4 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> No
         raise DeviceError(
             f"{shape} need {needed:.1f} GiB on {model.device.alias}; {available / 2**30:.1f} GiB are available"
         )
+    return available is None or 1.5 * needed <= available / 2**30

@@ -292,12 +292,12 @@ class AddedScores:
 
 
 @made_once
-def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
+def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool, low_words: bool) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
-    polarisation, tally, gradients, ledger, pending_add, thread, scale) -> AddedScores`` that scores an event by way
-    of all images; arguments as of `make_score_image`."""
+    polarisation, tally, low, gradients, ledger, pending_add, thread, scale) -> AddedScores`` that scores an event by
+    way of all images; arguments as of `make_score_image`."""
     score_image = make_score_image(spec, flights, brute_force)
-    deposit = make_deposit(spec.signed)
+    deposit = make_deposit(spec.signed, 0, low_words)
 
     @wp.func
     def score_images(
@@ -312,6 +312,7 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
         derivatives: Derivatives,
         polarisation: Polarisation,
         tally: wp.array(dtype=wp.int64),
+        low: wp.array(dtype=wp.uint32),
         gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         pending_add: wp.vec2l,
@@ -330,6 +331,7 @@ def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool) -> 
                     scores.contributions += 1
                     scores.pending_add = deposit(
                         tally,
+                        low,
                         gradients,
                         ledger,
                         scores.pending_add,

@@ -75,10 +75,11 @@ def make_ask_flight(request_flight: wp.Function | None, push: wp.Function) -> wp
 
 
 @made_once
-def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function) -> wp.Function:
+def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function, low_words: bool) -> wp.Function:
     """The Warp function with the arguments of `make_score_images` that scores a flight at all points but the first,
     where each thread scores its own requests; shadow rays are traced on the spot."""
-    points, point_of, deposit = spec.points, make_point_of(spec.points), make_deposit(spec.signed)
+    points, point_of = spec.points, make_point_of(spec.points)
+    deposit = make_deposit(spec.signed, 0, low_words)
     has_mesh = spec.mesh
 
     @wp.func
@@ -94,6 +95,7 @@ def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function
         derivatives: Derivatives,
         polarisation: Polarisation,
         tally: wp.array(dtype=wp.int64),
+        low: wp.array(dtype=wp.uint32),
         gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         pending_add: wp.vec2l,
@@ -119,7 +121,15 @@ def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function
                             found.seen = hit.face < 0
                     if found.seen and not found.contribution.value <= 0.0:
                         scores.pending_add = deposit(
-                            tally, gradients, ledger, scores.pending_add, thread, scale, derivatives, found.contribution
+                            tally,
+                            low,
+                            gradients,
+                            ledger,
+                            scores.pending_add,
+                            thread,
+                            scale,
+                            derivatives,
+                            found.contribution,
                         )
         return scores
 

@@ -24,6 +24,7 @@ from spadwarp_kernels.math.once import made_once
 
 from .blocks import Blocks, met_count, met_entry, score_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
+from .low_words import add_to_words
 from .tally import DEPOSIT_LIMIT, Contribution, Scores, deposit
 
 # What a derivative may be with respect to, and the range of such a parameter: a at fixed b, b at fixed a, the mean
@@ -105,11 +106,11 @@ def _numbers_of_parts(name: str, values: Any, device: wp.Device) -> wp.array:
 
 
 @made_once
-def make_deposit(count: int, kinds: int = 0) -> wp.Function:
-    """The Warp function ``(tally, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
+def make_deposit(count: int, kinds: int = 0, low_words: bool = False) -> wp.Function:
+    """The Warp function ``(tally, low, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
     `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many
     derivatives, and after them of so many kinds of derivatives by block; rounded down after the rounding sample is
-    added, so that the mean is kept."""
+    added, so that the mean is kept. With `low_words`, those of the tally are in `low`."""
 
     @wp.func
     def deposit_scored(
@@ -131,6 +132,7 @@ def make_deposit(count: int, kinds: int = 0) -> wp.Function:
     @wp.func
     def deposit_derived(
         tally: wp.array(dtype=wp.int64),
+        low: wp.array(dtype=wp.uint32),
         gradients: wp.array(dtype=wp.int64),
         ledger: wp.array(dtype=wp.int64),
         pending: wp.vec2l,
@@ -153,6 +155,11 @@ def make_deposit(count: int, kinds: int = 0) -> wp.Function:
                             units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
                             p = wp.static(count) + q * blocks.count + k
                             deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
+        if wp.static(low_words):
+            units = c.value * scale
+            if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
+                add_to_words(tally, low, c.index, wp.int64(units + c.rounding_sample))
+                return pending
         return deposit(tally, ledger, pending, thread, scale, c)
 
     return deposit_derived

@@ -87,10 +87,11 @@ FEWER_START_LANES = 3
 
 
 @made_once
-def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote.
+    On CUDA they must be a multiple of the block size, since whole warps vote. `low_words`: on CUDA, those of the tally
+    are apart, see `tally.low_words`.
 
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
@@ -129,12 +130,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
     warp_memory, push, pop = make_queue(
         flights, queues, asks_twice, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points, short
     )
-    deposit = make_deposit(spec.signed, len(spec.blocks))
+    deposit = make_deposit(spec.signed, len(spec.blocks), low_words)
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
     ask_flight = make_ask_flight(request_flight, make_push_points(spec.points, push))
-    score_more, scores_more = make_score_images(spec, flights, brute_force), reflecting
+    score_more, scores_more = make_score_images(spec, flights, brute_force, low_words), reflecting
     if spec.points > 1 and not queues:
-        score_more, scores_more = make_score_points(spec, score, look), True
+        score_more, scores_more = make_score_points(spec, score, look, low_words), True
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
 
@@ -170,6 +171,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
         out: Records,
         cursor: wp.array(dtype=int),
         offset: wp.array(dtype=wp.uint64),
+        low: wp.array(dtype=wp.uint32),
     ):
         lane = wp.tid() % wp.static(32 if cuda else 1)  # on the CPU one thread moves all photons
         thread = ledger_slot(wp.tid(), first_id)
@@ -221,7 +223,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                             if not crossing.value <= 0.0:
                                 s.contributions += 1
                                 s.pending_add = deposit(
-                                    tally, gradients, ledger, s.pending_add, thread, scale, derivatives, crossing
+                                    tally, low, gradients, ledger, s.pending_add, thread, scale, derivatives, crossing
                                 )
                         end = collide(s, medium, layers, limits)
                         s.scores = fly_history(s.scores, derivatives, layers, s.x, s.u, end.distance)
@@ -268,7 +270,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     c = found.contribution
                                     if not c.value <= 0.0:
                                         s.pending_add = deposit(
-                                            tally, gradients, ledger, s.pending_add, thread, scale, derivatives, c
+                                            tally, low, gradients, ledger, s.pending_add, thread, scale, derivatives, c
                                         )
                                 else:
                                     s.hidden = True
@@ -277,8 +279,9 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                                     s.pending = found.contribution
                             if wp.static(scores_more):
                                 more = score_more(
-                                    asked.request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
-                                    polarisation, tally, gradients, ledger, s.pending_add, thread, scale)  # fmt: skip
+                                    asked.request, medium, layers, camera, gate, limits, surfaces, scan,
+                                    derivatives, polarisation, tally, low, gradients, ledger, s.pending_add, thread,
+                                    scale)  # fmt: skip
                                 s.contributions += more.contributions
                                 s.shadow_queries += more.shadow_queries
                                 s.pending_add = more.pending_add
@@ -387,7 +390,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False) -> wp.Kernel:
                         s.hidden = False
                         if s.walk.found < 0:
                             s.pending_add = deposit(
-                                tally, gradients, ledger, s.pending_add, thread, scale, derivatives, s.pending
+                                tally, low, gradients, ledger, s.pending_add, thread, scale, derivatives, s.pending
                             )
                     s.ray = NO_RAY
 

@@ -1,0 +1,153 @@
+"""Low words of a large tally: who keeps them apart, and that the sums are those of additions of 64 bits."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import spadwarp
+import spadwarp_kernels as sk
+from helpers.scenes import scene
+from helpers.statistics_of_samples import DEVICES
+from spadwarp.device import pick_device
+from spadwarp.mesh import build_mesh
+from spadwarp.transport.model import build_model, transport_spec
+from spadwarp_kernels.tally.low_words import add_to_words, fold_low_words
+from spadwarp_kernels.transport.launch import uses_low_words
+
+MANY_FACES = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
+PENCIL = {
+    "laser": {"profile": "collimated", "position": [0.0, 0.0, 0.0]},
+    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 50.0},
+    "gate": {"bins": 1, "bin_width_ps": 8 * 3335.64095},
+}
+CASES = {
+    "water": {"targets": [], "transport": {"estimator": "next_event"}},
+    "plate": {"transport": {"estimator": "guided"}},
+    "analog": {"transport": {"estimator": "analog"}},
+    "tree": {"targets": [MANY_FACES], "transport": {"estimator": "next_event"}},
+    "guided tree": {"targets": [MANY_FACES], "transport": {"estimator": "guided"}},
+    "points": {"targets": [MANY_FACES], "transport": {"estimator": "guided", "points_per_flight": 3}},
+    "pencil": PENCIL,
+}
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """Low words pay for every tally."""
+    monkeypatch.setattr("spadwarp_kernels.tally.low_words.CACHE_BYTES", 0)
+    monkeypatch.setattr("spadwarp_kernels.tally.low_words.PHOTONS_PER_VOXEL", 0)
+
+
+def built(sections, device):
+    one = scene(**sections)
+    mesh = build_mesh(one)
+    return transport_spec(one, mesh), build_model(one, pick_device(device), mesh)
+
+
+def tally_of(spec, model, launches=2, photons=100_000):
+    data = sk.make_data(model)
+    sums = []
+    for i in range(launches):
+        sk.launch_transport(spec, model, data, seed=3, first_id=i * photons, photon_count=photons)
+        sums.append(data.tally.numpy())
+    return sums, data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
+    spec, model = built(CASES[case], device)
+    assert model.low_words
+    sums, data = tally_of(spec, model)
+    expected, plain = tally_of(spec, dataclasses.replace(model, low_words=False))
+    for found, other in zip(sums, expected, strict=True):
+        np.testing.assert_array_equal(found, other)
+    assert plain.low_words is None and expected[0].max() > 2**32
+    if device == "cpu":
+        assert data.low_words is None
+    else:
+        assert data.low_words.shape == data.tally.shape and not data.low_words.numpy().any()
+
+
+@wp.kernel
+def add_kernel(
+    voxel: wp.array(dtype=int),
+    value: wp.array(dtype=wp.int64),
+    tally: wp.array(dtype=wp.int64),
+    low_words: wp.array(dtype=wp.uint32),
+):
+    i = wp.tid()
+    add_to_words(tally, low_words, voxel[i], value[i])
+
+
+@pytest.mark.parametrize("device", DEVICES[1:])
+def test_carries_and_values_of_more_than_32_bits(device):
+    """Each voxel has 10^5 contributions of 1 to 42 bits, so that its low word goes round some thousand times."""
+    random = np.random.default_rng(1)
+    voxels = random.integers(0, 4, 400_000).astype(np.int32)
+    values = random.integers(0, 1 << random.integers(1, 43, voxels.size))
+    values[:5] = 2**32 - 1, 1, 2**32, 2**33 + 5, 2**58
+    start = np.array([0, 2**32 - 1, 2**50, 7])
+    expected = start.copy()
+    np.add.at(expected, voxels, values)
+    tally = wp.array(start, dtype=wp.int64, device=device)
+    low_words = wp.zeros(4, dtype=wp.uint32, device=device)
+    inputs = [wp.array(array, device=device) for array in (voxels, values)]
+    wp.launch(add_kernel, dim=voxels.size, inputs=[*inputs, tally, low_words], device=device)
+    fold_low_words(low_words, tally)
+    np.testing.assert_array_equal(tally.numpy(), expected)
+    assert not low_words.numpy().any()
+
+
+def test_words_are_folded_once(device):
+    tally = wp.array([5, 2**40, 0], dtype=wp.int64, device=device)
+    low_words = wp.array(np.array([0, 2**32 - 1, 7], np.uint32), dtype=wp.uint32, device=device)
+    for _ in range(2):
+        fold_low_words(low_words, tally)
+        assert tally.numpy().tolist() == [5, 2**40 + 2**32 - 1, 7]
+
+
+LARGE = 64 * 64 * 2048  # voxels of a component, 67 MB
+
+
+@pytest.mark.parametrize(
+    ("chosen", "spec", "changes", "photons"),
+    [
+        (True, {}, {}, 1 << 26),
+        (True, {"estimator": "guided", "mesh": True}, {}, 4 * LARGE),
+        (True, {"merged": True}, {}, 1 << 26),
+        (False, {}, {}, 4 * LARGE - 1),
+        (False, {}, {"tally_size": 3 * LARGE // 2}, 1 << 26),
+        (False, {}, {"low_words": False}, 1 << 26),
+        (False, {}, {"device": SimpleNamespace(is_cuda=False)}, 1 << 26),
+        (False, {"estimator": "none"}, {}, 1 << 26),
+        (False, {"derivatives": ("absorption",)}, {}, 1 << 26),
+        (False, {"channels": 2, "polarised": True}, {}, 1 << 26),
+        (False, {"blocks": ("absorption",)}, {}, 1 << 26),
+    ],
+)
+def test_large_launches_into_large_tallies_on_a_gpu_keep_them(chosen, spec, changes, photons):
+    fields = {"low_words": True, "device": SimpleNamespace(is_cuda=True), "tally_size": 3 * LARGE}
+    model = SimpleNamespace(**{**fields, **changes})
+    assert uses_low_words(sk.TransportSpec(**{"estimator": "next_event", **spec}), model, photons) is chosen
+
+
+def test_only_where_their_memory_is_left(monkeypatch):
+    """Half as much again as the histograms take, on the CPU 16 bytes a voxel with copy and total."""
+    needed = 16 * 3 * 4 * 4 * 8
+    for part, fits in ((1.6, True), (1.4, False)):
+        monkeypatch.setattr("spadwarp.transport.model.physical_memory", lambda part=part: part * needed)
+        assert built({}, "cpu")[1].low_words is fits
+    monkeypatch.setattr("spadwarp.transport.model.physical_memory", lambda: 0.9 * needed)
+    with pytest.raises(spadwarp.DeviceError, match="are available"):
+        built({}, "cpu")
+
+
+def test_words_of_another_length_are_refused():
+    spec, model = built({}, "cpu")
+    data = dataclasses.replace(sk.make_data(model), low_words=wp.zeros(3, dtype=wp.uint32, device="cpu"))
+    with pytest.raises(sk.ArgumentError, match=r"data\.low_words"):
+        sk.launch_transport(spec, model, data, seed=1, first_id=0, photon_count=10)
