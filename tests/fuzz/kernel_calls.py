@@ -151,7 +151,10 @@ def _valid_calls():
         "henyey_greenstein": (sk.henyey_greenstein_density, {"t": 0.5, "g": 0.5}),
         "two_term": (sk.two_term_henyey_greenstein_density, {"t": 0.5, "g1": 0.5, "g2": -0.1, "alpha": 0.9}),
         "near_depth_map": (sk.near_depth_map, {"mesh": mesh, "camera": lit_box()["camera"]}),
-        "load_kernel": (sk.load_transport_kernel, {"spec": sk.TransportSpec("next_event"), "device": "cpu"}),
+        "load_kernel": (
+            sk.load_transport_kernel,
+            {"spec": sk.TransportSpec("next_event"), "device": "cpu", "model": model, "photon_count": 20},
+        ),
         "add_tallies": (sk.add_tallies, {"total": tallies(), "more": tallies()}),
         "batches": (
             lambda close, **rest: sk.Batches(**rest).close(close),
