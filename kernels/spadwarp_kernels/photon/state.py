@@ -6,7 +6,7 @@ from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.sensor.camera import Camera
 from spadwarp_kernels.surface.trace import SurfaceHit
-from spadwarp_kernels.tally.ledger import to_ledger
+from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
 from spadwarp_kernels.tally.tally import Contribution, Scores
 
 # What a thread does next: a flight, the ray that looks for a surface along it, the event at its end, the scattering
@@ -25,7 +25,7 @@ class Weight:
         value: Fraction of the photon that is left.
         taken: By which the last change lowered it, in ledger units.
         absorbed_water: Sum over the thread's photons of what water took, in ledger units: what they had, less what
-            others took and what was left.
+            was left and what others took, but for the thread's sums for the ledger.
     """
 
     value: float
@@ -37,11 +37,19 @@ class Weight:
 def reweigh(w: Weight, factor: float) -> Weight:
     """The weight times a factor.
 
-    The ledger is written where weight changes hands; water takes what is missing there.
+    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
+    one of the thread's sums for the ledger, or to be given by `give`.
     """
     before = to_ledger(w.value)
     w.value *= factor
     w.taken = before - to_ledger(w.value)
+    return w
+
+
+@wp.func
+def give(w: Weight, ledger: wp.array(dtype=wp.int64), thread: int, entry: int) -> Weight:
+    """What the last change has taken goes to an entry of the ledger."""
+    add_to_ledger(ledger, thread, entry, w.taken)
     w.absorbed_water -= w.taken
     return w
 

@@ -5,12 +5,12 @@ import warp as wp
 from spadwarp_kernels.math.once import made_once
 from spadwarp_kernels.photon.lanes import exchange
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, reweigh
+from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, give, reweigh
 from spadwarp_kernels.port.kinds import PortKind
 from spadwarp_kernels.port.port import Passage, Port
 from spadwarp_kernels.source.laser import Laser, emit_along, emit_measured
 from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.tally.ledger import LASER_PORT, add_to_ledger
+from spadwarp_kernels.tally.ledger import LASER_PORT
 
 
 @wp.struct
@@ -52,7 +52,7 @@ def make_enter(port: PortKind | None) -> wp.Function:
                 start.x = passage.x
                 start.u = passage.u
                 start.path = passage.path
-            add_to_ledger(ledger, thread, LASER_PORT, start.weight.taken)
+            start.weight = give(start.weight, ledger, thread, LASER_PORT)
         return start
 
     return enter

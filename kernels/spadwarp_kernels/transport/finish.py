@@ -58,7 +58,7 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     def flush(s: PhotonState, tally: wp.array(dtype=wp.int64), ledger: wp.array(dtype=wp.int64), thread: int):
         if wp.static(adds):
             atomic_add_int64(tally, int(s.pending_add[0]), s.pending_add[1])
-        add_to_ledger(ledger, thread, ABSORBED_WATER, s.weight.absorbed_water)
+        add_to_ledger(ledger, thread, ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
         add_to_ledger(ledger, thread, ABSORBED_SURFACE, s.absorbed_surface)
         add_to_ledger(ledger, thread, DIRECTED, s.directed)
         add_to_ledger(ledger, thread, WATER_COLLISIONS, wp.int64(s.water_collisions))

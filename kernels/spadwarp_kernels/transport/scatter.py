@@ -13,7 +13,7 @@ from spadwarp_kernels.medium.limits import Limits
 from spadwarp_kernels.medium.water import Medium
 from spadwarp_kernels.phase.phase_function import Guiding
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState, Weight, reweigh
+from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState, Weight, give, reweigh
 from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
 from spadwarp_kernels.polarisation.request import Polarisation
 from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
@@ -22,7 +22,7 @@ from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
 from spadwarp_kernels.surface.lambert import sample_cosine_law
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
-from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF, add_to_ledger
+from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
 
@@ -186,7 +186,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
                     new.reason = -1
                     new.weight = reweigh(new.weight, 10.0)
                     new.analog_weight *= 10.0
-                    add_to_ledger(ledger, thread, ROULETTE, new.weight.taken)
+                    new.weight = give(new.weight, ledger, thread, ROULETTE)
         if new.reason < 0 and collisions >= limits.max_collisions:
             new.reason = MAX_COLLISIONS
         return new
@@ -226,7 +226,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
             new.stokes = reflected_stokes(s.stokes, s.u, u, face_index(limits.boundary, face))
         new.reason = s.reason
         # The light of an event that was the last is accounted for by what has ended the history.
-        add_to_ledger(ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason), new.weight.taken)
+        new.weight = give(new.weight, ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason))
         if s.reason < 0:
             new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
             new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
@@ -325,7 +325,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 if new.reason < 0:
                     new.absorbed_surface += new.weight.taken
                 else:
-                    add_to_ledger(ledger, thread, new.reason, new.weight.taken)
+                    new.weight = give(new.weight, ledger, thread, new.reason)
                 if new.weight.value <= 0.0 and new.reason < 0:
                     new.reason = WEIGHT_CUTOFF
         return new
