@@ -3,21 +3,29 @@
 import warp as wp
 
 
-@wp.func
+@wp.func_native("""
+    float in[3], out[3];
+    for (int i = 0; i < 3; ++i) {
+        // Infinite along a side. Then only the sides that stand across count, unless the segment lies in one of those
+        // along it, where it meets nothing within the padding.
+        const float inverse = 1.0f / u[i], a = (lower[i] - x[i]) * inverse, b = (upper[i] - x[i]) * inverse;
+        in[i] = wp::min(a, b);
+        out[i] = wp::max(a, b);
+    }
+#if defined(__CUDA_ARCH__)
+    // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
+    // negative counts only as that.
+    const auto bits = [](float number) { return __float_as_int(number); };
+    const int enters = __vimax3_s32_relu(bits(in[0]), bits(in[1]), bits(in[2]));
+    return enters <= min(__vimin3_s32(bits(out[0]), bits(out[1]), bits(out[2])), bits(length));
+#else
+    const float enters = wp::max(wp::max(in[0], in[1]), wp::max(in[2], 0.0f));
+    return enters <= wp::min(wp::min(out[0], out[1]), wp::min(out[2], length));
+#endif
+""")
 def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
     """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    near = float(0.0)
-    far = float(length)
-    for i in range(3):
-        d = u[i]
-        if wp.abs(d) < 1.0e-12:
-            d = 1.0e-12
-        inverse = 1.0 / d
-        a = (lower[i] - x[i]) * inverse
-        b = (upper[i] - x[i]) * inverse
-        near = wp.max(near, wp.min(a, b))
-        far = wp.min(far, wp.max(a, b))
-    return near <= far
+    ...
 
 
 @wp.func_native("""
