@@ -22,7 +22,7 @@ from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.random.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
-from spadwarp_kernels.sensor.camera import Camera, lens_point, toward_axis
+from spadwarp_kernels.sensor.camera import Camera, lens_point
 from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.sensor.port_view import port_view
 from spadwarp_kernels.surface.ggx import reflection_pdf
@@ -251,7 +251,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
     water_at, extinction_at, lens_chance = spec.water.at, _make_extinction_at(spec), _make_lens_chance(spec)
-    view_of = spec.lens.view
+    view_of, toward_middle = spec.lens.view, spec.lens.toward_middle
     has_mesh, specular = spec.mesh, spec.specular
     in_view = spec.lens.shows if spec.port is None else port_view(spec.port).shows
     toward, toward_centre = make_toward(spec)
@@ -287,11 +287,13 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
             v = toward(camera, s.x, lens_point(camera, u01(ahead[2]), u01(ahead[3])))
         view = view_of(camera, s.view)
-        to_axis = toward_axis(view, s.x)
+        way = toward_middle(view, s.x)
+        to_axis = wp.vec3()
         to_view_chance = float(0.0)
-        if wp.dot(to_axis, to_axis) > 0.0 and not in_view(camera, view, s.x):
+        if wp.dot(way, way) > 0.0 and not in_view(camera, view, s.x):
             to_view_chance = guiding.return_probability
-            to_axis = wp.normalize(to_axis)
+            way *= 1.0 / wp.length(way)
+            to_axis = wp.vec3(way[0], way[1], 0.0)
         part = guided_part(s.weight.value, s.analog_weight, met, to_lens_chance + to_view_chance)
         to_lens_chance *= part
         to_view_chance *= part

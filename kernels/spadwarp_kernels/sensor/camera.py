@@ -217,10 +217,16 @@ def in_field(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
 
 
 @wp.func
-def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec3:
-    """Vector across the optical axis from x towards the middle of the view."""
+def toward_middle(view: wp.vec4, x: wp.vec3) -> wp.vec2:
+    """Vector across the optical axis from x towards the middle of the view [m]."""
     depth = 0.5 * wp.max(x[2], 0.0)
-    return wp.vec3(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1], 0.0)
+    return wp.vec2(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1])
+
+
+@wp.func
+def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec2:
+    """`toward_middle` of a view about the optical axis."""
+    return wp.vec2(-1.0 * x[0], -1.0 * x[1])
 
 
 def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:

@@ -8,7 +8,16 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .camera import Camera, in_field, in_view, project, project_about_axis, project_calibrated
+from .camera import (
+    Camera,
+    in_field,
+    in_view,
+    project,
+    project_about_axis,
+    project_calibrated,
+    toward_axis,
+    toward_middle,
+)
 
 
 class Lens(NamedTuple):
@@ -21,6 +30,7 @@ class Lens(NamedTuple):
             or the pixel of a scan, shows.
         shows: As `in_view`, for such a view without a port.
         image: As `project`, for a camera that the transport kernel has prepared; None for `project` itself.
+        toward_middle: As the function of that name, for such a view.
     """
 
     name: str
@@ -28,6 +38,7 @@ class Lens(NamedTuple):
     view: wp.Function
     shows: wp.Function = in_view
     image: wp.Function | None = None
+    toward_middle: wp.Function = toward_middle
 
 
 @wp.func
@@ -50,7 +61,7 @@ def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
     return view
 
 
-PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain)
+PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain, toward_axis)
 """Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
 
 CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
