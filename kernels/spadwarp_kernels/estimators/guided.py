@@ -323,10 +323,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
                 density = reflection_pdf(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], lobe)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
         mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), medium, guiding)
-        if to_view_chance > 0.0:
-            mixture += to_view_chance * henyey_greenstein_pdf(
-                one_minus_cosine(to_axis, new.u), guiding.return_anisotropy
-            )
+        mixture += to_view_chance * henyey_greenstein_pdf(one_minus_cosine(to_axis, new.u), guiding.return_anisotropy)
         new.factor = density / wp.max(mixture, 1.0e-30)
         return new
 
