@@ -300,13 +300,8 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         choice = u01(s.flight.block[3])
         to_lens = choice < to_lens_chance
         directed = choice < to_lens_chance + to_view_chance
-        axis = snapped
-        if to_lens:
-            axis = v
-        elif directed:
-            axis = to_axis
-        elif on_surface:
-            axis = s.hit.normal
+        axis = wp.where(on_surface, s.hit.normal, snapped)
+        axis = wp.where(to_lens, v, wp.where(directed, to_axis, axis))
         t = sample_angle(s.flight.block[1], to_lens, directed, here, medium, guiding)
         # Selected rather than branched to, so that what is left out stays in no register.
         if wp.static(has_mesh):

@@ -123,7 +123,7 @@ def _toward_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
 
 @wp.func
 def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
-    return -wp.normalize(x)
+    return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
 
 @made_once
