@@ -5,7 +5,7 @@ from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES
 from .lanes import BLOCK_SIZE, count_lanes
 from .records import Records, make_records
 from .spec import TransportSpec
-from .state import Flight, PhotonState, Weight, reweigh
+from .state import Flight, PhotonState, Weight, give, reweigh
 
 __all__ = [
     "BLOCK_SIZE",
@@ -16,6 +16,7 @@ __all__ = [
     "TransportSpec",
     "Weight",
     "count_lanes",
+    "give",
     "make_records",
     "reweigh",
 ]
