@@ -18,8 +18,9 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, gate_of, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.depth import depth_of
 from spadwarp.frames.estimators import Method
-from spadwarp.frames.measured import Histograms, read_histograms, stored_images
+from spadwarp.frames.measured import Histograms, read_histograms
 from spadwarp.frames.sequence_file import SequenceFile
+from spadwarp.frames.stored_images import stored_images
 from spadwarp.io.exr import read_exr
 from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
@@ -109,8 +110,9 @@ def read_depth(
             frames = own.values.astype(np.float32)
             source = f"depth as it is{_unused(held)}"
             return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source=source, truth=truth)
-    stored = _stored_depth(place, channel, measured.get("dataset"), as_depth)
-    if stored is not None:
+    found = _stored_depth(place, channel, measured.get("dataset"), as_depth)
+    if found is not None:
+        stored, chosen = found
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
         if given := [name.replace("_", " ") for name in measured if name != "dataset"]:
@@ -119,7 +121,8 @@ def read_depth(
         below = np.count_nonzero(depth < 0)
         depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
         frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
-        source = "depth as it is" + (f"; {below} values below 0 count as not reported" if below else "")
+        source = "depth as it is" + (f": {chosen}" if chosen else "")
+        source += f"; {below} values below 0 count as not reported" if below else ""
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = read_histograms(place, **measured, **of_result)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
@@ -149,8 +152,10 @@ def _truth(held: Held) -> NDArray[np.float32] | None:
     return None if depth is None else depth.astype(np.float32)
 
 
-def _stored_depth(path: Path, channel: str | None, dataset: str | None, as_depth: bool) -> NDArray[Any] | None:
-    """Depth `[H, W]` or `[N, H, W]` as the file has it; None for histograms."""
+def _stored_depth(
+    path: Path, channel: str | None, dataset: str | None, as_depth: bool
+) -> tuple[NDArray[Any], str] | None:
+    """Depth `[H, W]` or `[N, H, W]` as the file has it, and which of several images it is; None for histograms."""
     ending = path.suffix.lower()
     if ending == ".exr":
         channels, _ = read_exr(path)
@@ -158,7 +163,7 @@ def _stored_depth(path: Path, channel: str | None, dataset: str | None, as_depth
         found = next((channels[name] for name in wanted if name in channels), None)
         if found is None:
             raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
-        return found
+        return found, ""
     return stored_images(path, dataset, several=as_depth)
 
 

@@ -32,7 +32,7 @@ from spadwarp.result.received import Channel, received
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["ENDINGS", "Histograms", "read_histograms", "stored_images"]
+__all__ = ["ENDINGS", "Histograms", "histograms_in", "is_own", "listed_arrays", "read_histograms", "unnamed_dataset"]
 
 ENDINGS = (".h5", ".hdf5", ".npy", ".mat", ".ptu")
 
@@ -143,7 +143,7 @@ def read_histograms(
         dataset=dataset, axes=axes, image_size=image_size, tag_unit=tag_unit, bin_width=bin_width, sum_frames=sum_frames
     )
     ending = path.suffix.lower()
-    if ending in (".h5", ".hdf5") and _is_own(path):
+    if ending in (".h5", ".hdf5") and is_own(path):
         given = {**vars(asked), "gate_start": gate_start, "irf": irf}
         if clash := [name.replace("_", " ") for name, value in given.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
@@ -176,55 +176,11 @@ def read_histograms(
     )
 
 
-def stored_images(path: Path, dataset: str | None, *, several: bool) -> NDArray[Any] | None:
-    """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
-    the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
-    of a `.h5` without them the only one.
-
-    Raises `FileError`, and `ArgumentError` where there are several in a `.h5`.
-    """
-    ending = path.suffix.lower()
-    if ending == ".npy":
-        array = read_npy(path)
-        return array if array.ndim == 2 or (several and array.ndim == 3) else None
-    if ending == ".mat":
-        entries = mat_entries(path)
-        images = {name: one for name, one in entries.items() if one.kind == "dense" and len(one.shape) in (2, 3)}
-        name = dataset
-        if name is None and (several or not _histograms_in(entries)):
-            images = {name: one for name, one in images.items() if math.prod(one.shape) > 1}
-            name = max(images, key=lambda one: math.prod(images[one].shape), default=None)
-        if name not in images or (len(images[name].shape) == 3 and not several):
-            return None
-        return np.asarray(read_mat(path, name, images[name]))
-    if ending in (".h5", ".hdf5") and not _is_own(path):
-        with read_hdf5(path) as file:
-            arrays = file.arrays()
-        name = _only_image(path, arrays, several=several) if dataset is None else dataset
-        shape, dtype = arrays.get(name, ((), np.dtype(float)))
-        if len(shape) == 2 or (several and len(shape) == 3):
-            with read_hdf5(path) as file:
-                return file.array(name, dtype, shape)
-    return None
-
-
-def _only_image(path: Path, arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]], *, several: bool) -> str:
-    """Name of the only array of an HDF5 file that may be an image, or if there may be `several` images; "" where it may
-    hold histograms, or has no images. Raises `ArgumentError` where there are more."""
-    numbers = {name: len(shape) for name, (shape, dtype) in arrays.items() if dtype.kind in "biuf"}
-    cubes = [name for name, axes in numbers.items() if axes in (3, 4)]
-    found = [name for name in cubes if several and numbers[name] == 3]
-    if not found and not cubes:
-        found = [name for name, axes in numbers.items() if axes == 2 and math.prod(arrays[name][0]) > 1]
-    if len(found) > 1:
-        raise _unnamed(path, _listed(arrays))
-    return found[0] if found else ""
-
-
 # Kinds of files
 
 
-def _is_own(path: Path) -> bool:
+def is_own(path: Path) -> bool:
+    """Whether an HDF5 file is one of ours."""
     return (hdf5_format(path) or "").startswith("spadwarp")
 
 
@@ -274,24 +230,26 @@ def _read(path: Path, ending: str, asked: _Asked) -> _Raw:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
-def _listed(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> str:
+def listed_arrays(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> str:
+    """Names and shapes of arrays, as an error lists them."""
     return ", ".join(f"{name} {shape}" for name, (shape, _) in arrays.items()) or "nothing"
 
 
-def _unnamed(path: Path, listed: str) -> ArgumentError:
+def unnamed_dataset(path: Path, listed: str) -> ArgumentError:
+    """That a file holds several arrays, so that one has to be named."""
     return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
 
 
 def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
     with read_hdf5(path) as file:
         arrays = file.arrays()
-        listed = _listed(arrays)
+        listed = listed_arrays(arrays)
         cubes = [name for name, (shape, dtype) in arrays.items() if len(shape) in (3, 4) and dtype.kind in "biuf"]
     name = asked.dataset or (cubes[0] if len(cubes) == 1 else None)
     if name is None and not cubes:
         raise FileError(f"{path}: no array of 3 or 4 dimensions; it holds {listed}")
     if name is None:
-        raise _unnamed(path, listed)
+        raise unnamed_dataset(path, listed)
     if name not in arrays:
         raise FileError(f"{path}: no array {name!r}; it holds {listed}")
     shape, dtype = arrays[name]
@@ -302,7 +260,7 @@ def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
 
 def _read_mat(path: Path, asked: _Asked) -> _Raw:
     entries = mat_entries(path)
-    found = _histograms_in(entries)
+    found = histograms_in(entries)
     listed = ", ".join(f"{name} {one.shape} {one.kind}" for name, one in entries.items()) or "no numbers"
     name = asked.dataset or (found[0] if found else None)
     if name is None:
@@ -342,7 +300,7 @@ def _read_mat(path: Path, asked: _Asked) -> _Raw:
     return _Raw(values=value, notes=tuple(notes), **common)
 
 
-def _histograms_in(entries: dict[str, MatEntry]) -> list[str]:
+def histograms_in(entries: Mapping[str, MatEntry]) -> list[str]:
     """Variables that may hold histograms, counts before rates: sparse matrices, cells, arrays by their size."""
     rank = {"sparse": 0, "cell": 1, "dense": 2}
     fits = [

@@ -63,3 +63,18 @@ def test_histograms_of_a_dataset_are_not_used_and_it_is_said_why(tmp_path):
         found = denoise_file(tmp_path / "set" / name, tmp_path / "out", model="median", device="cpu")
         assert "histograms are not used, since a dataset does not keep their background" in found.notes[0]
         assert np.array_equal(read_depth(tmp_path / "set" / name).depth, stored, equal_nan=True)
+
+
+def test_of_several_images_the_largest_is_named_and_equals_are_refused(tmp_path):
+    """A camera matrix beside the depth does no harm; of depth and intensity of one size, nobody can know."""
+    savemat = pytest.importorskip("scipy.io").savemat
+    depth = np.random.default_rng(1).uniform(3.0, 4.0, (20, 30))
+    savemat(tmp_path / "one.mat", {"K": np.eye(3), "depth": depth})
+    found = read_depth(tmp_path / "one.mat")
+    assert found.source == "depth as it is: depth, not K"
+    assert found.depth[0] == pytest.approx(depth, rel=1e-6)
+    savemat(tmp_path / "two.mat", {"depth": depth, "intensity": depth, "K": np.eye(3)})
+    listed = r"depth \(20, 30\), intensity \(20, 30\), K \(3, 3\)"
+    with pytest.raises(ArgumentError, match=rf"dataset is missing \(--dataset\); the file holds {listed}"):
+        read_depth(tmp_path / "two.mat")
+    assert read_depth(tmp_path / "two.mat", dataset="depth").source == "depth as it is"
