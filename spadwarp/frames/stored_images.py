@@ -52,11 +52,11 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
 def _largest(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str | None, str]:
     """Name of the largest image, and which others there are. Raises `ArgumentError` where several are the largest."""
     most = max(map(math.prod, shapes.values()), default=0)
-    first, *more = [name for name, shape in shapes.items() if math.prod(shape) == most] or [None]
-    if more:
+    largest = [name for name, shape in shapes.items() if math.prod(shape) == most]
+    if len(largest) > 1:
         raise unnamed_dataset(path, ", ".join(f"{name} {shape}" for name, shape in shapes.items()))
-    others = [name for name in shapes if name != first]
-    return first, f"{first}, not {', '.join(others)}" * bool(others)
+    others = [name for name in shapes if name not in largest]
+    return (largest[0], f"{largest[0]}, not {', '.join(others)}" if others else "") if largest else (None, "")
 
 
 def _only_image(path: Path, arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]], *, several: bool) -> str:
