@@ -14,7 +14,7 @@ from spadwarp.device import core_count, processor_name
 from spadwarp.errors import ConfigError
 from spadwarp.limits import check_integer
 from spadwarp.result import COMPONENTS, Tallies, Truth
-from spadwarp.result.photon_ids import Range
+from spadwarp.result.photon_ids import Range, count
 from spadwarp.transport.device_worker import DeviceWorker, device_errors
 from spadwarp.transport.executor import Event
 from spadwarp.transport.loading import load_transport_kernel
@@ -58,6 +58,8 @@ class LocalWorkers:
             raise ConfigError(f"tallies go with one device, not with {len(devices)}")
         size = LAUNCH_SIZE[kind] if plan.launch_size is None else plan.launch_size
         size = check_integer("launch_size", size, f"[1, {LARGEST_LAUNCH[kind]}]")
+        if kind == "cuda":  # a run of few photons needs no kernel of larger launches
+            size = min(size, max(1, count([plan.ids])))
         threads = core_count() if threads is None else check_integer("threads", threads, "[1, 4096]")
         threads = 1 if kind == "cuda" else max(1, threads // len(devices))
         self._devices = devices
