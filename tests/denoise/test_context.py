@@ -181,17 +181,23 @@ def test_scattered_light_is_dimmer_and_later_than_a_target():
     assert left[8] > 0.9 and right[8] < 0.5 and left[10] < 0.01 and right[10] > 0.2
 
 
-def test_scattered_light_beside_a_bright_target_is_water():
-    """A ball in open water, 800 counts a pixel; light of three tenths more arrives late, and from beside it."""
-    row, column = np.mgrid[:64, :64] - 31.5
-    seen = row**2 + column**2 < 15.0**2
-    place = 40.5 - 3.0 * np.sqrt(np.maximum(0.0, 1.0 - (row**2 + column**2) / 15.0**2))
+def ball(size, radius, photons):
+    """Where a ball in open water is seen, its place in bins, and counts; three tenths more light is late and beside."""
+    row, column = np.mgrid[:size, :size] - 0.5 * (size - 1)
+    seen = row**2 + column**2 < radius**2
+    place = 40.5 - 3.0 * np.sqrt(np.maximum(0.0, 1.0 - (row**2 + column**2) / radius**2))
     edges = np.arange(BINS + 1.0)
-    direct = 800.0 * seen[..., None] * np.diff(norm.cdf(edges - place[..., None], scale=1.2))
+    direct = photons * seen[..., None] * np.diff(norm.cdf(edges - place[..., None], scale=1.2))
     wide = gaussian_filter(direct, (8.0, 8.0, 0.0))
     delays = np.diff(expon.cdf(np.arange(41.0), scale=6.0))
     late = np.apply_along_axis(lambda light: np.convolve(light, delays)[:BINS], -1, wide)
     counts = np.random.default_rng(8).poisson(direct + 0.3 * late + 11.0 / BINS).astype(np.float32)
+    return seen, place, counts
+
+
+def test_scattered_light_beside_a_bright_target_is_water():
+    """A ball in open water, 800 counts a pixel."""
+    seen, place, counts = ball(64, 15.0, 800.0)
     found = found_in(counts, 11.0)
     assert np.mean(found.target_probability[seen] < 0.5) < 0.05
     assert np.mean(found.target_probability[~seen] > 0.5) < 0.05
@@ -199,9 +205,17 @@ def test_scattered_light_beside_a_bright_target_is_water():
     assert np.median(np.abs(error[seen])) < 0.2
 
 
+def test_water_far_from_a_small_target_and_from_the_border_is_water():
+    """A frame wider than the crops of the training. Weights from crops of 64 × 64 pixels alone invent 1.3 to 35 %."""
+    seen, _, counts = ball(192, 15.0, 100.0)
+    found = found_in(counts, 11.0)
+    assert np.mean(found.target_probability[seen] < 0.5) < 0.01
+    assert np.mean(found.target_probability[~seen] > 0.5) < 0.01
+
+
 @pytest.mark.parametrize("photons", [1.0, 30.0])
 def test_a_wall_in_a_frame_wider_than_the_crops_of_the_training_is_target(photons):
-    """Also where no border of the frame is near: crops of 64 × 64 pixels have no such place."""
+    """Also where no border is near: only wide crops have such a place, and none one 72 pixels from its border."""
     place = 24.0 + 3.0 * np.sin(np.arange(144.0) / 40.0)
     light = np.diff(norm.cdf(np.arange(BINS + 1.0) - place[:, None, None], scale=1.2))
     rate = photons * light + 0.2 * photons / BINS
