@@ -119,15 +119,15 @@ def test_two_returns_are_not_averaged():
 
 
 def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_path):
-    """Two signal photons a pixel among ten of the background; averages over two noises."""
+    """Two signal photons a pixel among ten of the background; over eight noises 0.76 ± 0.05 times the squared error."""
     old = {
         name: value for name, value in load_file(WEIGHTS / "histograms.safetensors").items() if "context." not in name
     }
     save_file(old, tmp_path / "old.safetensors", {"model": "histograms"})
     row, column = np.mgrid[:64, :64]
     place = np.where((row - 30) ** 2 + (column - 33) ** 2 < 400, 30.5, 60.5)
-    errors = np.zeros((2, 2))
-    for number in range(2):
+    errors = np.zeros((2, 8))
+    for number in range(8):
         counts = counts_of(place, 2.0, 10.0, seed=10 + number)
         for which, weights in enumerate((tmp_path / "old.safetensors", None)):
             depth = found_in(counts, 10.0, weights=weights).depth
