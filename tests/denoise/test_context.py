@@ -206,7 +206,7 @@ def test_scattered_light_beside_a_bright_target_is_water():
 
 
 def test_water_far_from_a_small_target_and_from_the_border_is_water():
-    """A frame wider than the crops of the training. Weights from crops of 64 × 64 pixels alone invent 1.3 to 35 %."""
+    """In 192 × 192 pixels. Weights from crops of 64 × 64 alone invent 1.3 to 35 %; much wider frames are not mended."""
     seen, _, counts = ball(192, 15.0, 100.0)
     found = found_in(counts, 11.0)
     assert np.mean(found.target_probability[seen] < 0.5) < 0.01
