@@ -8,6 +8,7 @@ how late the light arrives that water scattered forward.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import torch
@@ -44,6 +45,8 @@ SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS + LIGHT
 """Number of channels that `extract_features` gives."""
 
+_LEAST_SIGNAL, _SIGNAL_STEP = 0.05, math.log(1.1)  # counts; of levels of signal
+_WHOLE, _SURROUNDING = 128, 63  # frames up to this side have one signal; in others it is that of so many pixels around
 _SMOOTHED, _STEPS = 0.75, 120  # strength and steps of the total variation among the depths
 _UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
 _MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
@@ -54,9 +57,9 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
 
     The score of a return in bin k is its log-likelihood ratio less what background alone gives on average,
     Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
-    mean signal of the frame; B' is B plus 0.3 S spread evenly over the gate. Scores of pixels add. The template h is
-    the instrument response; for the largest window it is that response with an exponential tail, as light arrives that
-    was scattered forward.
+    mean signal of the frame, in frames wider than 128 pixels of 127 × 127 pixels around; B' is B plus 0.3 S spread
+    evenly over the gate. Scores of pixels add. The template h is the instrument response; for the largest window it is
+    that response with an exponential tail, as light arrives that was scattered forward.
 
     Args:
         counts: Histograms over the gate, `[B, H, W, T]`.
@@ -83,7 +86,8 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     above = counts - background
     background = background.mean(dim=(1, 2))  # scores are sums over pixels: these have one template
     narrow = toeplitz(response, bins)
-    score = torch.bmm(above.flatten(1, 2), _template(above, background, narrow)).view_as(counts)
+    signal = _signal(above)
+    score = _correlated(above, background, narrow, signal)
     more = edge_penalties(total)
     usual, *connected = _connected(score, more)
     cubes = [score, *(pooled(score, side) * side**2 for side in WINDOWS[:-1]), usual]
@@ -92,7 +96,7 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     tail = torch.exp(-delays / (TAIL * bins))
     distance = delays[:, None] - delays
     late = torch.where(distance >= 0, tail[distance.clamp_min(0)], 0.0) / tail.sum()
-    wide = torch.bmm(above.flatten(1, 2), _template(above, background, late @ narrow)).view_as(counts)
+    wide = _correlated(above, background, late @ narrow, signal)
     found.append(highest(pooled(wide, WINDOWS[-1])))
     del wide
     anchor, peak = found[-1], score.amax(dim=-1).clamp(0.0, MOST)
@@ -121,14 +125,39 @@ def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tens
     """Score of a return in each bin, as `extract_features` describes it, `[B, H, W, T]`; arguments as there."""
     above = counts - background
     narrow = toeplitz(response, counts.shape[-1])
-    template = _template(above, background.mean(dim=(1, 2)), narrow)
-    return torch.bmm(above.flatten(1, 2), template).view_as(counts)
+    return _correlated(above, background.mean(dim=(1, 2)), narrow, above.sum(dim=-1).mean(dim=(1, 2)))
 
 
-def _template(above: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """ln(1 + S h / B') in bin j for a return in bin k, `[B, j, k]`."""
-    signal = above.sum(dim=-1).mean(dim=(1, 2)).clamp_min(0.05)
-    floor = _UNIFORM_SHARE * signal[:, None] / above.shape[-1]
+def _signal(above: Tensor) -> Tensor:
+    """Mean excess over the background, of each frame `[B]`; in large frames around each pixel, `[B, H, W]`.
+
+    A bright target far away tells nothing about a pixel's own. The network would infer from the mean of the whole frame
+    that there is a target, and from not seeing it, that it is a dim one here: its training had it always in view.
+    """
+    excess = above.sum(dim=-1)
+    if max(excess.shape[1:]) <= _WHOLE:
+        return excess.mean(dim=(1, 2))
+    return pooled(excess[..., None], 2 * _SURROUNDING + 1)[..., 0]
+
+
+def _correlated(above: Tensor, background: Tensor, response: Tensor, signal: Tensor) -> Tensor:
+    """Scores `[B, H, W, T]` with the template of the signal: that of each frame `[B]`, or of each pixel `[B, H, W]`,
+    then to a twentieth, so that pixels share templates."""
+    if signal.ndim == 1:
+        return torch.bmm(above.flatten(1, 2), _template(signal, background, response)).view_as(above)
+    levels = (signal.clamp_min(_LEAST_SIGNAL).log() / _SIGNAL_STEP).round()
+    scores = torch.empty_like(above)
+    for level in levels.unique():
+        templates = _template((level * _SIGNAL_STEP).exp().expand(len(above)), background, response)
+        for score, counts, chosen, template in zip(scores, above, levels == level, templates, strict=True):
+            score[chosen] = counts[chosen] @ template
+    return scores
+
+
+def _template(signal: Tensor, background: Tensor, response: Tensor) -> Tensor:
+    """ln(1 + S h / B') in bin j for a return in bin k, `[B, j, k]`, for S counts of signal `[B]`."""
+    signal = signal.clamp_min(_LEAST_SIGNAL)
+    floor = _UNIFORM_SHARE * signal[:, None] / response.shape[-1]
     return torch.log1p(signal[:, None, None] / (background + floor)[:, :, None] * response)
 
 

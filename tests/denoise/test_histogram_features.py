@@ -12,7 +12,7 @@ from helpers.stepped_frames import denoised
 from spadwarp import ArgumentError, DeviceError
 from spadwarp.denoise import apply, estimate, histogram_inputs, synthetic_noise
 from spadwarp.denoise.guide import GUIDES
-from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features
+from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features, log_likelihood
 from spadwarp.denoise.recipe import Noise
 
 BINS, SIGMA = 128, 1.2  # bins of the gate, response [bins]
@@ -95,6 +95,23 @@ def test_each_pixel_may_have_its_background():
         np.mean(np.abs(BINS * features_of(counts, one)[5] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)
     ]
     assert wrong[1] < 0.1 < wrong[0]
+
+
+@pytest.mark.parametrize("width", [128, 300])
+def test_a_bright_target_far_away_changes_no_likelihood(width):
+    """The log-likelihood at its candidate of a pixel of water, 100 pixels or more from a target of 500 counts in the
+    last columns; the template of the pixels there is that of a frame of water alone. Narrower frames have one signal."""
+    counts = np.random.default_rng(1).poisson(0.05, (1, 4, width, 64)).astype(np.float32)
+    bright = counts.copy()
+    bright[..., -20:, 30] += 500.0
+    background = torch.full((1, 1, 1, 64), 0.05)
+    response = torch.tensor([[0.2, 0.6, 0.2]])
+    water, beside = (
+        extract_features(torch.from_numpy(c), background, response)[:, SEEN, :, :40] for c in (counts, bright)
+    )
+    alone = log_likelihood(torch.from_numpy(counts), background, response).amax(dim=-1)[..., :40]
+    assert torch.allclose(10.0 * water, alone, rtol=0.05, atol=0.02)
+    assert torch.allclose(beside, water, rtol=1e-4, atol=1e-4) == (width > 128)
 
 
 def test_a_frame_of_pixels_without_counts_is_no_error():
