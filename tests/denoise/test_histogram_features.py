@@ -100,7 +100,7 @@ def test_each_pixel_may_have_its_background():
 @pytest.mark.parametrize("width", [128, 300])
 def test_a_bright_target_far_away_changes_no_likelihood(width):
     """The log-likelihood at its candidate of a pixel of water, 100 pixels or more from a target of 500 counts in the
-    last columns; the template of the pixels there is that of a frame of water alone. Narrower frames have one signal."""
+    last columns, is that in a frame of water alone. Narrower frames have one signal."""
     counts = np.random.default_rng(1).poisson(0.05, (1, 4, width, 64)).astype(np.float32)
     bright = counts.copy()
     bright[..., -20:, 30] += 500.0
