@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -114,7 +114,8 @@ class Pool:
 
     The pool has `PORTIONS` of equal size; the oldest one is replaced every so many steps, so that a sample is used
     `optimiser.uses` times on average. All samples of a portion have the noise of one part of the recipe's mixture. A
-    portion depends on its number and on the seed alone: a resumed run draws those again that it had.
+    portion depends on its number and on the seed alone: a resumed run draws those again that it had. On a GPU portions
+    are drawn in a stream of their own: thousands of short launches, which need not wait for the steps before them.
 
     Args:
         recipe: See `spadwarp.denoise.recipe`.
@@ -138,6 +139,10 @@ class Pool:
         self.drawn, self.seconds = 0, 0.0
         self.filled = torch.zeros((), device=generator.device)
         self.memory: Batch | None = None
+        self.stream: Any = None
+        if generator.device.type == "cuda":
+            self.stream = torch.cuda.Stream(generator.device)
+            self.stream.wait_stream(torch.cuda.current_stream(generator.device))
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         due = _FIRST + step // self.interval
@@ -145,7 +150,7 @@ class Pool:
         total = max(0, due - first) * self.portion
         for number in range(first, due):
             began = time.monotonic()
-            for drawn in self._draw(number, self.scenes.at(max(0, number - _FIRST) * self.interval)):
+            for drawn in self._draw(number):
                 yield (number - first) * self.portion + drawn, total
             self.seconds = (time.monotonic() - began) / self.interval
         self.drawn = due
@@ -160,32 +165,43 @@ class Pool:
         return Batch(*(values.index_select(0, index) for values in self.memory))
 
     @torch.no_grad()
-    def _draw(self, number: int, scenes: CleanScenes) -> Iterator[int]:
+    def _draw(self, number: int) -> Iterator[int]:
         wide = (self.scenes.crop,) if self.scenes.crop != self.recipe.optimiser.crop else ()
         host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number, *wide))
         part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
-        seed = int(host.integers(2**62))
-        generator = torch.Generator(self.generator.device).manual_seed(seed)
+        generator = torch.Generator(self.generator.device).manual_seed(int(host.integers(2**62)))
         is_crowded = host.random() < part.crowded
-        if host.random() < part.open_water:
-            scenes = in_open_water(scenes)
-        if is_crowded:
-            scenes = crowded(scenes)
+        with torch.cuda.stream(self.stream):
+            scenes = self.scenes.at(max(0, number - _FIRST) * self.interval)
+            if host.random() < part.open_water:
+                scenes = in_open_water(scenes)
+            if is_crowded:
+                scenes = crowded(scenes)
         first = number % PORTIONS * self.portion
         for done in range(0, self.portion, self.piece):
-            new = draw_batch(
-                scenes, part, size=min(self.piece, self.portion - done), crop=self.scenes.crop,
-                generator=generator, histograms=True,
-            )  # fmt: skip
-            if is_crowded:
-                new = new._replace(judged=torch.zeros_like(new.judged))
-            if self.memory is None:
-                size = PORTIONS * self.portion
-                self.memory = Batch(*(values.new_empty(size, *values.shape[1:]) for values in new))
-            for kept, values in zip(self.memory, new, strict=True):
-                kept[first + done : first + done + len(values)] = values
+            with torch.cuda.stream(self.stream):
+                new = draw_batch(
+                    scenes, part, size=min(self.piece, self.portion - done), crop=self.scenes.crop,
+                    generator=generator, histograms=True,
+                )  # fmt: skip
+                if is_crowded:
+                    new = new._replace(judged=torch.zeros_like(new.judged))
+            self._keep(new, first + done)
             yield done + len(new.frame)
         self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
+
+    def _keep(self, new: Batch, first: int) -> None:
+        """Copies samples to the pool's memory, after the steps that still read it."""
+        if self.stream is not None:
+            here = torch.cuda.current_stream(self.generator.device)
+            here.wait_stream(self.stream)
+            for values in new:
+                values.record_stream(here)
+        if self.memory is None:
+            size = PORTIONS * self.portion
+            self.memory = Batch(*(values.new_empty(size, *values.shape[1:]) for values in new))
+        for kept, values in zip(self.memory, new, strict=True):
+            kept[first : first + len(values)] = values
 
 
 class Sizes:

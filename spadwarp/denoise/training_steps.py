@@ -241,11 +241,13 @@ class Run:
             torch.cuda.current_stream().wait_stream(side)
         else:
             loss = self._work(samples)
+        settings = self.recipe.optimiser
+        _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
         self.loss_sum += loss
         self.step += 1
         self.steps_here += 1
         self.eager[samples] = self.eager.get(samples, 0) + 1
-        settled = self.eager[samples] >= _EAGER and self.step > self.recipe.optimiser.warm_up + 1
+        settled = self.eager[samples] >= _EAGER
         if self.side is not None and self.workers.size == 1 and settled and samples not in self.recorded:
             self.recorded.add(samples)
             self._capture(samples)
@@ -279,7 +281,6 @@ class Run:
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
-        _update_mean(self.average, self.network, settings.averaging if self.step > settings.warm_up else 0.0)
         return loss.detach()
 
     def save_checkpoint(self) -> None:
