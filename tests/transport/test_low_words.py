@@ -52,7 +52,7 @@ def tally_of(spec, model, launches=2, photons=100_000):
     sums = []
     for i in range(launches):
         sk.launch_transport(spec, model, data, seed=3, first_id=i * photons, photon_count=photons)
-        sums.append(data.tally.numpy())
+        sums.append(data.tally.numpy().copy())  # on a CPU the array is the tally itself
     return sums, data
 
 
@@ -65,7 +65,7 @@ def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
     expected, plain = tally_of(spec, dataclasses.replace(model, low_words=False))
     for found, other in zip(sums, expected, strict=True):
         np.testing.assert_array_equal(found, other)
-    assert plain.low_words is None and expected[0].max() > 2**32
+    assert plain.low_words is None and expected[-1].max() > 2**32
     if device == "cpu":
         assert data.low_words is None
     else:
