@@ -142,7 +142,7 @@ def measure_transport(case: Case, device: wp.Device, photons: int | None, repeat
     photons = case.photons or photons or usual
     memory = _Memory(device)
     traced = TransportRun(case, device)
-    traced.run(min(photons, 1 << 20))
+    traced.run(min(photons, _LAUNCH if device.is_cuda else 1 << 20))  # a GPU's kernel may depend on the number
     seconds: list[float] = []
     counts: list[dict[str, int]] = []
     while len(seconds) < repeats and sum(seconds) < case.time_limit:

@@ -58,11 +58,17 @@ def prepare_kernels(device: str | None = None) -> None:
 
 
 def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Callable[[], None]:
-    """Begins to load the kernel of a spec on devices; the function returned waits for it, or raises its error."""
+    """Begins to load the kernel of a spec on CPUs; the function returned waits for it, or raises its error.
+
+    On GPUs it does nothing: `DeviceWorker` loads the kernel there, of which large histograms may need another one.
+    """
     import spadwarp_kernels as sk
+
+    if not _beside(devices):
+        return lambda: None
 
     def load() -> None:
         for device in devices:
             sk.load_transport_kernel(spec, device)
 
-    return _thread().submit(load).result if _beside(devices) else load
+    return _thread().submit(load).result

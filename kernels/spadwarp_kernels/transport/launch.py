@@ -100,8 +100,8 @@ class Data:
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
         gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
             without them.
-        low_words: uint32, as long as the tally, zero between launches; made by the first launch that uses it, see
-            `tally.low_words`.
+        low_words: uint32, as long as the tally, zero between launches; made by the first launch that is large enough,
+            see `tally.low_words`, and used by those after it.
     """
 
     tally: wp.array
@@ -150,26 +150,29 @@ def make_data(
 # Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing.
 CUDA_THREADS = 1 << 19
 
+# Photons of one launch.
+_MOST_PHOTONS = 1 << 26
+
 
 def load_transport_kernel(
-    spec: TransportSpec, device: wp.DeviceLike = None, *, model: Model | None = None, photon_count: int = 1 << 26
+    spec: TransportSpec, device: wp.DeviceLike = None, *, model: Model | None = None, photon_count: int = _MOST_PHOTONS
 ) -> None:
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch.
 
-    With `model`, also the kernel that launches of `photon_count` photons take there where its tally is large.
+    With `model`, the kernel of a first launch of `photon_count` photons, which later launches into the same data take,
+    too: with a large tally on CUDA it may be another one, see `Model.low_words`.
     """
     check_spec(spec)
     device = check_device("device", device)
-    choices = [False]
+    low_words = False
     if model is not None:
         check_kind("model", model, Model)
-        photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
-        if uses_low_words(spec, model, photon_count):
-            choices.append(True)
-            wp.load_module(fold_kernel.module, device=device)
-    for low_words in choices:
-        kernel = make_transport_kernel(spec, device.is_cuda, low_words)
-        kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
+        photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
+        low_words = uses_low_words(spec, model, photon_count)
+    kernel = make_transport_kernel(spec, device.is_cuda, low_words)
+    kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
+    if low_words:
+        wp.load_module(fold_kernel.module, device=device)
     # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
 
@@ -210,7 +213,7 @@ def launch_transport(
     """
     check_kind("model", model, Model)
     check_kind("data", data, Data)
-    photon_count = check_integer("photon_count", photon_count, 1, 1 << 26)
+    photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
     first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
     seed = check_seed(seed)
     threads = check_integer("threads", threads, BLOCK_SIZE)
@@ -239,8 +242,9 @@ def launch_transport(
 
 
 def _low_words(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
-    """Those of `data` for a launch that uses them."""
-    if not uses_low_words(spec, model, photon_count):
+    """Those of `data` for a launch that uses them: a large one, and after it also smaller ones, which would need
+    another kernel otherwise."""
+    if not uses_low_words(spec, model, photon_count if data.low_words is None else _MOST_PHOTONS):
         return None
     if data.low_words is None and not model.device.is_capturing:  # what is made there belongs to the graph
         data.low_words = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
