@@ -69,9 +69,9 @@ def table_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
         )
     if any(row.optical_depth > _SCATTERS for row in found):
         notes.append(
-            "signal: unscattered light alone. In water that scatters more light comes back from a target: in a view of "
-            "10° of a plane at 5 m, in water of albedo 0.83 and anisotropy 0.924, 1.3 times as much at c·r = 0.2 and "
-            "3.6 times at 1; `spadwarp plan` traces all of it"
+            "signal: unscattered light alone. In water that scatters, more light comes back from a target: in a view "
+            "of 10° of a plane at 5 m, in water of albedo 0.83 and anisotropy 0.924, 1.3 times as much at c·r = 0.2 "
+            "and 3.6 times at 1; `spadwarp plan` traces all of it"
         )
     own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
     if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:

@@ -34,10 +34,10 @@ def train(
     """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
     New noise is drawn for each step; with a pool, as in the recipe for histograms, a sample serves several steps (6
-    there, on average). After the first steps it says how long it will take. Writes weights (safetensors), log.jsonl,
-    curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command resumes the
-    training. Another recipe or number of steps needs a new folder. On several GPUs: torchrun --nproc-per-node N -m
-    spadwarp train ...
+    there, on average). After the first steps the command says how long it will take. Writes weights (safetensors),
+    log.jsonl, curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command
+    resumes the training. Another recipe or number of steps needs a new folder. On several GPUs: torchrun
+    --nproc-per-node N -m spadwarp train ...
 
     \b
     Example:

@@ -40,7 +40,7 @@ def beliefs(score: Tensor, jump: Tensor, more: tuple[Tensor, Tensor] | None = No
     rows = columns = score.new_zeros(())
     send = partial(messages, slope=_SLOPE)
     for _ in range(_ROUNDS):
-        told = score + columns, (score + rows).transpose(1, 2)
-        rows, columns = rows_and_columns(send, told, (ahead, beside))
+        scores = score + columns, (score + rows).transpose(1, 2)
+        rows, columns = rows_and_columns(send, scores, (ahead, beside))
         columns = columns.transpose(1, 2)
     return (rows + columns).add_(score)

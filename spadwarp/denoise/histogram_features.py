@@ -45,8 +45,8 @@ SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS + LIGHT
 """Number of channels that `extract_features` gives."""
 
-_LEAST_SIGNAL, _SIGNAL_STEP = 0.05, math.log(1.1)  # counts; of levels of signal
-_WHOLE, _SURROUNDING = 128, 63  # frames up to this side have one signal; in others it is that of so many pixels around
+_LEAST_SIGNAL, _SIGNAL_STEP = 0.05, math.log(1.1)  # counts; step of its logarithm, to which it is rounded
+_WHOLE, _SURROUNDING = 128, 63  # pixels: frames up to this side have one signal, others that of so many to each side
 _SMOOTHED, _STEPS = 0.75, 120  # strength and steps of the total variation among the depths
 _UNIFORM_SHARE = 0.3  # part of the signal that may come at any time, so that photons far from the return say little
 _MOST_BINS = 384  # finer histograms are rebinned: features need no finer bins
@@ -57,9 +57,9 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
 
     The score of a return in bin k is its log-likelihood ratio less what background alone gives on average,
     Σ_j (n_j − B_j) ln(1 + S h_{j−k} / B'_j), so that dim pixels are not drawn to where background is high. S is the
-    mean signal of the frame, in frames wider than 128 pixels of 127 × 127 pixels around; B' is B plus 0.3 S spread
-    evenly over the gate. Scores of pixels add. The template h is the instrument response; for the largest window it is
-    that response with an exponential tail, as light arrives that was scattered forward.
+    mean signal of the frame, or in frames with more than 128 rows or columns that of the 127 × 127 pixels around; B' is
+    B plus 0.3 S spread evenly over the gate. Scores of pixels add. The template h is the instrument response; for the
+    largest window it is that response with an exponential tail, as light arrives that was scattered forward.
 
     Args:
         counts: Histograms over the gate, `[B, H, W, T]`.
@@ -122,7 +122,8 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
 
 
 def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """Score of a return in each bin, as `extract_features` describes it, `[B, H, W, T]`; arguments as there."""
+    """Score of a return in each bin, as `extract_features` describes it, but in frames of every size with the mean
+    signal of the whole frame, `[B, H, W, T]`; arguments as there."""
     above = counts - background
     narrow = toeplitz(response, counts.shape[-1])
     return _correlated(above, background.mean(dim=(1, 2)), narrow, above.sum(dim=-1).mean(dim=(1, 2)))
@@ -131,8 +132,8 @@ def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tens
 def _signal(above: Tensor) -> Tensor:
     """Mean excess over the background, of each frame `[B]`; in large frames around each pixel, `[B, H, W]`.
 
-    A bright target far away tells nothing about a pixel's own. The network would infer from the mean of the whole frame
-    that there is a target, and from not seeing it, that it is a dim one here: its training had it always in view.
+    With the mean of a whole large frame, which a bright target raises, the network takes water far from this target for
+    a dim target: its training never had a bright target so far away.
     """
     excess = above.sum(dim=-1)
     if max(excess.shape[1:]) <= _WHOLE:
@@ -142,10 +143,11 @@ def _signal(above: Tensor) -> Tensor:
 
 def _correlated(above: Tensor, background: Tensor, response: Tensor, signal: Tensor) -> Tensor:
     """Scores `[B, H, W, T]` with the template of the signal: that of each frame `[B]`, or of each pixel `[B, H, W]`,
-    then to a twentieth, so that pixels share templates."""
+    which is then rounded, by 5 % at most, so that pixels share templates."""
+    signal = signal.clamp_min(_LEAST_SIGNAL)
     if signal.ndim == 1:
         return torch.bmm(above.flatten(1, 2), _template(signal, background, response)).view_as(above)
-    levels = (signal.clamp_min(_LEAST_SIGNAL).log() / _SIGNAL_STEP).round()
+    levels = (signal.log() / _SIGNAL_STEP).round()
     scores = torch.empty_like(above)
     for level in levels.unique():
         templates = _template((level * _SIGNAL_STEP).exp().expand(len(above)), background, response)
@@ -156,7 +158,6 @@ def _correlated(above: Tensor, background: Tensor, response: Tensor, signal: Ten
 
 def _template(signal: Tensor, background: Tensor, response: Tensor) -> Tensor:
     """ln(1 + S h / B') in bin j for a return in bin k, `[B, j, k]`, for S counts of signal `[B]`."""
-    signal = signal.clamp_min(_LEAST_SIGNAL)
     floor = _UNIFORM_SHARE * signal[:, None] / response.shape[-1]
     return torch.log1p(signal[:, None, None] / (background + floor)[:, :, None] * response)
 

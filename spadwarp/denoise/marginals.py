@@ -29,8 +29,8 @@ def mean_depth(score: Tensor, across: Tensor, down: Tensor) -> Tensor:
     rows = columns = score.new_zeros(())
     odds = [torch.exp(-(_JUMP + more).clamp_min(0.5))[..., None] for more in (across, down.transpose(1, 2))]
     for _ in range(_ROUNDS):
-        told = _probable(score + columns), _probable((score + rows).transpose(1, 2))
-        rows, columns = rows_and_columns(_messages, told, (odds[0], odds[1]))
+        given = _probable(score + columns), _probable((score + rows).transpose(1, 2))
+        rows, columns = rows_and_columns(_messages, given, (odds[0], odds[1]))
         columns = columns.transpose(1, 2)
     probability = torch.softmax((score + rows + columns) / _TEMPERATURE, dim=-1)
     bins = score.shape[-1]
@@ -47,20 +47,20 @@ def _messages(probability: Tensor, odds: Tensor) -> Tensor:
     received, last = torch.ones_like(lines), lines.shape[1] - 1
     apart = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
     # Views are made once, as in `spadwarp.denoise.semi_global`.
-    told, heard = lines.unbind(dim=1), received.unbind(dim=1)
+    given, products = lines.unbind(dim=1), received.unbind(dim=1)
     known = lines.new_empty(2, len(lines), lines.shape[2])
     ahead = torch.ones_like(known)  # the message sent last, forwards and backwards
     now, sent = known.unbind(), ahead.unbind()
     nearer, farther, from_nearer, from_farther = ahead[..., :-1], ahead[..., 1:], known[..., :-1], known[..., 1:]
     for place in range(last):
-        torch.mul(told[place], sent[0], out=now[0])
-        torch.mul(told[last - place], sent[1], out=now[1])
+        torch.mul(given[place], sent[0], out=now[0])
+        torch.mul(given[last - place], sent[1], out=now[1])
         known /= known.sum(dim=-1, keepdim=True).clamp_min_(1e-30)
         ahead.copy_(known)
         farther.add_(from_nearer, alpha=_NEXT)
         nearer.add_(from_farther, alpha=_NEXT)
         ahead.mul_(1.0 / (1.0 + 2.0 * _NEXT)).add_(apart[place])
         ahead /= ahead.amax(dim=-1, keepdim=True)
-        heard[place + 1].mul_(sent[0])
-        heard[last - place - 1].mul_(sent[1])
+        products[place + 1].mul_(sent[0])
+        products[last - place - 1].mul_(sent[1])
     return received.clamp_min_(1e-30).log_().view_as(probability)

@@ -155,7 +155,7 @@ def _truth(held: Held) -> NDArray[np.float32] | None:
 def _stored_depth(
     path: Path, channel: str | None, dataset: str | None, as_depth: bool
 ) -> tuple[NDArray[Any], str] | None:
-    """Depth `[H, W]` or `[N, H, W]` as the file has it, and which of several images it is; None for histograms."""
+    """Depth `[H, W]` or `[N, H, W]` as the file has it, and a text if it is one of several; None for histograms."""
     ending = path.suffix.lower()
     if ending == ".exr":
         channels, _ = read_exr(path)

@@ -60,21 +60,21 @@ def messages(score: Tensor, jump: Tensor, *, slope: float) -> Tensor:
     most = jump.expand(-1, score.shape[1], max(1, last), 1).flatten(0, 1)
     penalties = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
     # Views are made once: a GPU takes less time for the arithmetic of a place than Python for a view.
-    told, heard = lines.unbind(dim=1), received.unbind(dim=1)
+    scores, sums = lines.unbind(dim=1), received.unbind(dim=1)
     known = lines.new_empty(2, len(lines), lines.shape[2])
     ahead = torch.zeros_like(known)  # the message sent last, forwards and backwards
     best = known.new_empty(2, len(lines), 1)
     now, sent = known.unbind(), ahead.unbind()
     nearer, farther, from_nearer, from_farther = ahead[..., :-1], ahead[..., 1:], known[..., :-1], known[..., 1:]
     for place in range(last):
-        torch.add(told[place], sent[0], out=now[0])
-        torch.add(told[last - place], sent[1], out=now[1])
+        torch.add(scores[place], sent[0], out=now[0])
+        torch.add(scores[last - place], sent[1], out=now[1])
         torch.amax(known, dim=-1, keepdim=True, out=best)
         torch.maximum(known, best - penalties[place], out=ahead)
         known -= slope
         torch.maximum(farther, from_nearer, out=farther)
         torch.maximum(nearer, from_farther, out=nearer)
         ahead -= best
-        heard[place + 1].add_(sent[0])
-        heard[last - place - 1].add_(sent[1])
+        sums[place + 1].add_(sent[0])
+        sums[last - place - 1].add_(sent[1])
     return received.view_as(score)

@@ -180,7 +180,7 @@ def read_histograms(
 
 
 def is_own(path: Path) -> bool:
-    """Whether an HDF5 file is one of ours."""
+    """Whether spadwarp wrote this HDF5 file."""
     return (hdf5_format(path) or "").startswith("spadwarp")
 
 
@@ -236,7 +236,7 @@ def listed_arrays(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -
 
 
 def unnamed_dataset(path: Path, listed: str) -> ArgumentError:
-    """That a file holds several arrays, so that one has to be named."""
+    """The error for a file of several arrays of which none was named."""
     return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
 
 

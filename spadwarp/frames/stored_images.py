@@ -21,9 +21,9 @@ __all__ = ["stored_images"]
 def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[NDArray[Any], str] | None:
     """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
     the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
-    of a `.h5` without them the only one. Second, what is to be said of the choice: text, or nothing.
+    of a `.h5` without them the only one. With it a text that names the image taken and those left; "" without a choice.
 
-    Raises `FileError`, and `ArgumentError` where several are as large in a `.mat`, or there are several in a `.h5`.
+    Raises `FileError`, and `ArgumentError` where several of a `.mat` are the largest, or a `.h5` has several.
     """
     ending = path.suffix.lower()
     if ending == ".npy":
@@ -32,12 +32,12 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
     if ending == ".mat":
         entries = mat_entries(path)
         images = {name: one for name, one in entries.items() if one.kind == "dense" and len(one.shape) in (2, 3)}
-        name, said = dataset, ""
+        name, choice = dataset, ""
         if name is None and (several or not histograms_in(entries)):
-            name, said = _largest(path, {name: one.shape for name, one in images.items() if math.prod(one.shape) > 1})
+            name, choice = _largest(path, {name: one.shape for name, one in images.items() if math.prod(one.shape) > 1})
         if name not in images or (len(images[name].shape) == 3 and not several):
             return None
-        return np.asarray(read_mat(path, name, images[name])), said
+        return np.asarray(read_mat(path, name, images[name])), choice
     if ending in (".h5", ".hdf5") and not is_own(path):
         with read_hdf5(path) as file:
             arrays = file.arrays()
@@ -50,13 +50,16 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
 
 
 def _largest(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str | None, str]:
-    """Name of the largest image, and which others there are. Raises `ArgumentError` where several are the largest."""
-    most = max(map(math.prod, shapes.values()), default=0)
+    """Name of the largest image, None without any, and a text that names it and the others, "" without others. Raises
+    `ArgumentError` where several are the largest."""
+    if not shapes:
+        return None, ""
+    most = max(map(math.prod, shapes.values()))
     largest = [name for name, shape in shapes.items() if math.prod(shape) == most]
     if len(largest) > 1:
         raise unnamed_dataset(path, ", ".join(f"{name} {shape}" for name, shape in shapes.items()))
-    others = [name for name in shapes if name not in largest]
-    return (largest[0], f"{largest[0]}, not {', '.join(others)}" if others else "") if largest else (None, "")
+    others = [name for name in shapes if name != largest[0]]
+    return largest[0], f"{largest[0]}, not {', '.join(others)}" if others else ""
 
 
 def _only_image(path: Path, arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]], *, several: bool) -> str:

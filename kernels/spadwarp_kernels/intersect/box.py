@@ -6,8 +6,8 @@ import warp as wp
 @wp.func_native("""
     float in[3], out[3];
     for (int i = 0; i < 3; ++i) {
-        // Infinite along a side. Then only the sides that stand across count, unless the segment lies in one of those
-        // along it, where it meets nothing within the padding.
+        // Infinite for a segment parallel to these two sides: in and out are then infinite as well, and their signs
+        // decide. In the plane of a side 0 * infinity is no number; any answer is right there, within the padding.
         const float inverse = 1.0f / u[i], a = (lower[i] - x[i]) * inverse, b = (upper[i] - x[i]) * inverse;
         in[i] = wp::min(a, b);
         out[i] = wp::max(a, b);

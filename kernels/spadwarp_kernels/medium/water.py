@@ -18,7 +18,7 @@ class Medium:
         albedo: Single-scattering albedo b/c in [0, 1]; with random_albedo, the upper end of the uniform draw.
         anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
         axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
-            switches it off, and is 2 where the transport kernel hands the medium to your functions.
+            switches it off, and functions of your own that the transport kernel calls then see 2.
         per_bit: -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`.
         phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
     """

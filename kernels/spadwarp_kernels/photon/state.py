@@ -24,8 +24,8 @@ class Weight:
     Attributes:
         value: Fraction of the photon that is left.
         taken: By which the last change lowered it, in ledger units.
-        absorbed_water: Sum over the thread's photons of what water took, in ledger units: what they had, less what
-            was left and what others took, but for the thread's sums for the ledger.
+        absorbed_water: Sum over the thread's photons, in ledger units: what they had, less what was left and what
+            `give` gave. It is what water took once the thread's other sums for the ledger are subtracted, at its end.
     """
 
     value: float

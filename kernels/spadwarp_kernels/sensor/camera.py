@@ -23,8 +23,8 @@ class Camera:
         aperture_radius: Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply.
         aperture_area: The area that collects light [m^2], also where the lens is a point.
         inverse_focus: 1 over the depth that is imaged sharply [1/m]; 0 is infinity.
-        focal: Focal length in pixels along rows and columns; this and what follows is read by `CALIBRATED` alone, and
-            for `PLAIN` filled by `launch_transport`.
+        focal: Focal length in pixels along rows and columns. This and what follows is for `CALIBRATED` alone;
+            for `PLAIN`, `launch_transport` computes what it needs of it.
         principal: Image coordinates of the optical axis.
         radial: k1, k2, k3 of Brown's model.
         tangential: p1, p2 of Brown's model.

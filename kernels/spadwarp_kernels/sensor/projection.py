@@ -29,7 +29,7 @@ class Lens(NamedTuple):
         view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
             or the pixel of a scan, shows.
         shows: As `in_view`, for such a view without a port.
-        image: As `project`, for a camera that the transport kernel has prepared; None for `project` itself.
+        image: As `project`, for the camera that the transport kernel gets, see `Camera.focal`; None: `project`.
         toward_middle: As the function of that name, for such a view.
     """
 
