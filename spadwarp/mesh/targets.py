@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
+from spadwarp.mesh.builtins import make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
 from spadwarp.mesh.usd import USD_ENDINGS, read_usd
@@ -166,7 +166,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
         field: How errors and warnings name the target; if empty, they name its file.
 
     Raises:
-        MeshError: Missing or unreadable file, unknown built-in, or a mesh that is empty, not finite or has no area.
+        MeshError: Missing or unreadable file, or a mesh that is empty, not finite or has no area.
     """
     return _load(target, field)[0]
 
@@ -185,15 +185,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
         else:
             mesh = _read_mesh(path, name)
     else:
-        name = f"{field}.builtin = {target.builtin!r}"
-        if target.builtin not in builtin_names():
-            raise MeshError(f"{name} is not one of {', '.join(map(repr, builtin_names()))}")
-        mesh = make_builtin(target.builtin)
-        if target.size is not None and target.builtin not in SIZED_BUILTINS:
-            raise MeshError(
-                f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
-                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
-            )
+        assert target.builtin is not None
+        name, mesh = f"{field}.builtin = {target.builtin!r}", make_builtin(target.builtin)
     if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
         raise MeshError(
             f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"

@@ -183,7 +183,8 @@ def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, f
         low, high = shown_limits(truth, margin=0.05)
         error = measured - truth
         spare = error_limit(error) if np.isfinite(error).any() else 0.0
-        return low - spare, high + spare
+        least, most = shown_limits(np.stack([truth, measured]), margin=0.05)  # errors may all have one sign
+        return max(low - spare, least), min(high + spare, most)
     return shown_limits(measured, beyond=1.0, margin=0.05)
 
 

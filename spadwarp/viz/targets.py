@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.colors import Normalize, to_rgb
 from numpy.typing import NDArray
 
-from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, builtin_names, load_target
-from spadwarp.scene import Scene, Target
+from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, builtin_names, make_builtin
+from spadwarp.scene import Scene
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
 from spadwarp.viz.panels import coloured_depth, strip_bar, strips
@@ -49,10 +49,10 @@ def _scene(target: dict[str, Any], pixels: int) -> Scene:
 
 
 def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Name, faces and extent x, y, z [m] of built-in targets; all if `names` is None."""
+    """Name, faces and extent x, y, z [m] of built-in targets; all if `names` is None. Raises `ArgumentError`."""
     described = []
     for name in builtin_names() if names is None else names:
-        mesh = load_target(Target(builtin=name))
+        mesh = make_builtin(name)
         described.append({"name": name, "faces": len(mesh.faces), "extent": [float(side) for side in mesh.extents]})
     return described
 
@@ -76,7 +76,7 @@ def draw_targets(
         device: Warp device for the rays.
 
     Raises:
-        MeshError: An unknown name.
+        ConfigError: An unknown name.
         FileError: The picture cannot be written.
     """
     chosen = list(builtin_names() if names is None else names)

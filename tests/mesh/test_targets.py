@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from helpers.synthetic_result import cast_truth, make_scene
-from spadwarp.errors import MeshError
+from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, describe_mesh, load_target
 from spadwarp.scene import Scene, Target
 
@@ -319,15 +319,19 @@ def test_faces_without_area_are_dropped_and_counted(tmp_path: Path) -> None:
 
 
 def test_built_ins_that_do_not_exist_are_refused_with_the_names_of_those_that_do() -> None:
-    text = error_of({"builtin": "stairs"})
+    with pytest.raises(ConfigError) as caught:
+        scene_of({"builtin": "plane"}, {"builtin": "stairs"})
+    text = str(caught.value)
     assert text.startswith("targets[1].builtin = 'stairs' is not one of 'staircase', 'plane', 'box', 'sphere', ")
+    assert text.endswith("'bust'; did you mean 'staircase'?")
     assert all(repr(name) in text for name in builtin_names())
 
 
 def test_size_goes_with_those_that_have_none_of_their_own() -> None:
-    assert "targets[1].size = [2.0, 2.0] does not go with builtin = 'staircase'" in error_of(
-        {"builtin": "staircase", "size": [2.0, 2.0]}
-    )
+    with pytest.raises(
+        ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] does not go with builtin = 'staircase'"
+    ):
+        scene_of({"builtin": "staircase", "size": [2.0, 2.0]})
 
 
 def test_too_many_subdivisions_are_refused_before_they_are_made() -> None:

@@ -20,7 +20,7 @@ from spadwarp.mesh import describe_mesh
 from spadwarp.viz import evaluation, style, transient_video, validation
 from spadwarp.viz import learning_curves as curves
 from spadwarp.viz.depth import draw_denoised, draw_depth
-from spadwarp.viz.panels import shown_limits
+from spadwarp.viz.panels import shown_limits, target_limits
 
 FOLDER = os.environ.get("SPADWARP_TEST_PICTURES")  # where the pictures stay, to be looked at
 METHODS = ("input", "median", "gating", "bm3d", "usdn", "dncnn", "pyramid")
@@ -343,3 +343,10 @@ def test_colours_of_a_depth_frame_are_those_of_the_pixels_with_counts():
     low, high = shown_limits(depth, beyond=1.0, weights=counts)
     assert 3.9 < low < 4.02 and 4.08 < high < 4.2
     assert shown_limits(depth, beyond=1.0, weights=0 * counts) == shown_limits(depth, beyond=1.0)
+
+
+def test_colours_of_depth_end_where_truth_and_measurement_do():
+    """The measured depth is up to 2 m too small, nowhere too large."""
+    truth = np.tile(np.linspace(5.0, 6.0, 50), (40, 1))
+    low, high = target_limits(truth, truth - np.linspace(0.0, 2.0, 40)[:, None])
+    assert 2.8 < low < 4.0 and high == pytest.approx(6.0, abs=0.2)
