@@ -16,7 +16,10 @@ from spadwarp.io.parsing import read_toml
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole
 
-__all__ = ["MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
+__all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
+
+LEAST_CROP = 32
+"""Side of the smallest crop that a network learns from [pixels]."""
 
 MODELS = ("pyramid", "histograms", "dncnn", "usdn")
 """Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
@@ -106,7 +109,7 @@ class Optimiser(_Table):
 
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
     batch: Whole = Field(64, ge=1, le=10**6, description="crops per update, on all GPUs together")
-    crop: Whole = Field(96, ge=32, le=16384, description="side of a crop [pixels]")
+    crop: Whole = Field(96, ge=LEAST_CROP, le=16384, description="side of a crop [pixels]")
     wide: Share = Field(0.0, description="part of the updates with a quarter as many crops of twice the side")
     scenes: Whole = Field(512, ge=1, le=10**6, description="scenes that are drawn at a time; without a dataset")
     redraw: Whole = Field(200, ge=1, le=10**12, description="updates between two drawings of scenes")

@@ -38,10 +38,15 @@ class Scenes:
     """
 
     def __init__(
-        self, recipe: TrainingRecipe, rank: int, device: torch.device, given: CleanScenes | None, crop: int = 0
+        self,
+        recipe: TrainingRecipe,
+        rank: int,
+        device: torch.device,
+        given: CleanScenes | None,
+        crop: int | None = None,
     ) -> None:
         self.recipe, self.rank, self.device = recipe, rank, device
-        self.crop = crop or recipe.optimiser.crop
+        self.crop = recipe.optimiser.crop if crop is None else crop
         self.given = None if given is None else given.to(device)
         self.drawn: tuple[int, CleanScenes] | None = None
 
@@ -61,8 +66,12 @@ class Scenes:
 class Samples(Protocol):
     """What a step learns from. `batch` is recorded in a CUDA graph, `prepare` is gone through before each step."""
 
+    scenes: Scenes
     seconds: float
     """What `prepare` takes, on average over the steps."""
+
+    def due(self, step: int) -> int:
+        """Samples that are still to be drawn before the step."""
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         """Draws what the step needs, piece by piece, and yields how many samples of how many are drawn.
@@ -87,6 +96,9 @@ class Fresh:
         self.now: CleanScenes | None = None
         self.held: CleanScenes | None = None
         self.seconds = 0.0  # scenes are few, and drawn rarely
+
+    def due(self, step: int) -> int:
+        return 0
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         now = self.scenes.at(step)
@@ -144,16 +156,22 @@ class Pool:
             self.stream = torch.cuda.Stream(generator.device)
             self.stream.wait_stream(torch.cuda.current_stream(generator.device))
 
+    def due(self, step: int) -> int:
+        return len(self._numbers(step)) * self.portion
+
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
-        due = _FIRST + step // self.interval
-        first = max(self.drawn, due - PORTIONS)
-        total = max(0, due - first) * self.portion
-        for number in range(first, due):
+        numbers, total = self._numbers(step), self.due(step)
+        for place, number in enumerate(numbers):
             began = time.monotonic()
             for drawn in self._draw(number):
-                yield (number - first) * self.portion + drawn, total
+                yield place * self.portion + drawn, total
             self.seconds = (time.monotonic() - began) / self.interval
-        self.drawn = due
+        self.drawn = numbers.stop
+
+    def _numbers(self, step: int) -> range:
+        """Of the portions that the step still needs."""
+        stop = _FIRST + step // self.interval
+        return range(max(self.drawn, stop - PORTIONS), stop)
 
     def hold(self) -> None:
         """The memory is the same from the start."""
@@ -242,9 +260,12 @@ class Sizes:
                 )
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
-        """See `Samples`; of all sizes."""
-        for kind in self.kinds:
-            yield from kind.prepare(step)
+        """See `Samples`; of all sizes, a crop of twice the side counted as four."""
+        counted = [(kind.scenes.crop // self.recipe.optimiser.crop) ** 2 for kind in self.kinds]
+        due = [count * kind.due(step) for count, kind in zip(counted, self.kinds, strict=True)]
+        for place, (count, kind) in enumerate(zip(counted, self.kinds, strict=True)):
+            for drawn, _ in kind.prepare(step):
+                yield sum(due[:place]) + count * drawn, sum(due)
 
     @property
     def seconds(self) -> float:

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from spadwarp.denoise.networks import reads_histograms
-from spadwarp.denoise.recipe import Noise, TrainingRecipe
+from spadwarp.denoise.recipe import LEAST_CROP, Noise, TrainingRecipe
 from spadwarp.denoise.repeatable import fixed_order
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training_steps import Run, Trained, Workers
@@ -69,10 +69,14 @@ def fit(
     workers = Workers(device)
     settings = recipe.optimiser
     if training is not None:
-        scale = 2 if settings.wide else 1
-        most, why = min(training.depth.shape[1:]) // scale, f" with optimiser.wide = {settings.wide}" * (scale - 1)
+        height, width = training.depth.shape[1:]
+        most = min(height, width) // (2 if settings.wide else 1)
+        why = f" with optimiser.wide = {settings.wide}" if settings.wide else ""
+        if most < LEAST_CROP:
+            least = LEAST_CROP * (2 if settings.wide else 1)
+            raise ConfigError(f"data: scenes of {width} x {height} pixels{why}; at least {least} x {least} are needed")
         if settings.crop > most:
-            raise ConfigError(f"optimiser.crop = {settings.crop}{why} is outside [32, {most}]")
+            raise ConfigError(f"optimiser.crop = {settings.crop}{why} is outside [{LEAST_CROP}, {most}]")
     if settings.batch % workers.size:
         raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {workers.size} processes")
     Path(out).mkdir(parents=True, exist_ok=True)

@@ -159,8 +159,7 @@ class Run:
         self.loss_sum = torch.zeros((), device=workers.device)  # of the steps since the last report
         self.step, spent = self._resume()
         self.steps_here = 0
-        self.eager: dict[Samples, int] = {}  # steps by the size of their samples, as long as none is recorded
-        self.recorded: set[Samples] = set()
+        self.eager: dict[Samples, int] = {}  # steps that were not replayed
         self.graphs: dict[Samples, tuple[Any, Tensor]] = {}  # the recorded step and its loss
         self.side: Any = torch.cuda.Stream() if workers.is_cuda else None
         self.last_report, self.timed_from = time.monotonic(), self.step
@@ -246,11 +245,10 @@ class Run:
         self.loss_sum += loss
         self.step += 1
         self.steps_here += 1
-        self.eager[samples] = self.eager.get(samples, 0) + 1
-        settled = self.eager[samples] >= _EAGER
-        if self.side is not None and self.workers.size == 1 and settled and samples not in self.recorded:
-            self.recorded.add(samples)
-            self._capture(samples)
+        if samples not in self.graphs:
+            self.eager[samples] = self.eager.get(samples, 0) + 1
+            if self.side is not None and self.workers.size == 1 and self.eager[samples] == _EAGER:
+                self._capture(samples)
 
     def _capture(self, samples: Samples) -> None:
         """Records a step as a CUDA graph; where that fails, training goes on step by step."""

@@ -120,6 +120,18 @@ def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):
         assert some / new == pytest.approx(OPTIMISER["uses"], rel=0.15)  # portions are of whole samples
 
 
+def test_how_many_samples_are_due_is_told_of_both_sizes_together(drawn):
+    """A crop of twice the side counts as four."""
+    ours = sizes(batch=16, wide=0.25, pool=16 * PORTIONS)
+    narrow, wide = ours.kinds
+    total = 8 * (narrow.portion + 4 * wide.portion)  # 8 portions of each before the first step
+    pieces = prepare(ours, 0)
+    assert {whole for _, whole in pieces} == {total}
+    numbers = [drawn for drawn, _ in pieces]
+    assert numbers == sorted(numbers) and numbers[-1] == total
+    assert prepare(ours, 0) == []
+
+
 def test_without_them_all_steps_learn_from_the_same_size(drawn):
     assert len(sizes().kinds) == 1
     whole = sizes(wide=1.0).kinds

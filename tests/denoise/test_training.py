@@ -293,6 +293,22 @@ def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path, wide):
     assert [line["loss"] for line in lines] == pytest.approx([line["loss"] for line in reference], rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("size", "wide", "problem"),
+    [
+        (48, 0.0, r"optimiser\.crop = 64 is outside \[32, 48\]"),
+        (80, 0.5, r"optimiser\.crop = 64 with optimiser\.wide = 0\.5 is outside \[32, 40\]"),
+        (31, 0.0, r"data: scenes of 31 x 31 pixels; at least 32 x 32 are needed"),
+        (48, 0.5, r"data: scenes of 48 x 48 pixels with optimiser\.wide = 0\.5; at least 64 x 64 are needed"),
+    ],
+)
+def test_crops_that_no_scene_holds_are_refused(tmp_path, size, wide, problem):
+    given = scenes(size=size)
+    recipe = TrainingRecipe.from_dict({"model": "usdn", "optimiser": {**OPTIMISER, "crop": 64, "wide": wide}})
+    with pytest.raises(ConfigError, match=problem):
+        fit(recipe, given, given, tmp_path, device="cpu")
+
+
 @pytest.mark.slow
 def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
