@@ -72,6 +72,21 @@ def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
         assert data.low_words.shape == data.tally.shape and not data.low_words.numpy().any()
 
 
+@pytest.mark.slow
+def test_smaller_launches_after_a_large_one_give_the_same_bits(monkeypatch, device):
+    """Only the second of the three is large enough to begin with low words."""
+    monkeypatch.setattr("spadwarp_kernels.tally.low_words.CACHE_BYTES", 0)
+    spec, model = built(CASES["water"], device)
+    kept, plain = sk.make_data(model), sk.make_data(model)
+    first = 0
+    for photons in (200, 100_000, 200):
+        for data, one in ((kept, model), (plain, dataclasses.replace(model, low_words=False))):
+            sk.launch_transport(spec, one, data, seed=3, first_id=first, photon_count=photons)
+        first += photons
+        np.testing.assert_array_equal(kept.tally.numpy(), plain.tally.numpy())
+        assert (kept.low_words is None) == (device == "cpu" or photons == first)
+
+
 @wp.kernel
 def add_kernel(
     voxel: wp.array(dtype=int),
