@@ -129,7 +129,9 @@ def make_queue(
     first_score = 4 if more else 3
     entries = queue_entries(points, long)
     write_words, read_words = _make_words(confocal, short, 2 * entries)
-    warp_memory = make_warp_memory(_vectors(more, derivatives, polarised) * entries if used else 0, flights and long)
+    warp_memory = make_warp_memory(
+        _vectors(more, derivatives, polarised) * entries if used else 0, flights and long and not traces
+    )
 
     @wp.func
     def write(memory: int, entry: int, request: Request):

@@ -113,10 +113,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     # Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
     at_once = cuda and not has_bvh and ((queues and (flights or not has_mesh) and spec.grid is None) or not scores)
     at_once = at_once and (long_queue_fits(spec) or not flights)
-    asks_twice = at_once and flights
+    # A flight and the event at its end come in one round where the queue has room for both, else in two.
+    asks_twice = flights and queues and spec.grid is None and long_queue_fits(spec)
+    apart = flights and not asks_twice
     short = not (has_mesh or flights or confocal or spec.derivatives or spec.polarised or spec.grid)
     # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
-    drains = asks_twice or (queues and not has_bvh and spec.points > 1)
+    drains = queues and not has_bvh and (asks_twice or spec.points > 1)
     early = at_once or (has_bvh and queues and not flights)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
     walking_lanes = GUIDED_WALKING_LANES if flights else WALKING_LANES
@@ -202,12 +204,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
                 if wp.static(not at_once) and flying:
                     id = base + wp.uint64(s.photon)
                     depart(s, medium, layers, camera, gate, limits, surfaces, kept, id, words)
-                # Round 0 scores the flight, round 1 the event at its end.
-                round = int(wp.static(0 if flights and not at_once else 1))
+                # Round 0 scores the flight, round 1 the event at its end, or both.
+                round = int(wp.static(0 if apart else 1))
                 while round < 2:
                     asked = Asked()
                     if wp.static(flights and not at_once):
-                        if round == 0 and flown(s, queued):
+                        if round == wp.static(0 if apart else 1) and flown(s, queued):
                             asked.request = ask_flight(s, memory)
                     if round == 1 and arrives(s, queued, flying):
                         if wp.static(at_once):
