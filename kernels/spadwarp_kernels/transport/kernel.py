@@ -119,7 +119,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     short = not (has_mesh or flights or confocal or spec.derivatives or spec.polarised or spec.grid)
     # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
     drains = queues and not has_bvh and (asks_twice or spec.points > 1)
-    early = at_once or (has_bvh and queues and not flights)
+    early = at_once or (has_bvh and queues and not apart)
     ray_lanes = (GUIDED_RAY_LANES if flights else RAY_LANES) if has_bvh else 32
     walking_lanes = GUIDED_WALKING_LANES if flights else WALKING_LANES
     start_lanes = START_LANES if scores and spec.grid is None and (flights or not has_bvh) else FEWER_START_LANES
