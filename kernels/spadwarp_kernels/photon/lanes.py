@@ -63,9 +63,10 @@ _MEMORY = """
 """
 
 
-def fits_in_block(vectors: int) -> bool:
-    """Whether a block has the shared memory, 48 KiB, for queues of so many vec4 in each of its warps."""
-    return 16 * (_QUEUE + vectors) * BLOCK_SIZE // 32 <= 48 * 1024
+def fits_in_block(vectors: int, kib: int) -> bool:
+    """Whether so much shared memory of a block, at most 48 KiB, is enough for queues of so many vec4 in each of its
+    warps."""
+    return 16 * (_QUEUE + vectors) * BLOCK_SIZE // 32 <= kib * 1024
 
 
 # As if another lane had it: the assembler too, which looks through the above, then keeps it in a register.

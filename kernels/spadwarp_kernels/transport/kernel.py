@@ -108,14 +108,13 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     has_bvh = has_mesh and not brute_force
     in_blocks = bool(spec.blocks)
     queues = scores and cuda and not in_blocks  # scores of blocks stay with the thread
+    # A flight and the event at its end are asked for in one round where the queue has room for both, else in two.
+    asks_twice = flights and queues and long_queue_fits(spec, has_bvh)
+    apart = flights and not asks_twice
     # Where nothing waits for a shadow ray, a photon flies, collides and scatters in one branch, so that a warp pays for
     # these once. Otherwise a new direction comes before the score, or after it: measured, which of the two is faster.
-    # Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
-    at_once = cuda and not has_bvh and ((queues and (flights or not has_mesh) and spec.grid is None) or not scores)
-    at_once = at_once and (long_queue_fits(spec) or not flights)
-    # A flight and the event at its end come in one round where the queue has room for both, else in two.
-    asks_twice = flights and queues and spec.grid is None and long_queue_fits(spec)
-    apart = flights and not asks_twice
+    at_once = cuda and not has_bvh and (asks_twice or not scores)
+    at_once = at_once or (queues and not flights and not has_mesh and spec.grid is None)
     short = not (has_mesh or flights or confocal or spec.derivatives or spec.polarised or spec.grid)
     # Where a round adds more requests than a warp scores at a time, it scores until fewer than that are left.
     drains = queues and not has_bvh and (asks_twice or spec.points > 1)
@@ -204,7 +203,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
                 if wp.static(not at_once) and flying:
                     id = base + wp.uint64(s.photon)
                     depart(s, medium, layers, camera, gate, limits, surfaces, kept, id, words)
-                # Round 0 scores the flight, round 1 the event at its end, or both.
+                # Round 0 scores the flight and round 1 the event at its end, or round 1 both.
                 round = int(wp.static(0 if apart else 1))
                 while round < 2:
                     asked = Asked()
