@@ -10,6 +10,9 @@ from spadwarp.scene import Scene
 WATER = {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.8, "group_index": 1.0}
 PLATE = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
+# Of so many faces that a GPU walks down a tree to them.
+TREE = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
+
 
 def scene(**sections):
     """A 4 x 4 pixel scene in which even `analog` converges: a wide lens and a near plate; sections change it."""

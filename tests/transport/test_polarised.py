@@ -8,7 +8,7 @@ from scipy import stats
 
 import spadwarp
 from helpers.estimators import clear_at_the_lens
-from helpers.scenes import PLATE, scene, single_scatter_case
+from helpers.scenes import PLATE, TREE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.polarised_lidar import linear, stokes_factor
 from reference.rayleigh_tables import TABLES, UPPER
@@ -32,9 +32,6 @@ def polarised(**sections):
 def totals(result):
     """Each channel's light in all pixels, by component and bin: [channels, components, bins]."""
     return np.array([values.sum(axis=(1, 2)) for values in result.channels.values()])
-
-
-TREE = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
 
 @pytest.mark.parametrize("targets", [[PLATE], [], [TREE]], ids=["plate", "water", "tree"])

@@ -10,16 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spadwarp
-from helpers.scenes import scene
+from helpers.scenes import PLATE, TREE, scene
 
 
 def _bits(result):
     return result.tallies.tobytes(), dict(result.ledger), dict(result.counters)
 
 
+@pytest.mark.parametrize("targets", [[PLATE], [TREE]], ids=["plate", "tree"])
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
-def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, device):
-    one = scene(transport={"estimator": estimator})
+def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, targets, device):
+    one = scene(transport={"estimator": estimator}, targets=targets)
     whole = spadwarp.simulate(one, photons=20_000, seed=2**63 + 5, device=device, threads=1, launch_size=20_000)
     assert whole.tallies.any()
     for threads, launch_size in [(1, 777), (2, 1000), (3, 4096)]:
