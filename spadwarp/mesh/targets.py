@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import MeshError
+from spadwarp.errors import ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.mesh.builtins import make_builtin
+from spadwarp.limits import suggestion
+from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
 from spadwarp.mesh.usd import USD_ENDINGS, read_usd
@@ -72,6 +73,7 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
     """The scene's targets as one mesh, or None if it has none.
 
     Raises:
+        ConfigError: An unknown built-in, or a size for one that has its own.
         MeshError: A target that is missing, unreadable, empty, not finite or without area; names file and field.
     """
     parts: list[TriangleMesh] = []
@@ -166,6 +168,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
         field: How errors and warnings name the target; if empty, they name its file.
 
     Raises:
+        ConfigError: An unknown built-in, or a size for one that has its own.
         MeshError: Missing or unreadable file, or a mesh that is empty, not finite or has no area.
     """
     return _load(target, field)[0]
@@ -185,8 +188,16 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
         else:
             mesh = _read_mesh(path, name)
     else:
-        assert target.builtin is not None
-        name, mesh = f"{field}.builtin = {target.builtin!r}", make_builtin(target.builtin)
+        name, known = f"{field}.builtin = {target.builtin!r}", builtin_names()
+        if target.builtin not in known:
+            listed = ", ".join(map(repr, known))
+            raise ConfigError(f"{name} is not one of {listed}{suggestion(target.builtin, known)}")
+        mesh = make_builtin(target.builtin)
+        if target.size is not None and target.builtin not in SIZED_BUILTINS:
+            raise ConfigError(
+                f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
+                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
+            )
     if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
         raise MeshError(
             f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from spadwarp.limits import suggestion
 from spadwarp.scene.sections import Scale, Section, Size, Vector, Whole
 
 
@@ -41,15 +40,6 @@ class Target(Section):
     specular_index: float = Field(1.5, ge=1, le=10)
     """phase index of its facets, by which they polarise light; polarised light alone"""
 
-    @field_validator("builtin")
-    @classmethod
-    def _known(cls, name: str | None) -> str | None:
-        from spadwarp.mesh.builtins import builtin_names
-
-        if name is not None and name not in (names := builtin_names()):
-            raise ValueError(f"is not one of {', '.join(map(repr, names))}{suggestion(name, names)}")
-        return name
-
     @model_validator(mode="after")
     def _one_mesh(self) -> Self:
         if (self.builtin is None) == (self.mesh is None):
@@ -58,7 +48,6 @@ class Target(Section):
             raise ValueError(f"scale = {list(self.scale)} holds a zero")
         if self.size is not None and self.builtin is None:
             raise ValueError(f"size = {list(self.size)} goes with builtin only; a mesh file takes scale")
-        self._check_size()
         if self.reflectance == "from_file":
             if self.mesh is None:
                 raise ValueError("reflectance = 'from_file' goes with mesh only; a builtin takes a number")
@@ -70,12 +59,3 @@ class Target(Section):
         elif self.reflectance_scale != 1:
             raise ValueError(f"reflectance_scale = {self.reflectance_scale:g} goes with reflectance = 'from_file' only")
         return self
-
-    def _check_size(self) -> None:
-        from spadwarp.mesh.builtins import SIZED_BUILTINS
-
-        if self.size is not None and self.builtin not in SIZED_BUILTINS:
-            raise ValueError(
-                f"size = {list(self.size)} does not go with builtin = {self.builtin!r}, which has its own;"
-                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
-            )

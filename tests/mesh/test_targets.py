@@ -320,7 +320,7 @@ def test_faces_without_area_are_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_built_ins_that_do_not_exist_are_refused_with_the_names_of_those_that_do() -> None:
     with pytest.raises(ConfigError) as caught:
-        scene_of({"builtin": "plane"}, {"builtin": "stairs"})
+        build_mesh(scene_of({"builtin": "plane"}, {"builtin": "stairs"}))
     text = str(caught.value)
     assert text.startswith("targets[1].builtin = 'stairs' is not one of 'staircase', 'plane', 'box', 'sphere', ")
     assert text.endswith("'bust'; did you mean 'staircase'?")
@@ -331,7 +331,7 @@ def test_size_goes_with_those_that_have_none_of_their_own() -> None:
     with pytest.raises(
         ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] does not go with builtin = 'staircase'"
     ):
-        scene_of({"builtin": "staircase", "size": [2.0, 2.0]})
+        build_mesh(scene_of({"builtin": "staircase", "size": [2.0, 2.0]}))
 
 
 def test_too_many_subdivisions_are_refused_before_they_are_made() -> None:

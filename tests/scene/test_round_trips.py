@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from helpers.minimal_scene import CAMERA, MINIMAL, scene
 from spadwarp.errors import ConfigError
-from spadwarp.mesh import SIZED_BUILTINS
 from spadwarp.scene import Scene, load_scene, presets
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
@@ -100,7 +99,7 @@ section_values = {
     ),
     "targets": st.lists(
         st.fixed_dictionaries(
-            {"builtin": st.sampled_from(SIZED_BUILTINS), "translation": vector},
+            {"builtin": st.text(min_size=1, max_size=9), "translation": vector},
             optional={
                 "scale": st.floats(0.1, 9) | st.just([1, 2, 3]),
                 "size": st.lists(st.just(2.5), min_size=1, max_size=3),
