@@ -54,9 +54,9 @@ def draw_case(axis: Axes, points: dict[str, list[Point]], unit: str, colours: di
         axis.errorbar(date, mean / first, yerr=spread, fmt="o-", color=colours[device], label=device)
         axis.annotate(
             f"{mean[-1]:.3g} {unit}/s",
-            (0.97, 0.04 + 0.1 * number),
+            (0.04, 0.96 - 0.1 * number),
             xycoords="axes fraction",
-            ha="right",
+            va="top",
             size=6.5,
             color=colours[device],
         )
