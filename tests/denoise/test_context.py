@@ -119,7 +119,7 @@ def test_two_returns_are_not_averaged():
 
 
 def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_path):
-    """Two signal photons a pixel among ten of the background; over eight noises 0.76 ± 0.05 times the squared error."""
+    """Two signal photons a pixel among ten of the background; over eight noises 0.75 ± 0.04 times the squared error."""
     old = {
         name: value for name, value in load_file(WEIGHTS / "histograms.safetensors").items() if "context." not in name
     }
@@ -207,8 +207,7 @@ def test_scattered_light_beside_a_bright_target_is_water():
 
 @pytest.mark.parametrize(("size", "photons"), [(192, 100.0), (256, 800.0)])
 def test_water_far_from_a_small_target_and_from_the_border_is_water(size, photons):
-    """Weights from crops of 64 × 64 pixels alone invent 1 to 35 %; with the signal of the whole frame, these invent 0.4
-    and 36 %."""
+    """With the mean signal of the whole frame the network invents targets in 0.2 and 37 % of the water."""
     seen, _, counts = ball(size, 15.0, photons)
     found = found_in(counts, 11.0)
     assert np.mean(found.target_probability[seen] < 0.5) < 0.01
