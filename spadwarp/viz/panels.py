@@ -95,7 +95,7 @@ class Panels:
         extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[
             int((image < low).any()), int((image > high).any())
         ]
-        label = wrapped(label, self._cell - 0.2)
+        label = wrapped(label, self._cell - 0.45)  # its middle is that of the bar, which numbers and margins narrow
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
         if scale == "log":
             ticks, digits = _log_ticks(low, high, (self._cell - 0.3) / 0.4)
@@ -119,7 +119,8 @@ class Panels:
         factor, unit = (1e3, "mm") if reach < 0.1 else (1e2, "cm") if reach < 1.0 else (1.0, "m")
         known = max(1, int(np.isfinite(error).sum()))
         below, above = (100 * np.count_nonzero(side) / known for side in (error < -reach, error > reach))
-        beyond = f"\n{percent(below)} below, {percent(above)} above" if below or above else ""
+        parts = (f"{percent(below)} below,", f"{percent(above)} above")  # neither is broken
+        beyond = "\n" + " ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts) if below or above else ""
         self.show(factor * error, title, f"depth error [{unit}]{beyond}", ERROR_MAP, (-factor * reach, factor * reach))
 
     def show_intensity(self, image: NDArray[Any], title: str, label: str) -> None:
@@ -183,8 +184,9 @@ def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, f
         low, high = shown_limits(truth, margin=0.05)
         error = measured - truth
         spare = error_limit(error) if np.isfinite(error).any() else 0.0
-        least, most = shown_limits(np.stack([truth, measured]), margin=0.05)  # errors may all have one sign
-        return max(low - spare, least), min(high + spare, most)
+        # Errors may all have one sign, and single ones may be as large as the gate.
+        least, most = shown_limits(measured, beyond=1.0, margin=0.05)
+        return max(low - spare, min(low, least)), min(high + spare, max(high, most))
     return shown_limits(measured, beyond=1.0, margin=0.05)
 
 
