@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Protocol
 
 import numpy as np
@@ -189,7 +190,7 @@ class Pool:
         part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
         generator = torch.Generator(self.generator.device).manual_seed(int(host.integers(2**62)))
         is_crowded = host.random() < part.crowded
-        with torch.cuda.stream(self.stream):
+        with self._apart():
             scenes = self.scenes.at(max(0, number - _FIRST) * self.interval)
             if host.random() < part.open_water:
                 scenes = in_open_water(scenes)
@@ -197,7 +198,7 @@ class Pool:
                 scenes = crowded(scenes)
         first = number % PORTIONS * self.portion
         for done in range(0, self.portion, self.piece):
-            with torch.cuda.stream(self.stream):
+            with self._apart():
                 new = draw_batch(
                     scenes, part, size=min(self.piece, self.portion - done), crop=self.scenes.crop,
                     generator=generator, histograms=True,
@@ -208,12 +209,16 @@ class Pool:
             yield done + len(new.frame)
         self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
 
+    def _apart(self) -> AbstractContextManager[Any]:
+        """Of what is drawn. Without a stream PyTorch would take up the GPU here, also for a training on the CPU."""
+        return nullcontext() if self.stream is None else torch.cuda.stream(self.stream)
+
     def _keep(self, new: Batch, first: int) -> None:
         """Copies samples to the pool's memory, after the steps that still read it."""
         if self.stream is not None:
             here = torch.cuda.current_stream(self.generator.device)
             here.wait_stream(self.stream)
-            for values in new:
+            for values in new:  # whose memory the next drawing may have only when they have been copied
                 values.record_stream(here)
         if self.memory is None:
             size = PORTIONS * self.portion

@@ -60,7 +60,8 @@ def prepare_kernels(device: str | None = None) -> None:
 def load_transport_kernel(spec: Any, devices: Sequence[wp.Device]) -> Callable[[], None]:
     """Begins to load the kernel of a spec on CPUs; the function returned waits for it, or raises its error.
 
-    On GPUs it does nothing: `DeviceWorker` loads the kernel there, of which large histograms may need another one.
+    On GPUs, and where memory is limited, it does nothing: `DeviceWorker` loads the kernel. On a GPU that may be another
+    one, for a large histogram.
     """
     import spadwarp_kernels as sk
 

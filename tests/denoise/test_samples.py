@@ -200,6 +200,17 @@ def test_drawing_goes_on_in_pieces_and_an_abandoned_one_begins_again(drawn):
     assert prepare(whole, 0) == []
 
 
+def test_samples_drawn_on_a_cpu_leave_the_gpu_alone(drawn, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a GPU is taken up")
+
+    for name in ("stream", "current_stream", "current_device", "Stream"):
+        monkeypatch.setattr(torch.cuda, name, refuse)
+    ours = sizes(wide=0.5)
+    assert prepare(ours, 0)
+    assert all(len(kind.batch().frame) == kind.size for kind in ours.kinds)
+
+
 def test_a_pool_beyond_the_memory_is_refused():
     with pytest.raises(
         DeviceError, match=r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"

@@ -150,7 +150,7 @@ def make_data(
 # Threads of a CUDA launch: enough to fill any GPU, few enough that flushing their counts costs nothing.
 CUDA_THREADS = 1 << 19
 
-# Photons of one launch.
+# In one launch.
 _MOST_PHOTONS = 1 << 26
 
 
