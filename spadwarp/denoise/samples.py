@@ -210,7 +210,7 @@ class Pool:
         self.filled.fill_(min(number + 1, PORTIONS) * self.portion)
 
     def _apart(self) -> AbstractContextManager[Any]:
-        """Of what is drawn. Without a stream PyTorch would take up the GPU here, also for a training on the CPU."""
+        """The stream in which samples are drawn. On a CPU none: `torch.cuda.stream(None)`, too, takes up a GPU."""
         return nullcontext() if self.stream is None else torch.cuda.stream(self.stream)
 
     def _keep(self, new: Batch, first: int) -> None:
