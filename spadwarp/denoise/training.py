@@ -33,6 +33,7 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 _TIMED = 5  # steps after which the duration is foretold
 _PATIENCE = 3.0  # seconds after which it is said how long samples take to be drawn
+_AGAIN = 30.0  # and how many later it is said again
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
 
 
@@ -70,13 +71,12 @@ def fit(
     settings = recipe.optimiser
     if training is not None:
         height, width = training.depth.shape[1:]
-        most = min(height, width) // (2 if settings.wide else 1)
-        why = f" with optimiser.wide = {settings.wide}" if settings.wide else ""
+        scale, why = (2, f" with optimiser.wide = {settings.wide}") if settings.wide else (1, "")
+        most, given = min(height, width) // scale, f"scenes of {width} x {height} pixels"
         if most < LEAST_CROP:
-            least = LEAST_CROP * (2 if settings.wide else 1)
-            raise ConfigError(f"data: scenes of {width} x {height} pixels{why}; at least {least} x {least} are needed")
+            raise ConfigError(f"data: {given}{why}; at least {scale * LEAST_CROP} x {scale * LEAST_CROP} are needed")
         if settings.crop > most:
-            raise ConfigError(f"optimiser.crop = {settings.crop}{why} is outside [{LEAST_CROP}, {most}]")
+            raise ConfigError(f"optimiser.crop = {settings.crop}{why} is outside [{LEAST_CROP}, {most}]: {given}")
     if settings.batch % workers.size:
         raise ConfigError(f"optimiser.batch = {settings.batch} cannot be shared evenly by {workers.size} processes")
     Path(out).mkdir(parents=True, exist_ok=True)
@@ -117,19 +117,20 @@ def fit(
 
 
 def _prepared(run: Run, interrupted: threading.Event, notify: Callable[[str], None] | None) -> bool:
-    """Draws the samples of the next step; False where it was interrupted. Says once how long this takes, if it does."""
-    began, silent = time.monotonic(), notify is None or run.steps_here > 0 or run.workers.rank > 0
+    """Draws the samples of the next step; False where it was interrupted. Says now and then how long this takes."""
+    silent = notify is None or run.steps_here > 0 or run.workers.rank > 0
+    began, due, first, advice = time.monotonic(), _PATIENCE, (0.0, 0), _advice(run.workers)
     for drawn, total in run.samples.prepare(run.step):
         if run.workers.any(interrupted.is_set()):
             return False
         seconds = time.monotonic() - began
-        if not silent and notify is not None and seconds > _PATIENCE and drawn < total:
-            left = max(1.0, seconds * (total - drawn) / drawn)
-            notify(
-                f"{total - drawn} of {total} samples are still to be drawn before the next step, about {left:.0f} s"
-                f"{_advice(run.workers)}"
-            )
-            silent = True
+        if not first[1]:
+            first = seconds, drawn  # which loads what is needed, and takes longer than the others
+        elif not silent and notify is not None and seconds > due and drawn < total:
+            left = max(1.0, (seconds - first[0]) * (total - drawn) / (drawn - first[1]))
+            rest = f"{total - drawn} of {total} samples are still to be drawn before the next step"
+            notify(f"{rest}, about {left:.0f} s{advice}")
+            due, advice = seconds + _AGAIN, ""
     return True
 
 
@@ -146,8 +147,9 @@ def _advice(workers: Workers) -> str:
         return ""
     return (
         " on this CPU; a data-centre GPU trains in minutes. The package has trained weights, which `spadwarp denoise` "
-        "uses; fewer steps (--steps, in a new folder), or start from these weights (start in the recipe), take less. "
-        "Ctrl-C keeps a checkpoint from which the same command resumes"
+        "uses; fewer steps (--steps, in a new folder), or start from these weights (start in the recipe), take less, "
+        "and fewer samples (optimiser.pool) are drawn sooner. Ctrl-C keeps a checkpoint of the steps, from which the "
+        "same command resumes; samples are drawn anew"
     )
 
 

@@ -198,6 +198,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
                 f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
                 f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
             )
+    if len(mesh.faces) == 0:
+        raise MeshError(f"{name}: the mesh has no faces")
     if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
         raise MeshError(
             f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"
@@ -211,8 +213,6 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
     size = target.size or (1.0,)  # one number for all axes, two for x and y, or three
     stretch = np.array([*size, 1.0] if len(size) == 2 else np.broadcast_to(size, 3))
     mesh.apply_transform(placement(stretch * target.scale, target.rotation_deg, target.translation))
-    if len(mesh.faces) == 0:
-        raise MeshError(f"{name}: the mesh has no faces")
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
         corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
     if not (inside := np.abs(corners) <= FARTHEST).all():

@@ -45,7 +45,7 @@ def draw_denoised(
     """A frame before and after, depth `[H, W]` [m] each; returns the path.
 
     With the truth also that, the error, and in colours of their own the pixels in which a target was missed or
-    invented: NaN stands for no target. `width`: of the picture [inch].
+    invented, and their parts of the target and of the water: NaN stands for no target. `width`: of the picture [inch].
     """
     known = truth is not None and np.isfinite(truth).any()
     scale = truth if truth is not None and known else denoised if np.isfinite(denoised).any() else noisy
@@ -58,8 +58,9 @@ def draw_denoised(
     else:
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
-        parts = percent(100 * missed.mean()), percent(100 * invented.mean())
-        label = f"depth z [m]\nblack: missed, {parts[0]}\nred: invented, {parts[1]}"
+        parts = (100 * some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
+        of_target, of_water = map(percent, parts)
+        label = f"depth z [m]\nblack: missed, {of_target}\nred: invented, {of_water}"
         mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")

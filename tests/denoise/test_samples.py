@@ -219,14 +219,30 @@ def test_a_pool_beyond_the_memory_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"), [(1.6, ["2 of 4 samples are still to be drawn before the next step, about 3 s"]), (0.8, [])]
+    ("seconds", "count", "left"),
+    [(1.6, 4, ["2 of 4 samples are still to be drawn before the next step, about 3 s"]), (0.8, 4, [])],
 )
-def test_how_long_samples_take_is_said_only_if_some_are_left(monkeypatch, seconds, said):
-    """Once, more than three seconds after the start, and not at the last piece."""
+def test_how_long_samples_take_is_said_only_if_some_are_left(monkeypatch, seconds, count, left):
+    """More than three seconds after the start, and not at the last piece."""
     clock, heard = itertools.count(0.0, seconds), []
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
+    assert training._prepared(unprepared(count), threading.Event(), heard.append)
+    assert heard == left
+
+
+def test_how_long_samples_take_is_said_again(monkeypatch):
+    """Every half minute; the first piece, which here takes twenty times as long as the others, does not count."""
+    clock, heard = itertools.chain([0.0], itertools.count(20.0, 1.0)), []
+    monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
+    assert training._prepared(unprepared(100), threading.Event(), heard.append)
+    assert [text.partition(",")[0] for text in heard] == [
+        f"{rest} of 100 samples are still to be drawn before the next step" for rest in (98, 67, 36, 5)
+    ]
+    assert [text.partition("about ")[2] for text in heard] == ["98 s", "67 s", "36 s", "5 s"]
+
+
+def unprepared(count):
+    """A run whose next step needs so many samples."""
+    pieces = SimpleNamespace(prepare=lambda step: ((drawn, count) for drawn in range(1, count + 1)))
     workers = SimpleNamespace(rank=0, is_cuda=True, any=bool)
-    pieces = SimpleNamespace(prepare=lambda step: ((drawn, 4) for drawn in (1, 2, 3, 4)))
-    run = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)
-    assert training._prepared(run, threading.Event(), heard.append)
-    assert heard == said
+    return SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)

@@ -303,6 +303,15 @@ def test_incomplete_mesh_files_are_refused(tmp_path: Path, name: str, text: str,
     assert problem in error_of({"mesh": str(path), "reflectance": "from_file" if problem else 0.5})
 
 
+@pytest.mark.parametrize(("name", "text"), [("empty.obj", "# nothing\n"), ("text.stl", "hello")])
+def test_files_without_faces_are_refused(tmp_path: Path, name: str, text: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    assert error_of({"mesh": str(path)}).endswith(f"{name}': the mesh has no faces")
+    with pytest.raises(MeshError, match="no faces"):
+        describe_mesh(path)
+
+
 def test_meshes_without_any_area_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "line.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n")
