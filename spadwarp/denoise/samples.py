@@ -266,11 +266,10 @@ class Sizes:
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
         """See `Samples`; of all sizes, a crop of twice the side counted as four."""
-        counted = [(kind.scenes.crop // self.recipe.optimiser.crop) ** 2 for kind in self.kinds]
-        due = [count * kind.due(step) for count, kind in zip(counted, self.kinds, strict=True)]
-        for place, (count, kind) in enumerate(zip(counted, self.kinds, strict=True)):
-            for drawn, _ in kind.prepare(step):
-                yield sum(due[:place]) + count * drawn, sum(due)
+        due = [(kind.scenes.crop // self.recipe.optimiser.crop) ** 2 * kind.due(step) for kind in self.kinds]
+        for place, kind in enumerate(self.kinds):
+            for drawn, all_drawn in kind.prepare(step):
+                yield sum(due[:place]) + due[place] * drawn // all_drawn, sum(due)
 
     @property
     def seconds(self) -> float:

@@ -32,8 +32,8 @@ PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Signal photons per pixel, a third of the background, at which networks that read histograms are validated."""
 
 _TIMED = 5  # steps after which the duration is foretold
-_PATIENCE = 3.0  # seconds after which it is said how long samples take to be drawn
-_AGAIN = 30.0  # and how many later it is said again
+_PATIENCE = 3.0  # seconds before the first message on how long the samples still take
+_AGAIN = 30.0  # seconds from one such message to the next
 _VALIDATION_SEED = 2**40  # of drawn scenes, far from those of training
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spadwarp.errors import ArgumentError
+from spadwarp.limits import suggestion
 
 if TYPE_CHECKING:
     import trimesh
@@ -31,8 +32,8 @@ def make_builtin(name: str) -> trimesh.Trimesh:
 
     Raises `ArgumentError` for a name that is not among `builtin_names()`.
     """
-    if name not in builtin_names():
-        raise ArgumentError(f"builtin = {name!r} is not one of {', '.join(map(repr, builtin_names()))}")
+    if name not in (known := builtin_names()):
+        raise ArgumentError(f"builtin = {name!r} is not one of {', '.join(map(repr, known))}{suggestion(name, known)}")
     return _built(name).copy()
 
 

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, MeshError
+from spadwarp.errors import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.limits import suggestion
-from spadwarp.mesh.builtins import SIZED_BUILTINS, builtin_names, make_builtin
+from spadwarp.mesh.builtins import SIZED_BUILTINS, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
 from spadwarp.mesh.usd import USD_ENDINGS, read_usd
@@ -188,11 +187,12 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
         else:
             mesh = _read_mesh(path, name)
     else:
-        name, known = f"{field}.builtin = {target.builtin!r}", builtin_names()
-        if target.builtin not in known:
-            listed = ", ".join(map(repr, known))
-            raise ConfigError(f"{name} is not one of {listed}{suggestion(target.builtin, known)}")
-        mesh = make_builtin(target.builtin)
+        assert target.builtin is not None  # the one or the other, see `Target`
+        name = f"{field}.builtin = {target.builtin!r}"
+        try:
+            mesh = make_builtin(target.builtin)
+        except ArgumentError as error:
+            raise ConfigError(f"{field}.{error}") from error
         if target.size is not None and target.builtin not in SIZED_BUILTINS:
             raise ConfigError(
                 f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"

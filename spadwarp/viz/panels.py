@@ -48,6 +48,7 @@ class Panels:
         columns = math.ceil(count / math.ceil(count / columns))  # lines of equal length
         lines = math.ceil(count / columns)
         self._cell = min(width / columns, _LARGEST)
+        self._line = self._cell - 0.4  # of a label: its middle is that of the bar, which numbers and margins narrow
         height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
         # Titles, numbers and labels; more below for its labels and a legend.
         self.figure = new_figure(width, lines * (height + 1.1) + (below + 0.7) * bool(below))
@@ -95,7 +96,7 @@ class Panels:
         extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[
             int((image < low).any()), int((image > high).any())
         ]
-        label = wrapped(label, self._cell - 0.45)  # its middle is that of the bar, which numbers and margins narrow
+        label = wrapped(label, self._line)
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
         if scale == "log":
             ticks, digits = _log_ticks(low, high, (self._cell - 0.3) / 0.4)
@@ -119,9 +120,10 @@ class Panels:
         factor, unit = (1e3, "mm") if reach < 0.1 else (1e2, "cm") if reach < 1.0 else (1.0, "m")
         known = max(1, int(np.isfinite(error).sum()))
         below, above = (100 * np.count_nonzero(side) / known for side in (error < -reach, error > reach))
-        parts = (f"{percent(below)} below,", f"{percent(above)} above")  # neither is broken
-        beyond = "\n" + " ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts) if below or above else ""
-        self.show(factor * error, title, f"depth error [{unit}]{beyond}", ERROR_MAP, (-factor * reach, factor * reach))
+        label = f"depth error [{unit}]"
+        if below or above:
+            label += "\n" + wrapped_items(f"{percent(below)} below, {percent(above)} above", self._line)
+        self.show(factor * error, title, label, ERROR_MAP, (-factor * reach, factor * reach))
 
     def show_intensity(self, image: NDArray[Any], title: str, label: str) -> None:
         """From 0 to the 99.5th percentile, which single bright pixels exceed."""
@@ -180,14 +182,14 @@ def shown_limits(
 
 def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, float]:
     """Limits that show the true depth and the errors about it, or the measured depth where no target is in view."""
-    if np.isfinite(truth).any():
-        low, high = shown_limits(truth, margin=0.05)
-        error = measured - truth
-        spare = error_limit(error) if np.isfinite(error).any() else 0.0
-        # Errors may all have one sign, and single ones may be as large as the gate.
-        least, most = shown_limits(measured, beyond=1.0, margin=0.05)
-        return max(low - spare, min(low, least)), min(high + spare, max(high, most))
-    return shown_limits(measured, beyond=1.0, margin=0.05)
+    least, most = shown_limits(measured, beyond=1.0, margin=0.05)
+    if not np.isfinite(truth).any():
+        return least, most
+    low, high = shown_limits(truth, margin=0.05)
+    error = measured - truth
+    spare = error_limit(error) if np.isfinite(error).any() else 0.0
+    # Errors may all have one sign, and single ones may be as large as the gate.
+    return max(low - spare, min(low, least)), min(high + spare, max(high, most))
 
 
 def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, int]:
