@@ -20,7 +20,7 @@ import warp._src.build
 
 import spadwarp
 from spadwarp.io import examples
-from spadwarp_kernels import compiled
+from spadwarp_kernels.base import kernels as compiled
 
 
 def compile_for_target() -> None:

@@ -332,7 +332,7 @@ def kernels() -> str:
         package = import_module(f"spadwarp_kernels.{room}")
         parts.append(f"## {room.capitalize()}\n\n{package.__doc__}")
         parts += [f"::: spadwarp_kernels.{room}.{name}" for name in package.__all__]
-    parts.append("## Ray cast\n\n::: spadwarp_kernels.ray_cast.truth_kernel")
+    parts.append("## Ray cast\n\n::: spadwarp_kernels.surface.ray_cast.truth_kernel")
     return "\n\n".join(parts) + "\n"
 
 

@@ -125,7 +125,7 @@ def start_warp() -> None:
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     with _kernel_cache():
         _init_quietly()
-    from spadwarp_kernels.compiled import unpack_kernels
+    from spadwarp_kernels import unpack_kernels
 
     unpack_kernels()
     load = wp.Module.load

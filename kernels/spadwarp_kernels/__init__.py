@@ -4,290 +4,35 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 `wp.Mesh`. A folder for each topic; what is not listed here is in its folder's `__all__`.
 """
 
-from .analytic import (
-    BACKSCATTER_SOURCES,
-    COUNT_LAWS,
-    Lidar,
-    sample_frames,
-    signal_map,
-    single_scatter_table,
-    statistics_maps,
-)
-from .arguments import ArgumentError
-from .compiled import unpack_kernels
-from .detection import arrival_bins, dark_count_rates, event_counts, expected_detections, first_photon_counts
-from .estimators import ESTIMATORS, Estimator, next_event_value
-from .intersect import segment_meets_box
-from .math import one_minus_cosine, orthonormal_basis, rotate_direction, snap_direction
-from .medium import (
-    DELTA_TRACKING,
-    REGULAR_TRACKING,
-    Boundary,
-    Grid,
-    Layers,
-    Limits,
-    Medium,
-    exit_distance,
-    free_path,
-    fresnel_reflectance,
-    layer_index,
-    layered_extinction,
-    layered_free_path,
-    layered_water,
-    make_boundary,
-    make_grid,
-    make_layers,
-    reflection_images,
-    voxel_values_kernel,
-)
-from .phase import (
-    HENYEY_GREENSTEIN,
-    TABULATED,
-    Guiding,
-    PhaseFunction,
-    PhaseGuide,
-    fournier_forand_density,
-    henyey_greenstein_density,
-    henyey_greenstein_pdf,
-    henyey_greenstein_score,
-    interpolated_density,
-    make_phase_tables,
-    rayleigh_density,
-    sample_henyey_greenstein,
-    sphere_integral,
-    two_term_henyey_greenstein_density,
-)
-from .photon import BRUTE_FORCE_FACES, Records, TransportSpec, make_records
-from .polarisation import MATRIX_POINTS, MOST_CHANNELS, Polarisation, make_polarisation, matrix_cosines
-from .port import DOME_PORT, FLAT_PORT, Port, PortKind, make_dome_port, make_flat_port
-from .random import philox4x32, random_block, u01, u01_fine, u01_tail
-from .ray_cast import truth_along_kernel, truth_kernel
-from .sensor import (
-    C0,
-    CALIBRATED,
-    PLAIN,
-    Camera,
-    Gate,
-    Lens,
-    gate_bin,
-    lens_point,
-    near_depth_map,
-    pixel_direction,
-    project,
-    project_calibrated,
-)
-from .source import LASER_PROFILES, Laser, Scan, emit_photon, profile_tables
-from .surface import (
-    SurfaceHit,
-    Surfaces,
-    Textures,
-    ggx_brdf,
-    ggx_normals,
-    ggx_pdf,
-    intersect_mesh,
-    intersect_surfaces,
-    lambert_brdf,
-    make_surfaces,
-    make_textures,
-    offset_from_surface,
-    reflectance_at,
-    sample_ggx,
-    sample_lambert,
-    surface_choices,
-    unshadowed,
-    update_surfaces,
-)
-from .tally import (
-    BLOCK_DERIVATIVES,
-    COMPONENTS,
-    COUNTERS,
-    DERIVATIVES,
-    LEDGER_ENTRIES,
-    LEDGER_UNIT,
-    MOST_BLOCK_DERIVATIVES,
-    MOST_DERIVATIVES,
-    Batches,
-    Blocks,
-    Derivatives,
-    add_tallies,
-    has_overflowed,
-    make_blocks,
-    make_derivatives,
-    tally_rates,
-    to_fixed_point,
-)
-from .transport import (
-    Data,
-    Model,
-    launch_transport,
-    load_transport_kernel,
-    make_data,
-    make_transport_kernel,
-    read_ledger,
-)
-from .worlds import (
-    CAMERA_FRAMES,
-    SHAPE_KINDS,
-    Shapes,
-    SpadCamera,
-    SpadConfig,
-    SpadTracer,
-    make_shapes,
-    move_shapes,
-    mujoco_shapes,
-    newton_shapes,
-    write_poses,
-)
+from typing import TYPE_CHECKING
+
+from .analytic import *
+from .base import *
+from .detection import *
+from .estimators import *
+from .optics import *
+from .photon import *
+from .riders import *
+from .surface import *
+from .tally import *
+from .transport import *
+from .water import *
+from .worlds import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = (
+        analytic.__all__
+        + base.__all__
+        + detection.__all__
+        + estimators.__all__
+        + optics.__all__
+        + photon.__all__
+        + riders.__all__
+        + surface.__all__
+        + tally.__all__
+        + transport.__all__
+        + water.__all__
+        + worlds.__all__
+    )
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "BACKSCATTER_SOURCES",
-    "BLOCK_DERIVATIVES",
-    "BRUTE_FORCE_FACES",
-    "C0",
-    "CALIBRATED",
-    "CAMERA_FRAMES",
-    "COMPONENTS",
-    "COUNTERS",
-    "COUNT_LAWS",
-    "DELTA_TRACKING",
-    "DERIVATIVES",
-    "DOME_PORT",
-    "ESTIMATORS",
-    "FLAT_PORT",
-    "HENYEY_GREENSTEIN",
-    "LASER_PROFILES",
-    "LEDGER_ENTRIES",
-    "LEDGER_UNIT",
-    "MATRIX_POINTS",
-    "MOST_BLOCK_DERIVATIVES",
-    "MOST_CHANNELS",
-    "MOST_DERIVATIVES",
-    "PLAIN",
-    "REGULAR_TRACKING",
-    "SHAPE_KINDS",
-    "TABULATED",
-    "ArgumentError",
-    "Batches",
-    "Blocks",
-    "Boundary",
-    "Camera",
-    "Data",
-    "Derivatives",
-    "Estimator",
-    "Gate",
-    "Grid",
-    "Guiding",
-    "Laser",
-    "Layers",
-    "Lens",
-    "Lidar",
-    "Limits",
-    "Medium",
-    "Model",
-    "PhaseFunction",
-    "PhaseGuide",
-    "Polarisation",
-    "Port",
-    "PortKind",
-    "Records",
-    "Scan",
-    "Shapes",
-    "SpadCamera",
-    "SpadConfig",
-    "SpadTracer",
-    "SurfaceHit",
-    "Surfaces",
-    "Textures",
-    "TransportSpec",
-    "add_tallies",
-    "arrival_bins",
-    "dark_count_rates",
-    "emit_photon",
-    "event_counts",
-    "exit_distance",
-    "expected_detections",
-    "first_photon_counts",
-    "fournier_forand_density",
-    "free_path",
-    "fresnel_reflectance",
-    "gate_bin",
-    "ggx_brdf",
-    "ggx_normals",
-    "ggx_pdf",
-    "has_overflowed",
-    "henyey_greenstein_density",
-    "henyey_greenstein_pdf",
-    "henyey_greenstein_score",
-    "interpolated_density",
-    "intersect_mesh",
-    "intersect_surfaces",
-    "lambert_brdf",
-    "launch_transport",
-    "layer_index",
-    "layered_extinction",
-    "layered_free_path",
-    "layered_water",
-    "lens_point",
-    "load_transport_kernel",
-    "make_blocks",
-    "make_boundary",
-    "make_data",
-    "make_derivatives",
-    "make_dome_port",
-    "make_flat_port",
-    "make_grid",
-    "make_layers",
-    "make_phase_tables",
-    "make_polarisation",
-    "make_records",
-    "make_shapes",
-    "make_surfaces",
-    "make_textures",
-    "make_transport_kernel",
-    "matrix_cosines",
-    "move_shapes",
-    "mujoco_shapes",
-    "near_depth_map",
-    "newton_shapes",
-    "next_event_value",
-    "offset_from_surface",
-    "one_minus_cosine",
-    "orthonormal_basis",
-    "philox4x32",
-    "pixel_direction",
-    "profile_tables",
-    "project",
-    "project_calibrated",
-    "random_block",
-    "rayleigh_density",
-    "read_ledger",
-    "reflectance_at",
-    "reflection_images",
-    "rotate_direction",
-    "sample_frames",
-    "sample_ggx",
-    "sample_henyey_greenstein",
-    "sample_lambert",
-    "segment_meets_box",
-    "signal_map",
-    "single_scatter_table",
-    "snap_direction",
-    "sphere_integral",
-    "statistics_maps",
-    "surface_choices",
-    "tally_rates",
-    "to_fixed_point",
-    "truth_along_kernel",
-    "truth_kernel",
-    "two_term_henyey_greenstein_density",
-    "u01",
-    "u01_fine",
-    "u01_tail",
-    "unpack_kernels",
-    "unshadowed",
-    "update_surfaces",
-    "voxel_values_kernel",
-    "write_poses",
-]

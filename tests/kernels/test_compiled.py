@@ -6,7 +6,8 @@ import zipfile
 import pytest
 import warp as wp
 
-from spadwarp_kernels import compiled, unpack_kernels
+from spadwarp_kernels import unpack_kernels
+from spadwarp_kernels.base import kernels as compiled
 
 
 @pytest.fixture

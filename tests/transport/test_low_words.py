@@ -14,7 +14,7 @@ from helpers.statistics_of_samples import DEVICES
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp_kernels.tally.low_words import add_to_words, fold_low_words
+from spadwarp_kernels.tally.tally import add_to_words, fold_low_words
 from spadwarp_kernels.transport.launch import uses_low_words
 
 MANY_FACES = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
@@ -37,8 +37,8 @@ CASES = {
 @pytest.fixture
 def always(monkeypatch):
     """Low words pay for every tally."""
-    monkeypatch.setattr("spadwarp_kernels.tally.low_words.CACHE_BYTES", 0)
-    monkeypatch.setattr("spadwarp_kernels.tally.low_words.PHOTONS_PER_VOXEL", 0)
+    monkeypatch.setattr("spadwarp_kernels.tally.tally.CACHE_BYTES", 0)
+    monkeypatch.setattr("spadwarp_kernels.tally.tally.PHOTONS_PER_VOXEL", 0)
 
 
 def built(sections, device):
@@ -75,7 +75,7 @@ def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
 @pytest.mark.slow
 def test_smaller_launches_after_a_large_one_give_the_same_bits(monkeypatch, device):
     """Only the second of the three is large enough to begin with low words."""
-    monkeypatch.setattr("spadwarp_kernels.tally.low_words.CACHE_BYTES", 0)
+    monkeypatch.setattr("spadwarp_kernels.tally.tally.CACHE_BYTES", 0)
     spec, model = built(CASES["water"], device)
     kept, plain = sk.make_data(model), sk.make_data(model)
     first = 0

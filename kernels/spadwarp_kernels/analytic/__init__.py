@@ -1,31 +1,24 @@
 """The analytic simulator: photon budget, Cramér–Rao bound, depth frames."""
 
-from .backscatter import TABLE_EDGES, single_scatter_table
-from .behind_port import make_optics
-from .cramer_rao import COUNT_LAWS, histogram_information, statistics_maps
-from .depth_frames import Sampler, sample_frames
-from .labelled_frames import FrameCoding, draw_frames
-from .lidar import BACKSCATTER_SOURCES, Lidar, Ports
-from .optics import IN_WATER, Optics
-from .outliers import outlier_probabilities
-from .signal import signal_map
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "BACKSCATTER_SOURCES",
-    "COUNT_LAWS",
-    "IN_WATER",
-    "TABLE_EDGES",
-    "FrameCoding",
-    "Lidar",
-    "Optics",
-    "Ports",
-    "Sampler",
-    "draw_frames",
-    "histogram_information",
-    "make_optics",
-    "outlier_probabilities",
-    "sample_frames",
-    "signal_map",
-    "single_scatter_table",
-    "statistics_maps",
-]
+from .backscatter import *
+from .behind_port import *
+from .cramer_rao import *
+from .depth_frames import *
+from .labelled_frames import *
+from .lidar import *
+from .outliers import *
+from .signal import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = (
+        backscatter.__all__
+        + behind_port.__all__
+        + cramer_rao.__all__
+        + depth_frames.__all__
+        + labelled_frames.__all__
+        + lidar.__all__
+        + outliers.__all__
+        + signal.__all__
+    )

@@ -7,14 +7,15 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError
-from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.port.kinds import FLAT_PORT, PortKind
-from spadwarp_kernels.port.port import Passage, Port
+from spadwarp_kernels.base.arguments import ArgumentError
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
+from spadwarp_kernels.optics.port import FLAT_PORT, Passage, Port, PortKind
 
 from .lidar import Lidar, Ports
 from .optics import IN_WATER, Light, Optics, Ray, Received, cone_interval
+
+__all__ = ["make_optics"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

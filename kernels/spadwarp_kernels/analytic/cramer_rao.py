@@ -8,15 +8,16 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_number
-from spadwarp_kernels.math.float64 import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_number
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.native import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 
 from .backscatter import check_phase, make_background_rate, spectral_lines
 from .lidar import Lidar
 from .optics import Optics, check_optics
 from .outliers import outlier_probability
+
+__all__ = ["COUNT_LAWS", "histogram_information", "statistics_maps"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

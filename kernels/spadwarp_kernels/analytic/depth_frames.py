@@ -5,13 +5,21 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_number, check_seed, check_vector
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.philox import STREAM_ANALYTIC, random_block, u01, u01_open
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_integer,
+    check_number,
+    check_seed,
+    check_vector,
+)
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.philox import STREAM_ANALYTIC, random_block, u01, u01_open
 
 from .lidar import Ports
 from .optics import IN_WATER, Optics, check_ports
+
+__all__ = ["sample_frames"]
 
 wp.set_module_options({"enable_backward": False})
 

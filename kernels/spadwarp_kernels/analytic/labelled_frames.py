@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_integer,
@@ -17,14 +17,15 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_vector,
 )
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.philox import STREAM_FRAMES, random_block, u01, u01_open
-from spadwarp_kernels.random.quantiles import count_quantile
+from spadwarp_kernels.base.binomial import count_quantile
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.philox import STREAM_FRAMES, random_block, u01, u01_open
 
 from .depth_frames import check_gate_paths, check_pixel_maps, make_depth_of_path, path_at_share
 from .lidar import Ports
 from .optics import Optics, check_ports
+
+__all__ = ["FrameCoding", "draw_frames"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 

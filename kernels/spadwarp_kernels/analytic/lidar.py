@@ -7,9 +7,11 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_fields, check_integer, check_number, check_struct, check_vector
-from spadwarp_kernels.math.float64 import ONE, PI, TWO, ZERO
-from spadwarp_kernels.port.port import Port
+from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct, check_vector
+from spadwarp_kernels.base.native import ONE, PI, TWO, ZERO
+from spadwarp_kernels.optics.port import Port
+
+__all__ = ["BACKSCATTER_SOURCES", "Lidar", "Ports"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_struct
-from spadwarp_kernels.math.float64 import HALF, ONE, TWO, ZERO
-from spadwarp_kernels.port.kinds import DOME_PORT, PortKind, check_port
+from spadwarp_kernels.base.arguments import ArgumentError, check_struct
+from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO
+from spadwarp_kernels.optics.port import DOME_PORT, PortKind, check_port
 
 from .lidar import Lidar, Ports, beam_direction, beam_fluence, beam_path, check_lidar
 

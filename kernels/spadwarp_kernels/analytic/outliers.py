@@ -2,9 +2,11 @@
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_array
-from spadwarp_kernels.math.float64 import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, one_minus_exp
-from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.base.arguments import check_array
+from spadwarp_kernels.base.kernels import launch_pixels
+from spadwarp_kernels.base.native import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, one_minus_exp
+
+__all__ = ["outlier_probabilities"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

@@ -8,13 +8,14 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_array
-from spadwarp_kernels.math.float64 import HALF, ONE, PI, TWO, ZERO
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.base.arguments import check_array
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
 from .lidar import Lidar
 from .optics import IN_WATER, Optics, check_optics
+
+__all__ = ["signal_map"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
 
 from .rates import RATES
+
+__all__ = ["PHASES", "arrival_bins"]
 
 wp.set_module_options({"enable_backward": False})
 

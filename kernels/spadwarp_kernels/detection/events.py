@@ -6,12 +6,14 @@ Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not de
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_integer, check_number, check_numbers
-from spadwarp_kernels.math.float64 import log1p
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import PURPOSE_EVENTS, uniforms
+from spadwarp_kernels.base.arguments import ArgumentError, check_integer, check_number, check_numbers
+from spadwarp_kernels.base.binomial import PURPOSE_EVENTS, uniforms
+from spadwarp_kernels.base.kernels import launch_pixels
+from spadwarp_kernels.base.native import log1p
 
 from .first_photon import check_exposure, check_rates, zeroed_counts
+
+__all__ = ["event_counts"]
 
 wp.set_module_options({"enable_backward": False})
 

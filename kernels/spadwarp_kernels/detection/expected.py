@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_device,
@@ -18,12 +18,20 @@ from spadwarp_kernels.arguments import (
     check_numbers,
     check_seed,
 )
-from spadwarp_kernels.math.float64 import expm1, log1p
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import PURPOSE_DARK_COUNTS, uniforms
+from spadwarp_kernels.base.binomial import PURPOSE_DARK_COUNTS, uniforms
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.native import expm1, log1p
 
 from .rates import RATES
+
+__all__ = [
+    "add_crosstalk",
+    "coates",
+    "dark_count_rates",
+    "expected_detections",
+    "first_photon_probabilities",
+    "free_running_probabilities",
+]
 
 wp.set_module_options({"enable_backward": False})
 

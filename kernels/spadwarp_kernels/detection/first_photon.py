@@ -7,11 +7,13 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_seed
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.random.binomial import PURPOSE_COUNTS, binomial, uniforms
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_seed
+from spadwarp_kernels.base.binomial import PURPOSE_COUNTS, binomial, uniforms
+from spadwarp_kernels.base.kernels import launch_pixels
 
 from .rates import first_invalid_row
+
+__all__ = ["first_photon_counts"]
 
 wp.set_module_options({"enable_backward": False})
 

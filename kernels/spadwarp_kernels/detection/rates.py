@@ -4,9 +4,10 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_array
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.pixels import launch_pixels
+from spadwarp_kernels.base.arguments import check_array
+from spadwarp_kernels.base.kernels import launch_pixels, made_once
+
+__all__ = ["first_invalid_row"]
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,30 +1,10 @@
 """What a photon adds to the histogram."""
 
-from .analog import make_analog
-from .contribution import Request, Scored, make_event_request, make_score
-from .estimator import Direction, Estimator, FlightPlan
-from .flight_sampling import make_sample_flight
-from .guided import make_guided
-from .link import Link, make_link, next_event_value
-from .next_event import make_next_event
-from .none import make_none
-from .registry import ESTIMATORS
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "ESTIMATORS",
-    "Direction",
-    "Estimator",
-    "FlightPlan",
-    "Link",
-    "Request",
-    "Scored",
-    "make_analog",
-    "make_event_request",
-    "make_guided",
-    "make_link",
-    "make_next_event",
-    "make_none",
-    "make_sample_flight",
-    "make_score",
-    "next_event_value",
-]
+from .estimator import *
+from .link import *
+from .registry import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = estimator.__all__ + link.__all__ + registry.__all__

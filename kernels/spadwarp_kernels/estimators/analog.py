@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from spadwarp_kernels.medium.limits import Limits
+from spadwarp_kernels.base.philox import u01
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.port.kinds import PortKind
-from spadwarp_kernels.random.philox import u01
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.gate import Gate
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, TOO_LONG, Contribution, tally_index
+from spadwarp_kernels.water.limits import Limits
 
 from .estimator import Estimator
 

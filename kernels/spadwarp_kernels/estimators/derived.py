@@ -2,25 +2,28 @@
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.blocks import make_block_scores
-from spadwarp_kernels.derivatives.crossing import make_crossing_scores, make_to_lens
-from spadwarp_kernels.derivatives.request import make_request_scores
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.polarisation.crossing import make_crossing_stokes
-from spadwarp_kernels.polarisation.events import make_event_stokes
-from spadwarp_kernels.polarisation.receiver import make_add_channels, make_leave_water, make_receive
-from spadwarp_kernels.polarisation.request import Polarisation
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.riders.blocks import make_block_scores
+from spadwarp_kernels.riders.derivatives import make_crossing_scores, make_request_scores, make_to_lens
+from spadwarp_kernels.riders.polarisation import (
+    Polarisation,
+    make_add_channels,
+    make_crossing_stokes,
+    make_event_stokes,
+    make_leave_water,
+    make_receive,
+)
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Contribution
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
 
 from .contribution import Request, Scored
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import warp as wp
 
+__all__ = ["Estimator"]
+
 
 @wp.struct
 class FlightPlan:

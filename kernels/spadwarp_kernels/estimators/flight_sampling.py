@@ -5,14 +5,13 @@ After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joi
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import cos_sin_turn, cotangent
-from spadwarp_kernels.medium.layers import Layers, Profile
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN_GUIDE
-from spadwarp_kernels.phase.phase_function import PhaseGuide
-from spadwarp_kernels.port.kinds import PortKind
-from spadwarp_kernels.sensor.camera import Camera, lens_point
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent
+from spadwarp_kernels.optics.camera import Camera, lens_point
+from spadwarp_kernels.optics.port import PortKind
+from spadwarp_kernels.water.layers import Layers, Profile
+from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
 
 @wp.struct

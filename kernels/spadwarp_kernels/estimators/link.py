@@ -2,9 +2,11 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.sensor.camera import Camera
+
+__all__ = ["next_event_value"]
 
 
 @wp.struct

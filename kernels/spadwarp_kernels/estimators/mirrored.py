@@ -2,11 +2,27 @@
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.history import make_flight_scores
-from spadwarp_kernels.derivatives.request import make_turn_scores
-from spadwarp_kernels.intersect.box import segment_meets_box
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.boundary import (
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
+from spadwarp_kernels.optics.camera import Camera, lens_point
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import Scan
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.riders.derivatives import make_flight_scores, make_turn_scores
+from spadwarp_kernels.riders.polarisation import (
+    Polarisation,
+    make_add_channels,
+    make_event_stokes,
+    make_leave_water,
+    make_receive,
+    make_reflected_stokes,
+)
+from spadwarp_kernels.surface.box import segment_meets_box
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
+from spadwarp_kernels.tally.scores import Derivatives, make_deposit
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Scores, tally_index
+from spadwarp_kernels.water.boundary import (
     face_index,
     flipped,
     image_direction,
@@ -14,22 +30,9 @@ from spadwarp_kernels.medium.boundary import (
     image_reflectance,
     reflections_of,
 )
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits, next_face, to_next_face
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
-from spadwarp_kernels.polarisation.receiver import make_add_channels, make_leave_water, make_receive
-from spadwarp_kernels.polarisation.request import Polarisation
-from spadwarp_kernels.random.philox import u01, u01_high, u01_low
-from spadwarp_kernels.random.splitmix import join_words
-from spadwarp_kernels.sensor.camera import Camera, lens_point
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.source.scan import Scan
-from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import intersect_surfaces, meets_faces
-from spadwarp_kernels.tally.scores import Derivatives, make_deposit
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Scores, tally_index
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits, next_face, to_next_face
+from spadwarp_kernels.water.medium import Medium
 
 from .contribution import Request, Scored, make_scattering
 from .link import make_link

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.bits import bits_of, from_bits
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.native import bits_of, from_bits
 from spadwarp_kernels.photon.lanes import (
     ADD_ENTRY,
     MOST_LEFT,

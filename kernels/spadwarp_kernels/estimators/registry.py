@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 
 from .analog import make_analog
@@ -10,6 +10,8 @@ from .estimator import Estimator
 from .guided import make_guided
 from .next_event import make_next_event
 from .none import make_none
+
+__all__ = ["ESTIMATORS"]
 
 ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
     "none": make_none,

@@ -1,22 +1,9 @@
-"""What a kernel is compiled for, the state of a photon, its record, and the lanes of a CUDA warp that carry photons."""
+"""What a photon carries, the choices that make a kernel, and the lanes and queue of a warp."""
 
-from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES
+from typing import TYPE_CHECKING
 
-from .lanes import BLOCK_SIZE, count_lanes
-from .records import Records, make_records
-from .spec import TransportSpec
-from .state import Flight, PhotonState, Weight, give, reweigh
+from .spec import *
+from .state import *
 
-__all__ = [
-    "BLOCK_SIZE",
-    "BRUTE_FORCE_FACES",
-    "Flight",
-    "PhotonState",
-    "Records",
-    "TransportSpec",
-    "Weight",
-    "count_lanes",
-    "give",
-    "make_records",
-    "reweigh",
-]
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = spec.__all__ + state.__all__

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
 
 # Threads of a block of the transport kernel on CUDA.
 BLOCK_SIZE = 128

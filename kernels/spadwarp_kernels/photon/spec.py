@@ -2,11 +2,12 @@
 
 from typing import NamedTuple
 
-from spadwarp_kernels.medium.layers import HOMOGENEOUS, LAYERED, Water
-from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
-from spadwarp_kernels.phase.phase_function import PhaseFunction
-from spadwarp_kernels.port.kinds import PortKind
-from spadwarp_kernels.sensor.projection import PLAIN, Lens
+from spadwarp_kernels.optics.port import PortKind
+from spadwarp_kernels.optics.projection import PLAIN, Lens
+from spadwarp_kernels.water.layers import HOMOGENEOUS, LAYERED, Water
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
+
+__all__ = ["TransportSpec"]
 
 MOST_POINTS = 3
 

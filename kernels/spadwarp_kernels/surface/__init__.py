@@ -1,31 +1,12 @@
-"""The target: its reflectance, patterns on it, and how it reflects."""
+"""Meshes: reflectance, and rays against a tree of their faces, on a GPU and on a core."""
 
-from .ggx import ggx_brdf, ggx_normals, ggx_pdf, reflection_pdf, sample_ggx, sample_reflection, unshadowed
-from .lambert import lambert_brdf, sample_cosine_law, sample_lambert
-from .mesh import Surfaces, Textures, make_surfaces, make_textures, surface_choices, update_surfaces
-from .reflectance import reflectance_at
-from .trace import SurfaceHit, intersect_mesh, intersect_surfaces, offset_from_surface
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "SurfaceHit",
-    "Surfaces",
-    "Textures",
-    "ggx_brdf",
-    "ggx_normals",
-    "ggx_pdf",
-    "intersect_mesh",
-    "intersect_surfaces",
-    "lambert_brdf",
-    "make_surfaces",
-    "make_textures",
-    "offset_from_surface",
-    "reflectance_at",
-    "reflection_pdf",
-    "sample_cosine_law",
-    "sample_ggx",
-    "sample_lambert",
-    "sample_reflection",
-    "surface_choices",
-    "unshadowed",
-    "update_surfaces",
-]
+from .box import *
+from .mesh import *
+from .patches import *
+from .ray_cast import *
+from .reflectance import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = box.__all__ + mesh.__all__ + patches.__all__ + ray_cast.__all__ + reflectance.__all__

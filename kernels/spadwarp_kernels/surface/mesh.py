@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_device,
@@ -16,12 +16,15 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_values,
 )
-from spadwarp_kernels.intersect.bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
-from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES, PATCH_ROWS, empty_patches, pack_patches, set_patches
-from spadwarp_kernels.intersect.triangle import LANES, face_vectors, pack_faces, set_faces
-from spadwarp_kernels.intersect.wide import empty_wide, pack_wide, refit_wide
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.visibility import near_depth_map, update_near_depth
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.visibility import near_depth_map, update_near_depth
+
+from .bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
+from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, empty_patches, pack_patches, set_patches
+from .triangle import LANES, face_vectors, pack_faces, set_faces
+from .wide import empty_wide, pack_wide, refit_wide
+
+__all__ = ["Surfaces", "Textures", "make_surfaces", "make_textures", "surface_choices", "update_surfaces"]
 
 
 @wp.struct

@@ -1,36 +1,12 @@
-"""Tallies in fixed point, the ledger of weights, and batches for standard errors."""
+"""Fixed-point tallies, the energy balance, batches, derivatives."""
 
-from .batches import Batches
-from .blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES, Blocks, make_blocks
-from .ledger import COUNTERS, LEDGER_ENTRIES, LEDGER_SLOTS, LEDGER_UNIT, LEDGER_WIDTH, add_to_ledger, to_ledger
-from .rates import tally_rates
-from .scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives, make_derivatives
-from .tally import COMPONENTS, Contribution, Scores, add_tallies, deposit, has_overflowed, tally_index, to_fixed_point
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "BLOCK_DERIVATIVES",
-    "COMPONENTS",
-    "COUNTERS",
-    "DERIVATIVES",
-    "LEDGER_ENTRIES",
-    "LEDGER_SLOTS",
-    "LEDGER_UNIT",
-    "LEDGER_WIDTH",
-    "MOST_BLOCK_DERIVATIVES",
-    "MOST_DERIVATIVES",
-    "Batches",
-    "Blocks",
-    "Contribution",
-    "Derivatives",
-    "Scores",
-    "add_tallies",
-    "add_to_ledger",
-    "deposit",
-    "has_overflowed",
-    "make_blocks",
-    "make_derivatives",
-    "tally_index",
-    "tally_rates",
-    "to_fixed_point",
-    "to_ledger",
-]
+from .batches import *
+from .blocks import *
+from .ledger import *
+from .scores import *
+from .tally import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = batches.__all__ + blocks.__all__ + ledger.__all__ + scores.__all__ + tally.__all__

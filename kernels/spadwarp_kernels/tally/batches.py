@@ -4,10 +4,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer, check_kind
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_kind
 
 from .ledger import atomic_add_int64
 from .tally import VOXEL_LIMIT, add_tallies, has_overflowed, pieces
+
+__all__ = ["Batches"]
 
 # Copies of a component's sum, so that threads seldom add to one address at the same time.
 _SLOTS = wp.constant(4096)

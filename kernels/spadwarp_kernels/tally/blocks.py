@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_integer, check_items, check_number, check_struct
-from spadwarp_kernels.medium.grid import Grid
+from spadwarp_kernels.base.arguments import ArgumentError, check_integer, check_items, check_number, check_struct
+from spadwarp_kernels.water.grid import Grid
+
+__all__ = ["BLOCK_DERIVATIVES", "MOST_BLOCK_DERIVATIVES", "Blocks", "make_blocks"]
 
 # What a derivative by block may be with respect to: a at fixed b, b at fixed a, or c at fixed albedo, the same addition
 # [1/m] to every cell of the block.

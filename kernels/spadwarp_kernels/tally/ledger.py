@@ -2,8 +2,10 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.limits import EXIT_FACES
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.water.limits import EXIT_FACES
+
+__all__ = ["COUNTERS", "LEDGER_ENTRIES", "LEDGER_UNIT"]
 
 # Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63, and a cut-off of 2e-4 is 839 units.
 LEDGER_ONE = wp.constant(4194304.0)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_choice,
     check_device,
@@ -20,12 +20,13 @@ from spadwarp_kernels.arguments import (
     check_numbers,
     check_struct,
 )
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
 
 from .blocks import Blocks, met_count, met_entry, score_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
-from .low_words import add_to_words
-from .tally import DEPOSIT_LIMIT, Contribution, Scores, deposit
+from .tally import DEPOSIT_LIMIT, Contribution, Scores, add_to_words, deposit
+
+__all__ = ["DERIVATIVES", "MOST_DERIVATIVES", "Derivatives", "make_derivatives"]
 
 # What a derivative may be with respect to, and the range of such a parameter: a at fixed b, b at fixed a, the mean
 # cosine g of Henyey and Greenstein's phase function, and a reflectance or a factor on one that varies.

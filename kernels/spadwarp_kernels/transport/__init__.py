@@ -1,21 +1,9 @@
 """The transport kernel, what it takes and writes, and its launch."""
 
-from .kernel import make_transport_kernel
-from .launch import (
-    Data,
-    Model,
-    launch_transport,
-    load_transport_kernel,
-    make_data,
-    read_ledger,
-)
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Data",
-    "Model",
-    "launch_transport",
-    "load_transport_kernel",
-    "make_data",
-    "make_transport_kernel",
-    "read_ledger",
-]
+from .kernel import *
+from .launch import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = kernel.__all__ + launch.__all__

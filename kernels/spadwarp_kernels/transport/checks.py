@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_choice,
@@ -18,32 +18,29 @@ from spadwarp_kernels.arguments import (
     check_struct,
     check_vector,
 )
+from spadwarp_kernels.base.tables import TABLE_CELLS
 from spadwarp_kernels.estimators.contribution import takes_collisions
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
-from spadwarp_kernels.intersect.patches import BRUTE_FORCE_FACES
-from spadwarp_kernels.medium.grid import Grid
-from spadwarp_kernels.medium.layers import Layers, Water
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.henyey_greenstein import HENYEY_GREENSTEIN
-from spadwarp_kernels.phase.phase_function import Guiding, PhaseFunction
-from spadwarp_kernels.phase.tabulated import TABULATED
-from spadwarp_kernels.photon.records import Records
+from spadwarp_kernels.optics.camera import Camera, check_camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
+from spadwarp_kernels.optics.port import PortKind, check_port
+from spadwarp_kernels.optics.projection import PLAIN, Lens
 from spadwarp_kernels.photon.spec import MOST_POINTS, TransportSpec
-from spadwarp_kernels.polarisation.request import MATRIX_POINTS, MOST_CHANNELS, Polarisation
-from spadwarp_kernels.port.kinds import PortKind, check_port
-from spadwarp_kernels.random.density_tables import TABLE_CELLS
-from spadwarp_kernels.sensor.camera import Camera, check_camera
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.projection import PLAIN, Lens
-from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
-from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.photon.state import Records
+from spadwarp_kernels.riders.polarisation import MATRIX_POINTS, MOST_CHANNELS, Polarisation
 from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
+from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES, MOST_BLOCK_DERIVATIVES
 from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS
+from spadwarp_kernels.water.grid import Grid
+from spadwarp_kernels.water.layers import Layers, Water
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, TABULATED, Guiding, PhaseFunction
 
 if TYPE_CHECKING:
     from .launch import Data, Model

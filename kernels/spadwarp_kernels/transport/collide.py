@@ -2,10 +2,15 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.boundary import face_index
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import (
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.photon.lanes import MOST_LEFT
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
+from spadwarp_kernels.surface.ray_cast import offset_from_surface
+from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
+from spadwarp_kernels.water.boundary import face_index
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import (
     Limits,
     exit_distance,
     exit_distance_rotated,
@@ -16,12 +21,7 @@ from spadwarp_kernels.medium.limits import (
     is_outside,
     is_outside_rotated,
 )
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.photon.lanes import MOST_LEFT
-from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
-from spadwarp_kernels.surface.trace import offset_from_surface
-from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
+from spadwarp_kernels.water.medium import Medium
 
 
 @wp.struct

@@ -2,14 +2,12 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.optics.laser import Laser, Scan, emit_along, emit_measured
+from spadwarp_kernels.optics.port import Passage, Port, PortKind
 from spadwarp_kernels.photon.lanes import exchange
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, give, reweigh
-from spadwarp_kernels.port.kinds import PortKind
-from spadwarp_kernels.port.port import Passage, Port
-from spadwarp_kernels.source.laser import Laser, emit_along, emit_measured
-from spadwarp_kernels.source.scan import Scan
 from spadwarp_kernels.tally.ledger import LASER_PORT
 
 

@@ -2,10 +2,9 @@
 
 import warp as wp
 
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.photon.records import Records
+from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState, Weight
+from spadwarp_kernels.photon.state import PhotonState, Records, Weight
 from spadwarp_kernels.tally.ledger import (
     ABSORBED_SURFACE,
     ABSORBED_WATER,

@@ -2,30 +2,30 @@
 
 import warp as wp
 
-from spadwarp_kernels.intersect.box import segment_meets_box, segment_meets_box_on_cpu
-from spadwarp_kernels.intersect.pairs import NOWHERE
-from spadwarp_kernels.intersect.patches import nearest_patch
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import EVENT, RAY, Flight, PhotonState, is_planned, shorten
-from spadwarp_kernels.random.ahead import block_ahead, make_draw_ahead
-from spadwarp_kernels.random.philox import (
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.philox import (
     STREAM_FLIGHT_SAMPLE,
     STREAM_ROULETTE,
     STREAM_TRANSPORT,
     RoundKeys,
+    block_ahead,
+    join_words,
+    make_draw_ahead,
     random_block_keyed,
     u01,
     u01_tail,
 )
-from spadwarp_kernels.random.splitmix import join_words
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.gate import Gate
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import EVENT, RAY, Flight, PhotonState, is_planned, shorten
+from spadwarp_kernels.surface.box import segment_meets_box, segment_meets_box_on_cpu
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import patch_hit
+from spadwarp_kernels.surface.patches import NOWHERE, nearest_patch
+from spadwarp_kernels.surface.ray_cast import patch_hit
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
 
 
 @made_once

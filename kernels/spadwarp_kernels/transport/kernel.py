@@ -12,22 +12,18 @@ state.
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.blocks import make_begin_history, make_fly_history
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.philox import WORDS_AHEAD, RoundKeys, hold_keys
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.points import make_ask_flight, make_push_points, make_score_points
 from spadwarp_kernels.estimators.queue import long_queue_fits, make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.intersect.box import inverse_direction
-from spadwarp_kernels.intersect.bvh import NO_NODE, Stack, place, step_leaf, step_node
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.photon.lanes import READ_SIZE, SET_SIZE, count_lanes, exchange, queue_size, take_photons, vote
-from spadwarp_kernels.photon.records import Records
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
     DONE,
@@ -39,6 +35,7 @@ from spadwarp_kernels.photon.state import (
     SHADOW_RAY,
     START,
     SURFACE_RAY,
+    Records,
     Turn,
     first_state,
     is_planned,
@@ -46,19 +43,19 @@ from spadwarp_kernels.photon.state import (
     shorten,
     sum_bounces,
 )
-from spadwarp_kernels.polarisation.emission import make_first_stokes
-from spadwarp_kernels.polarisation.request import Polarisation
-from spadwarp_kernels.random.ahead import WORDS_AHEAD
-from spadwarp_kernels.random.philox import RoundKeys, hold_keys
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.source.laser import Laser
-from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.riders.blocks import make_begin_history, make_fly_history
+from spadwarp_kernels.riders.polarisation import Polarisation, make_first_stokes
+from spadwarp_kernels.surface.box import inverse_direction
+from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import surface_hit
+from spadwarp_kernels.surface.ray_cast import surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import TOO_LONG
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.phase_functions import Guiding
 
 from .checks import check_spec
 from .collide import make_arrives, make_collide
@@ -67,6 +64,8 @@ from .finish import make_finish, make_flush
 from .flight import make_depart
 from .scatter import make_leave, make_scatter
 from .traverse import make_aim, make_begin_walk, make_free_lanes, make_look, next_ray
+
+__all__ = ["make_transport_kernel"]
 
 # A warp traces rays when this many of its 32 lanes wait for one, or have ended: fewer leave lanes idle in the BVH, more
 # in the water.

@@ -4,23 +4,18 @@ from dataclasses import dataclass, field
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_array, check_device, check_integer, check_kind, check_seed
+from spadwarp_kernels.base.arguments import check_array, check_device, check_integer, check_kind, check_seed
+from spadwarp_kernels.base.native import zeros
+from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.math.memory import zeros
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits, ready_limits
-from spadwarp_kernels.medium.water import Medium, ready_medium
-from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.optics.camera import Camera, with_field
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import Laser, Scan
+from spadwarp_kernels.optics.projection import PLAIN
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
-from spadwarp_kernels.photon.records import Records, make_records
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.polarisation.request import Polarisation
-from spadwarp_kernels.random.philox import round_keys
-from spadwarp_kernels.sensor.camera import Camera, with_field
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.sensor.projection import PLAIN
-from spadwarp_kernels.source.laser import Laser
-from spadwarp_kernels.source.scan import Scan
+from spadwarp_kernels.photon.state import Records, make_records
+from spadwarp_kernels.riders.polarisation import Polarisation
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.blocks import MOST_BLOCK_DERIVATIVES, blocks_with_memory, threads_of_blocks
 from spadwarp_kernels.tally.ledger import (
@@ -32,12 +27,17 @@ from spadwarp_kernels.tally.ledger import (
     OUTSIDE_SHIFT,
     PORT_ENTRY,
 )
-from spadwarp_kernels.tally.low_words import fold_kernel, fold_low_words, low_words_pay
 from spadwarp_kernels.tally.scores import MOST_DERIVATIVES, Derivatives
-from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel
+from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel, fold_kernel, fold_low_words, low_words_pay
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits, ready_limits
+from spadwarp_kernels.water.medium import Medium, ready_medium
+from spadwarp_kernels.water.phase_functions import Guiding
 
 from .checks import check_launch, check_model, check_spec
 from .kernel import make_transport_kernel
+
+__all__ = ["Data", "Model", "launch_transport", "load_transport_kernel", "make_data", "read_ledger"]
 
 
 @dataclass(frozen=True)

@@ -2,29 +2,32 @@
 
 import warp as wp
 
-from spadwarp_kernels.derivatives.blocks import make_block_scores
-from spadwarp_kernels.derivatives.history import make_event_scores
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
-from spadwarp_kernels.math.once import made_once
-from spadwarp_kernels.math.rotations import cos_sin_word, rotate_by, snap_from
-from spadwarp_kernels.medium.boundary import face_index, flipped, fresnel_reflectance
-from spadwarp_kernels.medium.layers import Layers
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState, Weight, give, reweigh
-from spadwarp_kernels.polarisation.events import make_event_stokes, make_reflected_stokes
-from spadwarp_kernels.polarisation.request import Polarisation
-from spadwarp_kernels.random.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.surface.ggx import sample_reflection, unshadowed
-from spadwarp_kernels.surface.lambert import sample_cosine_law
+from spadwarp_kernels.riders.blocks import make_block_scores
+from spadwarp_kernels.riders.derivatives import make_event_scores
+from spadwarp_kernels.riders.polarisation import Polarisation, make_event_stokes, make_reflected_stokes
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
+from spadwarp_kernels.surface.reflectance import (
+    face_reflectance,
+    pattern_reflectance,
+    sample_cosine_law,
+    sample_reflection,
+    unshadowed,
+)
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
+from spadwarp_kernels.water.boundary import face_index, flipped, fresnel_reflectance
+from spadwarp_kernels.water.layers import Layers
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.phase_functions import Guiding
 
 
 @wp.struct

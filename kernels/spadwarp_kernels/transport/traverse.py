@@ -2,17 +2,17 @@
 
 import warp as wp
 
+from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.estimators.contribution import Scored
-from spadwarp_kernels.intersect.box import segment_meets_box
-from spadwarp_kernels.intersect.bvh import NO_NODE, TreeWalk
-from spadwarp_kernels.math.once import made_once
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.visibility import may_be_hidden
 from spadwarp_kernels.photon.lanes import count_lanes
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import NO_RAY, RAY, SHADOW_RAY, SURFACE_RAY, PhotonState
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.visibility import may_be_hidden
+from spadwarp_kernels.surface.box import segment_meets_box
+from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.trace import intersect_surfaces, meets_faces
+from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 
 
 @wp.struct

@@ -1,26 +1,22 @@
 """SPAD cameras in simulations: many worlds in one launch, moving shapes, nothing read back."""
 
-from .closed_forms import SHAPE_KINDS, intersect_shape
-from .config import SpadConfig
-from .frames import CAMERA_FRAMES
-from .shapes import Shapes, ShapeTable, intersect_shapes, make_shapes, move_shapes
-from .simulators import mujoco_shapes, newton_shapes, write_poses
-from .spad_camera import SpadCamera
-from .spad_tracer import SpadTracer
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "CAMERA_FRAMES",
-    "SHAPE_KINDS",
-    "ShapeTable",
-    "Shapes",
-    "SpadCamera",
-    "SpadConfig",
-    "SpadTracer",
-    "intersect_shape",
-    "intersect_shapes",
-    "make_shapes",
-    "move_shapes",
-    "mujoco_shapes",
-    "newton_shapes",
-    "write_poses",
-]
+from .closed_forms import *
+from .config import *
+from .frames import *
+from .shapes import *
+from .simulators import *
+from .spad_camera import *
+from .spad_tracer import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = (
+        closed_forms.__all__
+        + config.__all__
+        + frames.__all__
+        + shapes.__all__
+        + simulators.__all__
+        + spad_camera.__all__
+        + spad_tracer.__all__
+    )

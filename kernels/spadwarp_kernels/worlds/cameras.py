@@ -4,7 +4,14 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_device, check_integer, check_items, check_kind
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_device,
+    check_integer,
+    check_items,
+    check_kind,
+)
 
 from .checks import check_poses, check_room
 from .config import SpadConfig, check_config

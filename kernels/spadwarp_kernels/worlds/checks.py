@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError
+from spadwarp_kernels.base.arguments import ArgumentError
 
 from .closed_forms import MESH, SHAPE_KINDS
 

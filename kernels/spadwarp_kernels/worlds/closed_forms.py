@@ -6,6 +6,8 @@ x + s u for s > `least`, which may be negative.
 
 import warp as wp
 
+__all__ = ["SHAPE_KINDS"]
+
 SHAPE_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "mesh")
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, CONE, MESH = (wp.constant(i) for i in range(len(SHAPE_KINDS)))
 

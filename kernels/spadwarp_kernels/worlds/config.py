@@ -8,17 +8,13 @@ import warp as wp
 
 from spadwarp_kernels.analytic.backscatter import check_phase, single_scatter_rate, spectral_lines
 from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
-from spadwarp_kernels.arguments import (
-    ArgumentError,
-    check_choice,
-    check_integer,
-    check_number,
-    check_vector,
-)
+from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_number, check_vector
+from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
-from spadwarp_kernels.pixels import launch_pixels
-from spadwarp_kernels.sensor.gate import C0
-from spadwarp_kernels.source.laser import LASER_PROFILES
+from spadwarp_kernels.optics.gate import C0
+from spadwarp_kernels.optics.laser import LASER_PROFILES
+
+__all__ = ["SpadConfig"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.arguments import check_choice
+from spadwarp_kernels.base.arguments import check_choice
+
+__all__ = ["CAMERA_FRAMES"]
 
 CAMERA_FRAMES = {
     "optical": (0.0, 0.0, 0.0, 1.0),

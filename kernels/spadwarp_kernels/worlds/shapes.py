@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import (
+from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_device,
@@ -20,6 +20,8 @@ from spadwarp_kernels.surface.reflectance import texture_at
 
 from .checks import check_shapes
 from .closed_forms import SHAPE_KINDS, ShapeHit, intersect_shape
+
+__all__ = ["Shapes", "make_shapes", "move_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 

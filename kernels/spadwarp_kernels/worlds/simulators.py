@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_array, check_integer
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 
 from .closed_forms import SHAPE_KINDS
 from .shapes import Shapes, make_shapes
+
+__all__ = ["mujoco_shapes", "newton_shapes", "write_poses"]
 
 wp.set_module_options({"enable_backward": False})
 

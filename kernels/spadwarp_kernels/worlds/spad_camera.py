@@ -6,11 +6,13 @@ import warp as wp
 
 from spadwarp_kernels.analytic.lidar import Lidar, beam_path
 from spadwarp_kernels.analytic.signal import radiometric_signal
-from spadwarp_kernels.arguments import check_array, check_number
+from spadwarp_kernels.base.arguments import check_array, check_number
 
 from .cameras import WorldCameras
 from .config import SpadConfig
 from .shapes import Shapes
+
+__all__ = ["SpadCamera"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})

@@ -7,22 +7,24 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.arguments import ArgumentError, check_choice, check_integer, check_kind
-from spadwarp_kernels.medium.limits import Limits
-from spadwarp_kernels.medium.water import Medium
-from spadwarp_kernels.phase.phase_function import Guiding
+from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
+from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.sensor.camera import Camera
-from spadwarp_kernels.sensor.gate import Gate
-from spadwarp_kernels.source.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
 from spadwarp_kernels.transport.launch import CUDA_THREADS, Data, Model, launch_transport, make_data
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.phase_functions import Guiding
 
 from .cameras import WorldCameras
 from .checks import check_room
 from .config import SpadConfig, check_config
 from .shapes import Shapes
 from .triangles import CameraMeshes, _albedo_kernel
+
+__all__ = ["SpadTracer"]
 
 wp.set_module_options({"enable_backward": False})
 

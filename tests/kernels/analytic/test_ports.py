@@ -10,7 +10,7 @@ from helpers.launch import on_device
 from helpers.lidar import C0, lidar
 from reference import refraction
 from spadwarp_kernels import ArgumentError, analytic
-from spadwarp_kernels.port import DOME_PORT, FLAT_PORT, make_dome_port, make_flat_port
+from spadwarp_kernels.optics import DOME_PORT, FLAT_PORT, make_dome_port, make_flat_port
 
 pytestmark = pytest.mark.physics
 

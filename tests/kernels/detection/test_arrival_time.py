@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from helpers.launch import Integers
+from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection import PHASES, arrival_bins, first_invalid_row
-from spadwarp_kernels.pixels import launch_pixels
 
 BINS = 96
 SIGMA = 1.7

@@ -18,9 +18,8 @@ from spadwarp_kernels import (
     u01,
     u01_fine,
 )
-from spadwarp_kernels.estimators import make_sample_flight
-from spadwarp_kernels.estimators.flight_sampling import sample_lens
-from spadwarp_kernels.phase import HENYEY_GREENSTEIN_GUIDE
+from spadwarp_kernels.estimators.flight_sampling import make_sample_flight, sample_lens
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 
 G = 0.924
 A2 = (1 - G) ** 2 / G

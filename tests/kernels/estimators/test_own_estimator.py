@@ -6,8 +6,9 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.estimators import Request, make_next_event
-from spadwarp_kernels.photon import PhotonState
+from spadwarp_kernels.estimators.contribution import Request
+from spadwarp_kernels.estimators.next_event import make_next_event
+from spadwarp_kernels.photon.state import PhotonState
 
 
 def make_half(spec: sk.TransportSpec) -> sk.Estimator:

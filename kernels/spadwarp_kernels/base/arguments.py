@@ -1,0 +1,176 @@
+"""What public functions check of their arguments before anything is launched, and the error that they raise.
+
+Kinds, shapes, dtypes, devices and numbers are read on the host and cost microseconds. Values of arrays are read only
+where something is built from them once: a check of every call would wait for a GPU.
+"""
+
+import math
+import operator
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+__all__ = ["ArgumentError"]
+
+
+class ArgumentError(ValueError):
+    """An argument that is missing, of the wrong kind or shape, on another device, or out of range.
+
+    The text names the argument, its value and what is allowed: `medium.albedo = 1.5 is outside [0, 1]`.
+    """
+
+
+@lru_cache(256)
+def _limits(interval: str) -> tuple[float, float, bool, bool]:
+    low, high = interval[1:-1].split(",")
+    return float(low), float(high), interval[0] == "(", interval[-1] == ")"
+
+
+def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
+    """A finite number within an interval, written as in an error: `"[0, 1)"`."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ArgumentError(f"{name} = {value!r} is not a number") from None
+    low, high, low_open, high_open = _limits(interval)
+    outside = number <= low if low_open else number < low
+    outside = outside or (number >= high if high_open else number > high)
+    if outside or not math.isfinite(number):
+        raise ArgumentError(f"{name} = {value} is outside {interval}")
+    return number
+
+
+def check_integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
+    """An integer from low to high, also one that is written as a float."""
+    try:
+        number = int(value) if isinstance(value, float) and value.is_integer() else operator.index(value)
+    except TypeError:
+        raise ArgumentError(f"{name} = {value!r} is not an integer") from None
+    if not low <= number <= high:
+        raise ArgumentError(f"{name} = {value} is outside [{low}, {high}]")
+    return number
+
+
+def check_seed(seed: Any) -> int:
+    """A seed of 64 bits."""
+    return check_integer("seed", seed, 0, 2**64 - 1)
+
+
+def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
+    """One of a few values."""
+    if value not in tuple(choices):
+        raise ArgumentError(f"{name} = {value!r} is not one of {', '.join(map(repr, choices))}")
+
+
+def check_device(name: str, device: Any) -> wp.Device:
+    """A device by name, or the current one for None."""
+    try:
+        return wp.get_device(device)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ArgumentError(f"{name} = {device!r} is not a device of this machine: {error}") from None
+
+
+def check_struct(name: str, value: Any, struct: Any) -> None:
+    """An instance of a Warp struct."""
+    if not isinstance(value, struct.cls):
+        raise ArgumentError(f"{name} is {_kind(value)}; a {struct.key.rsplit('.')[-1]} is needed")
+
+
+def check_fields(name: str, value: Any, intervals: Mapping[str, str]) -> None:
+    """Numbers of a struct."""
+    for field, interval in intervals.items():
+        check_number(f"{name}.{field}", getattr(value, field), interval)
+
+
+def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
+    """Finite components, of a unit vector if asked."""
+    try:
+        components = [float(x) for x in value]
+    except (TypeError, ValueError):
+        components = []
+    if len(components) != size or not all(map(math.isfinite, components)):
+        raise ArgumentError(f"{name} = {value} is not a vector of {size} finite numbers")
+    length = math.hypot(*components)
+    if unit and abs(length - 1.0) > 1e-3:
+        raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
+
+
+def check_numbers(name: str, values: Any, dimensions: int | None = None) -> NDArray[np.float64]:
+    """An array of numbers in NumPy, with so many dimensions (None: any)."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ArgumentError(f"{name} is {_kind(values)} and not an array of numbers") from None
+    if dimensions is not None and array.ndim != dimensions:
+        raise ArgumentError(f"{name} has shape {array.shape}; {dimensions} dimensions are needed")
+    return array
+
+
+def check_kind(name: str, value: Any, kind: type) -> None:
+    """An instance of a class."""
+    if not isinstance(value, kind):
+        raise ArgumentError(f"{name} is {_kind(value)}; a {kind.__name__} is needed")
+
+
+def check_items(name: str, value: Any) -> list[Any]:
+    """A list of what has items, such as a list, a tuple or an array."""
+    if isinstance(value, str | bytes) or not (isinstance(value, Iterable) and getattr(value, "ndim", 1)):
+        raise ArgumentError(f"{name} is {_kind(value)}; a list is needed")
+    return list(value)
+
+
+def check_array(
+    name: str, array: Any, dtypes: Any, shape: Sequence[int | None], device: Any = None, *, contiguous: bool = False
+) -> Any:
+    """A `wp.array` of one of the dtypes, with the sizes given (None: any), on a device (None: any)."""
+    allowed = dtypes if isinstance(dtypes, tuple) else (dtypes,)
+    problem = None
+    if not isinstance(array, wp.array):
+        problem = f"is {_kind(array)}"
+    elif not (_fits(array.shape, shape) and any(wp.types.types_equal(array.dtype, dtype) for dtype in allowed)):
+        problem = f"is a wp.array of {_dtype_name(array.dtype)}, shape {tuple(array.shape)}"
+    elif device is not None and array.device != device:
+        problem = f"is on {array.device} and not on {device}"
+    elif contiguous and not array.is_contiguous:
+        problem = "is not contiguous"
+    if problem is not None:
+        kinds = " or ".join(map(_dtype_name, allowed))
+        raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape {_shape_text(shape)}, is needed")
+    return array
+
+
+def _fits(sizes: Sequence[int], shape: Sequence[int | None]) -> bool:
+    return len(sizes) == len(shape) and all(b is None or a == b for a, b in zip(sizes, shape, strict=True))
+
+
+def check_values(name: str, array: wp.array, interval: str) -> None:
+    """Every number of an array of float32, int32 or vectors of float32 is finite and within a closed interval; waits
+    for the device."""
+    low, high, *_ = _limits(interval)
+    values = array.numpy().ravel()
+    outside = ~((values >= np.float64(low)) & (values <= np.float64(high)))
+    if outside.any():
+        k = int(outside.argmax())
+        raise ArgumentError(f"{name}[{k // (values.size // array.size)}] = {values[k]} is outside {interval}")
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "None"
+    if wp.types.is_struct(value):
+        return f"a {type(value).__mro__[1].__name__}"
+    shape = getattr(value, "shape", None)
+    return f"{type(value).__name__}{'' if shape is None else f' of shape {tuple(shape)}'}"
+
+
+def _dtype_name(dtype: Any) -> str:
+    return {float: "float32", int: "int32"}.get(dtype) or getattr(dtype, "__name__", str(dtype))
+
+
+def _shape_text(shape: Sequence[int | None]) -> str:
+    sizes = ["any" if size is None else str(size) for size in shape]
+    return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"

@@ -1,0 +1,138 @@
+"""Kernels: made once for each choice, launched over all cores of a CPU, compiled ahead of their first use."""
+
+import contextlib
+import functools
+import json
+import os
+import platform
+import secrets
+import threading
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+import warp as wp
+
+__all__ = ["unpack_kernels"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_making = threading.RLock()
+
+
+def _free() -> None:
+    global _making
+    _making = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_free)  # a thread that made something is not in the child
+
+
+def made_once(make: Callable[P, R]) -> Callable[P, R]:
+    """`functools.cache` for what makes Warp functions and kernels: in all threads one after the other.
+
+    Where two threads make a function of one name, Warp may give both the later one, and a kernel is then made of the
+    parts of another.
+    """
+    made = functools.cache(make)
+
+    @functools.wraps(make)
+    def once(*args: P.args, **kwargs: P.kwargs) -> R:
+        with _making:
+            return made(*args, **kwargs)
+
+    return once
+
+
+# ---- Kernels with one thread a pixel: launches over any number of them, on every core of a CPU.
+
+
+def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any) -> None:
+    """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
+
+    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads; but not
+    while a graph is captured, which records the launches of one thread.
+    """
+    device = wp.get_device(device)
+    if count == 0:
+        return
+    if device.is_cuda or device.is_capturing:
+        wp.launch(kernel, count, [0, *inputs], device=device)
+        return
+    wp.load_module(kernel.module, device=device)  # compiled once, before the threads
+    workers = os.cpu_count() or 1
+    edges = np.unique(np.linspace(0, count, 8 * workers + 1).astype(int)) if workers > 1 else np.array([0, count])
+
+    def part(index: int) -> None:
+        low, high = int(edges[index]), int(edges[index + 1])
+        wp.launch(kernel, high - low, [low, *inputs], device=device)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(part, range(len(edges) - 1)))
+
+
+# ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs.
+
+
+# Made by .ci/compile_kernels.py; a checkout has none.
+ARCHIVE = Path(__file__).parents[1] / "compiled.zip"
+MANIFEST = "manifest.json"
+
+TARGET = "x86-64-v3"
+"""The processors whose instructions the objects use: Intel since 2013 and AMD since 2017, but for the smallest."""
+FEATURES = ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe")
+"""These instructions by their names in /proc/cpuinfo."""
+
+# An archive that is damaged, or a cache that cannot be written: kernels are then compiled as without it.
+_UNUSABLE = (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile, zlib.error)
+
+
+def unpack_kernels() -> int:
+    """Puts the compiled kernels of this package into Warp's kernel cache, where they are not there already.
+
+    For programs of their own, before their first kernel; `spadwarp` calls it.
+
+    Returns:
+        The number of modules added: 0 where the package has none for this version of Warp, system and processor, and
+        where it is damaged or the cache cannot be written.
+    """
+    if not ARCHIVE.exists():
+        return 0
+    wp.init()
+    with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
+        if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= _processor_features():
+            # The end of this key is what Warp adds to the names of objects for the processor at hand.
+            ending = "cpu" + wp.get_cpu_kernel_cache_key().rpartition("-")[2]
+            return sum(_unpack(archive, name, ending) for name in archive.namelist() if name.endswith(".o"))
+    return 0
+
+
+def this_system() -> dict[str, str]:
+    """What an archive must be made for to be of use here, the features of the processor aside."""
+    return {"warp": wp.__version__, "system": platform.system(), "machine": platform.machine(), "target": TARGET}
+
+
+def _processor_features() -> set[str]:
+    for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+        if line.startswith("flags"):
+            return set(line.split())
+    return set()
+
+
+def _unpack(archive: zipfile.ZipFile, name: str, ending: str) -> bool:
+    module = name.removesuffix(".o")
+    folder = Path(wp.config.kernel_cache_dir) / module
+    parts = {f"{module}.o": folder / f"{module}.{ending}.o", f"{module}.meta": folder / f"{module}.meta"}
+    missing = {part: path for part, path in parts.items() if not path.exists()}
+    for part, path in missing.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = folder / f".{secrets.token_hex(8)}"
+        temporary.write_bytes(archive.read(part))
+        os.replace(temporary, path)
+    return bool(missing)

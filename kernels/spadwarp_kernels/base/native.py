@@ -1,0 +1,124 @@
+"""The bits of floats as integers, and back."""
+
+import numpy as np
+import warp as wp
+
+
+@wp.func_native("""
+    union { float number; int bits; } both;
+    both.number = number;
+    return both.bits;
+""")
+def bits_of(number: float) -> int:
+    """The int32 with the bits of a float32."""
+    ...
+
+
+@wp.func_native("""
+    union { float number; int bits; } both;
+    both.bits = bits;
+    return both.number;
+""")
+def from_bits(bits: int) -> float:
+    """The float32 with the bits of an int32; to be moved and not to be computed with."""
+    ...
+
+
+# ---- Memory that is read and written all over.
+
+
+# From this size on [bytes], NumPy asks Linux for pages of 2 MiB.
+_LARGE = 1 << 22
+
+
+def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
+    """`wp.zeros`, on the CPU in large pages, so that a core need not look up the page of each voxel that it adds to.
+
+    `dtype`: int64 or vec4.
+    """
+    if wp.get_device(device).is_cuda or size * wp.types.type_size_in_bytes(dtype) < _LARGE:
+        return wp.zeros(size, dtype=dtype, device=device)
+    memory = np.zeros((size, 4), np.float32) if dtype is wp.vec4 else np.zeros(size, np.int64)
+    return wp.array(memory, dtype=dtype, device="cpu", copy=False)
+
+
+@wp.func_native("return values.data[index];")
+def load_float(values: wp.array(dtype=float), index: int) -> float:
+    """`values[index]` of an array without gaps, 0 <= index: a quarter of the instructions."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float2 pair = reinterpret_cast<const float2*>(values.data)[index];
+    return wp::vec2(pair.x, pair.y);
+#else
+    return values.data[index];
+#endif
+""")
+def load_vec2(values: wp.array(dtype=wp.vec2), index: int) -> wp.vec2:
+    """As `load_float`, by one instruction instead of two; the array begins at a multiple of 8 bytes."""
+    ...
+
+
+# ---- Arguments of a kernel that its threads read again and again.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // Plus 0 in a launch along one axis, which the compiler does not know.
+    return word + (gridDim.y - 1u);
+#else
+    return word;
+#endif
+""")
+def held_word(word: wp.uint32) -> wp.uint32:
+    """The word, in a register that the warp shares from here on: else a compiler for CUDA reads an argument anew by an
+    instruction wherever it is used."""
+    ...
+
+
+# ---- Double precision: constants, and functions that keep their digits where the plain formula cancels.
+
+
+PI = wp.constant(wp.float64(3.141592653589793))
+SQRT2 = wp.constant(wp.float64(1.4142135623730951))
+SQRT_2PI = wp.constant(wp.float64(2.5066282746310002))
+ZERO = wp.constant(wp.float64(0.0))
+HALF = wp.constant(wp.float64(0.5))
+ONE = wp.constant(wp.float64(1.0))
+TWO = wp.constant(wp.float64(2.0))
+
+
+@wp.func
+def expm1(x: wp.float64) -> wp.float64:
+    """exp(x) − 1 without cancellation: relative error below 1e-13."""
+    if wp.abs(x) > wp.float64(0.01):
+        return wp.exp(x) - wp.float64(1.0)
+    series = wp.float64(1.0) + x * (
+        wp.float64(1.0 / 2.0) + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0)))
+    )
+    return x * series
+
+
+@wp.func
+def log1p(x: wp.float64) -> wp.float64:
+    """ln(1 + x) without cancellation (Kahan's correction)."""
+    y = wp.float64(1.0) + x
+    if y == wp.float64(1.0):
+        return x
+    return x * wp.log(y) / (y - wp.float64(1.0))
+
+
+@wp.func
+def normal_cdf(z: wp.float64) -> wp.float64:
+    """Probability below z of the normal distribution."""
+    return HALF * wp.erfc(-z / SQRT2)
+
+
+@wp.func
+def one_minus_exp(x: wp.float64) -> wp.float64:
+    """1 - exp(-x) for x >= 0 without cancellation."""
+    if x < wp.float64(1.0e-4):
+        return x * (ONE - x * (HALF - x / wp.float64(6.0)))
+    return ONE - wp.exp(-x)

@@ -1,0 +1,252 @@
+"""The camera: origin at the lens centre, +z along the optical axis, +x right, +y down.
+
+Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangents are x/z and y/z of a direction.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct, check_vector
+from spadwarp_kernels.base.rotations import cos_sin_turn
+
+from .port import Port
+
+__all__ = ["Camera", "lens_point", "pixel_direction", "project", "project_calibrated"]
+
+
+@wp.struct
+class Camera:
+    """A camera with a thin lens: a disc in the plane z = 0 that images one depth sharply.
+
+    Attributes:
+        width, height: Image size [pixels].
+        pixel_tangent: Pixel pitch over image distance.
+        aperture_radius: Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply.
+        aperture_area: The area that collects light [m^2], also where the lens is a point.
+        inverse_focus: 1 over the depth that is imaged sharply [1/m]; 0 is infinity.
+        focal: Focal length in pixels along rows and columns. This and what follows is for `CALIBRATED` alone;
+            for `PLAIN`, `launch_transport` computes what it needs of it.
+        principal: Image coordinates of the optical axis.
+        radial: k1, k2, k3 of Brown's model.
+        tangential: p1, p2 of Brown's model.
+        view: Least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it.
+        port: What is between the lens and the water, see `make_flat_port`; read by specs with a port alone. View and
+            focus are those in the air behind it.
+    """
+
+    width: int
+    height: int
+    pixel_tangent: float
+    aperture_radius: float
+    aperture_area: float
+    inverse_focus: float
+    focal: wp.vec2
+    principal: wp.vec2
+    radial: wp.vec3
+    tangential: wp.vec2
+    view: wp.vec4
+    port: Port
+
+
+@wp.func
+def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
+    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
+
+    The line through x and o meets the focus plane at a point that the lens centre sees in this direction,
+    x/z + o (1/focus - 1/z).
+    """
+    inverse = 1.0 / x[2]
+    return wp.vec2(
+        (x[0] - o[0]) * inverse + camera.inverse_focus * o[0], (x[1] - o[1]) * inverse + camera.inverse_focus * o[1]
+    )
+
+
+@wp.func
+def project(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images the point x by way of the lens point o, or -1 outside the view."""
+    scale = 1.0 / camera.pixel_tangent
+    centre = wp.vec2(0.5 * float(camera.width), 0.5 * float(camera.height))
+    return _pixel(camera, wp.vec2(scale, scale), centre, x, o)
+
+
+@wp.func
+def project_about_axis(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
+    """`project` for a camera from `with_field`."""
+    return _pixel(camera, camera.focal, camera.principal, x, o)
+
+
+@wp.func
+def _pixel(camera: Camera, focal: wp.vec2, principal: wp.vec2, x: wp.vec3, o: wp.vec3) -> int:
+    t = image_tangents(camera, x, o)
+    column = t[0] * focal[0] + principal[0]
+    row = t[1] * focal[1] + principal[1]
+    # Compared as floats: a float beyond the int range has no defined int value. Also false for what is not a number.
+    inside = column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)
+    if not (inside and x[2] > 0.0):
+        return -1
+    return int(row) * camera.width + int(column)
+
+
+@wp.func
+def distort(camera: Camera, t: wp.vec2) -> wp.vec2:
+    """Image coordinates at which the direction of tangents t through the lens centre is seen (Brown 1966)."""
+    x = t[0]
+    y = t[1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (camera.radial[0] + r2 * (camera.radial[1] + r2 * camera.radial[2]))
+    p1 = camera.tangential[0]
+    p2 = camera.tangential[1]
+    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    row = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return wp.vec2(column * camera.focal[0] + camera.principal[0], row * camera.focal[1] + camera.principal[1])
+
+
+@wp.func
+def project_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images x by way of the lens point o, or -1 outside the view or the image, and
+    for any pixel but the target where that is not negative."""
+    if x[2] <= 0.0:
+        return -1
+    t = image_tangents(camera, x, o)
+    # Beyond the view the polynomial may turn over and lead back into the image. Also false for what is not a number.
+    if not (t[0] >= view[0] and t[1] >= view[1] and t[0] <= view[2] and t[1] <= view[3]):
+        return -1
+    place = distort(camera, t)
+    column = wp.floor(place[0])
+    row = wp.floor(place[1])
+    if column < 0.0 or row < 0.0 or column >= float(camera.width) or row >= float(camera.height):
+        return -1
+    pixel = int(row) * camera.width + int(column)
+    return wp.where(target >= 0 and pixel != target, -1, pixel)
+
+
+@wp.func
+def pixel_direction(camera: Camera, column: float, row: float) -> wp.vec3:
+    """Unit direction from the lens centre through image coordinates in pixels; (0.5, 0.5) is the first pixel's
+    centre."""
+    return wp.normalize(
+        wp.vec3(
+            (column - 0.5 * float(camera.width)) * camera.pixel_tangent,
+            (row - 0.5 * float(camera.height)) * camera.pixel_tangent,
+            1.0,
+        )
+    )
+
+
+@wp.func
+def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
+    """A uniform point on the aperture disc [m], for uniform xi1, xi2 in [0, 1)."""
+    r = camera.aperture_radius * wp.sqrt(xi1)
+    turn = cos_sin_turn(xi2)
+    return wp.vec3(r * turn[0], r * turn[1], 0.0)
+
+
+@wp.func
+def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.vec2:
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, between the side planes through the origin with the
+    given tangents (left, top, right, bottom), which meet there: all of it has z > 0; empty where s0 >= s1."""
+    interval = wp.vec2(0.0, limit)
+    interval = clip_half_space(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
+    interval = clip_half_space(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
+    interval = clip_half_space(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
+    return clip_half_space(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
+
+
+@wp.func
+def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
+    """The part of the interval of s in which value + slope s > 0."""
+    # Selected rather than branched to: half the lanes of a warp go either way. For a flight along the plane the
+    # crossing is infinite.
+    crossing = -1.0 * value / slope
+    rising = slope >= 0.0
+    lower = wp.where(rising, wp.max(interval[0], crossing), interval[0])
+    upper = wp.where(rising, interval[1], wp.min(interval[1], crossing))
+    return wp.vec2(lower, upper)
+
+
+@wp.func
+def field(camera: Camera) -> wp.vec4:
+    """Tangents (left, top, right, bottom) of what the image shows, for square pixels about the optical axis."""
+    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
+    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
+    return wp.vec4(-half_width, -half_height, half_width, half_height)
+
+
+def with_field(camera: Any) -> Any:
+    """A copy of the camera that has what threads would otherwise compute: as its view its `field`, rounded as there,
+    and the focal lengths and principal point of square pixels about the axis."""
+    copy = Camera()
+    for name in Camera.vars:
+        setattr(copy, name, getattr(camera, name))
+    tangent = np.float32(camera.pixel_tangent)
+    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
+    copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
+    focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
+    copy.focal = wp.vec2(focal, focal)
+    copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))
+    return copy
+
+
+@wp.func
+def clip_to_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
+    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, that lies in the view as the lens point o sees it;
+    empty where s0 >= s1."""
+    # Sheared so that the side planes, which go through o and the view on the focus plane, go through the origin.
+    slope_x = camera.inverse_focus * o[0]
+    slope_y = camera.inverse_focus * o[1]
+    start = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
+    along = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
+    return clip_to_planes(view, start, along, limit)
+
+
+@wp.func
+def in_view(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+    """Whether any point of the lens may image x into the view; False is certain, up to rounding at its edge."""
+    z = x[2]
+    # Radius of the circle of confusion, at the distance of x.
+    blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
+    inside = wp.min(wp.min(x[0] - view[0] * z, view[2] * z - x[0]), wp.min(x[1] - view[1] * z, view[3] * z - x[1]))
+    return z > 0.0 and inside > -blur
+
+
+@wp.func
+def in_field(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+    """`in_view` of a view about the optical axis."""
+    z = x[2]
+    blur = camera.aperture_radius * wp.abs(z * camera.inverse_focus - 1.0)
+    return wp.abs(x[0]) < view[2] * z + blur and wp.abs(x[1]) < view[3] * z + blur and z > 0.0
+
+
+@wp.func
+def toward_middle(view: wp.vec4, x: wp.vec3) -> wp.vec2:
+    """Vector across the optical axis from x towards the middle of the view [m]."""
+    depth = 0.5 * wp.max(x[2], 0.0)
+    return wp.vec2(depth * (view[0] + view[2]) - x[0], depth * (view[1] + view[3]) - x[1])
+
+
+@wp.func
+def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec2:
+    """`toward_middle` of a view about the optical axis."""
+    return wp.vec2(-1.0 * x[0], -1.0 * x[1])
+
+
+def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
+    """A camera that images something; raises `ArgumentError`."""
+    check_struct(name, camera, Camera)
+    for field_name in ("width", "height"):
+        check_integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
+    check_fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
+    check_fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
+    if not calibrated:
+        return
+    for focal in camera.focal:
+        check_number(f"{name}.focal", focal, "(0, inf)")
+    check_vector(f"{name}.principal", camera.principal, size=2)
+    check_vector(f"{name}.radial", camera.radial)
+    check_vector(f"{name}.tangential", camera.tangential, size=2)
+    left, top, right, bottom = camera.view
+    check_vector(f"{name}.view", camera.view, size=4)
+    check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
+    check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")

@@ -1,0 +1,164 @@
+"""The pulsed laser: where photons start and where they go."""
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp_kernels.base.arguments import ArgumentError, check_numbers
+from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
+from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
+
+from .port import Port
+
+__all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "profile_tables"]
+
+LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
+
+
+@wp.struct
+class Laser:
+    """A laser in camera coordinates.
+
+    Attributes:
+        position: Centre of the exit pupil [m].
+        axis: Unit vector of the beam.
+        profile: Index into LASER_PROFILES.
+        spread: 1 - cos of the half angle, in [0, 2] (uniform cone).
+        tan2: tan^2 of the half angle at which the irradiance is 1/e^2 of that on the axis (gaussian).
+        radius: Beam radius at the exit [m] (collimated; 0 is a pencil beam).
+        rows, columns: Distribution functions of a measured profile, see `profile_tables`; this and what follows is
+            read by `emit_measured` alone.
+        extent: Tangents of the profile's half width and half height.
+        port: What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs
+            with a port of the laser alone.
+    """
+
+    position: wp.vec3
+    axis: wp.vec3
+    profile: int
+    spread: float
+    tan2: float
+    radius: float
+    rows: wp.array(dtype=float)
+    columns: wp.array2d(dtype=float)
+    extent: wp.vec2
+    port: Port
+
+
+@wp.func
+def emit_photon(laser: Laser, seed: wp.uint64, id: wp.uint64):
+    """Start position [m] and unit direction of photon `id`; see `emit_along`."""
+    position, direction = emit_along(laser, laser.axis, seed, id)
+    return position, direction
+
+
+@wp.func
+def emit_along(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
+    """Start position [m] and unit direction of photon `id` from a laser turned to an axis of its own; no measured
+    profile.
+
+    Uniform cone: uniform in solid angle. Gaussian: irradiance exp(-2 tan^2(a)/tan^2(theta)) on a plane across the axis.
+    Collimated: uniform over a disc of the given radius.
+    """
+    block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
+    xi = u01_fine(block[0])
+    azimuth = u01(block[1])
+    position = laser.position
+    direction = axis
+    if laser.profile == 0:
+        direction = rotate_direction(axis, laser.spread * xi, azimuth)
+    elif laser.profile == 1:
+        # tan^2 is exponential; 1 - cos from tan^2 without cancellation: tan^2/((1 + s) s), s = sqrt(1 + tan^2).
+        tan2 = -0.5 * laser.tan2 * wp.log(u01_open(block[0]))
+        s = wp.sqrt(1.0 + tan2)
+        direction = rotate_direction(axis, tan2 / ((1.0 + s) * s), azimuth)
+    else:
+        b1, b2 = orthonormal_basis(axis)
+        r = laser.radius * wp.sqrt(xi)
+        turn = cos_sin_turn(azimuth)
+        position = laser.position + (r * turn[0]) * b1 + (r * turn[1]) * b2
+    return position, direction
+
+
+def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Distribution functions from which `emit_measured` draws a pixel of a beam profile.
+
+    Args:
+        image: Irradiance on a plane across the beam, `[H, W]`, any unit, >= 0, finite, not all 0.
+
+    Returns:
+        float32 `[H]`, the part of the power in the rows up to each; float32 `[H, W]`, the same along each row. The last
+        entries are 1.
+
+    Raises:
+        ArgumentError: Another shape, or values that cannot be.
+    """
+    power = check_numbers("profile", image)
+    if power.ndim != 2 or power.size == 0:
+        raise ArgumentError(f"profile has shape {power.shape}; [height, width] is needed")
+    if not (np.isfinite(power).all() and power.min() >= 0 and power.max() > 0):
+        raise ArgumentError(
+            f"profile holds {power.min()} to {power.max()}; finite values >= 0 are needed, and one above"
+        )
+    power = power / power.max()
+    rows = np.cumsum(power.sum(axis=1))
+    columns = np.cumsum(power, axis=1)
+    total = columns[:, -1:]
+    columns = np.divide(columns, total, out=np.ones_like(columns), where=total > 0)
+    return (rows / rows[-1]).astype(np.float32), columns.astype(np.float32)
+
+
+@wp.func
+def beam_frame(axis: wp.vec3):
+    """Right and down of a beam's profile: as the camera's x and y for a beam along z, right always level with x-z."""
+    right = wp.vec3(axis[2], 0.0, -axis[0])
+    level = wp.length(right)
+    right = wp.where(level > 1.0e-6, right / wp.max(level, 1.0e-6), wp.vec3(1.0, 0.0, 0.0))
+    return right, wp.cross(axis, right)
+
+
+@wp.func
+def _first_above(table: wp.array(dtype=float), u: float) -> int:
+    """Index of the first entry above u of a rising table that ends with 1, for u in [0, 1)."""
+    low = int(0)
+    high = int(table.shape[0] - 1)
+    while low < high:
+        middle = (low + high) / 2
+        if table[middle] > u:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@wp.func
+def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
+    """Start position [m] and unit direction of photon `id` from a laser with a measured profile, turned to an axis.
+
+    The profile is the irradiance on a plane across the axis; a pixel is drawn by its power and a point evenly in it.
+    """
+    block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
+    row = _first_above(laser.rows, u01(block[0]))
+    column = _first_above(laser.columns[row], u01(block[1]))
+    x = 2.0 * (float(column) + u01(block[2])) / float(laser.columns.shape[1]) - 1.0
+    y = 2.0 * (float(row) + u01(block[3])) / float(laser.columns.shape[0]) - 1.0
+    right, down = beam_frame(axis)
+    return laser.position, wp.normalize(axis + (x * laser.extent[0]) * right + (y * laser.extent[1]) * down)
+
+
+# ---- A raster that beam and pixel scan together.
+
+
+@wp.struct
+class Scan:
+    """A raster that laser and pixel walk together: photon id belongs to position id mod `count`.
+
+    Attributes:
+        count: Number of positions; position i is scored into pixel i.
+        axis: Unit vector of the beam at each.
+        view: Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it.
+    """
+
+    count: int
+    axis: wp.array(dtype=wp.vec3)
+    view: wp.array(dtype=wp.vec4)

@@ -1,0 +1,651 @@
+"""A port between camera or laser and the water: layers of air and glass that bend light; and the ways through it."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_vector
+
+__all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
+
+
+@wp.struct
+class Port:
+    """What is between the air inside a housing and the water, in the frame of the camera; made by `make_flat_port` or
+    `make_dome_port`.
+
+    A flat window is all space between the planes x·normal = distance and distance + thickness, a dome all between the
+    spheres of radius and radius + thickness about its centre. With a thickness of 0 there is none, as at a calm
+    surface.
+
+    Attributes:
+        normal: Unit vector into the water (flat).
+        distance: To the inner face from the origin along the normal [m] (flat).
+        centre: Of the spheres [m] (dome).
+        radius: Of the inner sphere [m] (dome).
+        thickness: Of the window [m].
+        index: Phase index of what is inside, of the window, of the water.
+        delay: Group index over that of the water, of what is inside and of the window.
+        glass_slope, water_slope: Bounds of the tangent that a ray makes with the normal in the window and in the water,
+            over that inside, among the rays of a view: (least, largest) (flat).
+        turn: Bound of the sine of the angle by which a ray of the view is bent (dome).
+        aside: Bound of a ray's distance from the centre, in the water [m] (dome).
+        early, late: The way through the port takes at most this much less, and more, than the straight line in water
+            [m of water].
+    """
+
+    normal: wp.vec3
+    distance: float
+    centre: wp.vec3
+    radius: float
+    thickness: float
+    index: wp.vec3
+    delay: wp.vec2
+    glass_slope: wp.vec2
+    water_slope: wp.vec2
+    turn: float
+    aside: float
+    early: float
+    late: float
+
+
+@wp.struct
+class Connection:
+    """The one way of light from a point in the water to a point inside.
+
+    Attributes:
+        to_port: Unit direction in the water.
+        inside: Unit direction in which it arrives.
+        exit: Where it leaves the water [m].
+        water: Length of its way in the water [m].
+        path: Length in water that takes as long as the whole way [m].
+        transmission: Fraction of unpolarised light that gets through.
+        density: Solid angle at the point in the water over the area that its light covers inside, across the ray
+            [sr/m^2]; 0: there is no such way. 1/r^2 where all indices are equal.
+    """
+
+    to_port: wp.vec3
+    inside: wp.vec3
+    exit: wp.vec3
+    water: float
+    path: float
+    transmission: float
+    density: float
+
+
+@wp.struct
+class Passage:
+    """A ray that has gone through a port.
+
+    Attributes:
+        x: Where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside.
+        u: Its unit direction there.
+        water: Length of its way in the water up to the port [m]; negative if the ray began behind that.
+        path: Length in water that takes as long as the way behind that [m].
+        transmission: Fraction of unpolarised light that gets through; 0: none.
+    """
+
+    x: wp.vec3
+    u: wp.vec3
+    water: float
+    path: float
+    transmission: float
+
+
+@wp.func
+def transmission(n: wp.vec4, q: wp.vec4) -> float:
+    """Fraction of unpolarised light that two interfaces let through: half the sum of the products of both
+    polarisations. Light that a window reflects inside is left out.
+
+    Args:
+        n: Phase indices: before and behind the first interface, before and behind the second.
+        q: The same times the cosine to the normal there.
+    """
+    s1 = q[0] + q[1]
+    s2 = q[2] + q[3]
+    first = 4.0 * q[0] * q[1]
+    second = 4.0 * q[2] * q[3]
+    # cos/n in place of n cos gives the other polarisation.
+    p1 = q[0] * n[1] / n[0] + q[1] * n[0] / n[1]
+    p2 = q[2] * n[3] / n[2] + q[3] * n[2] / n[3]
+    return 0.5 * first * second * (1.0 / (s1 * s1 * s2 * s2) + 1.0 / (p1 * p1 * p2 * p2))
+
+
+@wp.func
+def refracted(u: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
+    """The direction u behind an interface, for the ratio of the index before it to that behind it; the zero vector
+    where all light is reflected. The normal is on either side."""
+    cosine = wp.dot(u, normal)
+    across = u - cosine * normal
+    rest = 1.0 - ratio * ratio * wp.dot(across, across)
+    if rest <= 0.0:
+        return wp.vec3(0.0)
+    return ratio * across + (wp.sign(cosine) * wp.sqrt(rest)) * normal
+
+
+# ---- A flat port: a plane window, or a calm surface without one.
+
+
+# Newton's method rises monotonically to the one root: 3 steps at 15 degrees in air, 5 at 63; beyond the critical angle,
+# where nearly all of the way is in a thin layer of air, up to about 12. After a step of this size, relative to t, the
+# error is its square.
+_FLAT_STEPS = wp.constant(16)
+_LAST_STEP = wp.constant(1.0e-4)
+
+
+@wp.func
+def snell_tangent(h: wp.vec3, n: wp.vec3, aside: float) -> float:
+    """t of the ray that gets `aside` [m] on its way through layers of thicknesses h [m] >= 0 and indices n."""
+    m = wp.min(n[0], wp.min(n[1], n[2]))
+    n2 = wp.cw_mul(n, n)
+    e = wp.vec3((n[0] - m) * (n[0] + m), (n[1] - m) * (n[1] + m), (n[2] - m) * (n[2] + m))
+    t = aside / (m * (h[0] / n[0] + h[1] / n[1] + h[2] / n[2]))
+    for _ in range(_FLAT_STEPS):
+        t2 = t * t
+        value = float(0.0)
+        slope = float(0.0)
+        for i in range(3):
+            root = 1.0 / wp.sqrt(n2[i] + e[i] * t2)
+            value += h[i] * root
+            slope += h[i] * n2[i] * root * root * root
+        step = (aside / m - t * value) / slope
+        t += step
+        if wp.abs(step) <= _LAST_STEP * t:
+            break
+    return t
+
+
+@wp.func
+def connect_flat(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
+    """The way from x in the water to o inside."""
+    c = Connection()
+    y = x - o
+    along = wp.dot(y, port.normal)
+    inside = port.distance - wp.dot(o, port.normal)
+    h = wp.vec3(inside, port.thickness, along - inside - port.thickness)
+    if h[0] <= 0.0 or h[2] <= 0.0:
+        return c
+    across = y - along * port.normal
+    aside = wp.length(across)
+    across = across / wp.max(aside, 1.0e-30)
+    n = port.index
+    m = wp.min(n[0], wp.min(n[1], n[2]))
+    t = snell_tangent(h, n, aside)
+    cos_m = 1.0 / wp.sqrt(1.0 + t * t)
+    k = m * t * cos_m
+    q = wp.vec3()  # n cos(theta)
+    for i in range(3):
+        q[i] = cos_m * wp.sqrt(n[i] * n[i] + (n[i] - m) * (n[i] + m) * t * t)
+    c.to_port = -(k / n[2]) * across - (q[2] / n[2]) * port.normal
+    c.inside = -(k / n[0]) * across - (q[0] / n[0]) * port.normal
+    length = wp.vec3(h[0] * n[0] / q[0], h[1] * n[1] / q[1], h[2] * n[2] / q[2])
+    c.water = length[2]
+    c.exit = x + c.water * c.to_port
+    c.path = c.water + port.delay[0] * length[0] + port.delay[1] * length[1]
+    c.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(q[0], q[1], q[1], q[2]))
+    # d(Omega)/dA = k/(n_w^2 cos(theta_w) rho rho'(k)) on the port's plane; rho/k and rho' are sums of positive terms.
+    ratio = length[0] / n[0] + length[1] / n[1] + length[2] / n[2]
+    slope = length[0] * n[0] / (q[0] * q[0]) + length[1] * n[1] / (q[1] * q[1]) + length[2] * n[2] / (q[2] * q[2])
+    c.density = n[0] / (n[2] * q[0] * q[2] * ratio * slope)
+    return c
+
+
+@wp.func
+def apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
+    """Where the ray of a connection from x to o meets the port's axis through o if it goes straight on."""
+    n = port.index
+    q_water = -n[2] * wp.dot(c.to_port, port.normal)
+    q_inside = -n[0] * wp.dot(c.inside, port.normal)
+    k2 = n[0] * n[0] - q_inside * q_inside
+    q_glass = wp.sqrt(n[1] * n[1] - k2)
+    inside = port.distance - wp.dot(o, port.normal)
+    behind = inside * q_water / q_inside + port.thickness * q_water / q_glass
+    return o + (inside + port.thickness - behind) * port.normal
+
+
+@wp.func
+def apparent_centre_flat(port: Port) -> wp.vec3:
+    """`apparent_flat` of the lens's centre, for rays along the normal."""
+    n = port.index
+    behind = port.distance * n[2] / n[0] + port.thickness * n[2] / n[1]
+    return (port.distance + port.thickness - behind) * port.normal
+
+
+@wp.func
+def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
+    ray as it goes straight on."""
+    p = Passage()
+    n = port.index
+    cosine = -wp.dot(u, port.normal)
+    behind = wp.dot(x, port.normal) - port.distance - port.thickness
+    across = n[2] * (u + cosine * port.normal)
+    k2 = wp.dot(across, across)
+    least = wp.min(n[0], n[1])
+    if cosine <= 0.0 or k2 >= least * least:
+        return p
+    q0 = wp.sqrt(n[0] * n[0] - k2)
+    q1 = wp.sqrt(n[1] * n[1] - k2)
+    p.water = behind / cosine
+    glass = port.thickness / q1
+    inner = x + p.water * u + glass * across - port.thickness * port.normal
+    p.u = (across - q0 * port.normal) / n[0]
+    if p.u[2] >= 0.0:
+        return p
+    length = -inner[2] / p.u[2]
+    p.x = inner + length * p.u
+    p.path = port.delay[0] * length + port.delay[1] * glass * n[1]
+    p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(q0, q1, q1, n[2] * cosine))
+    return p
+
+
+@wp.func
+def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+    """What comes of a ray from x inside along u, up to where it enters the water."""
+    p = Passage()
+    n = port.index
+    cosine = wp.dot(u, port.normal)
+    before = port.distance - wp.dot(x, port.normal)
+    across = n[0] * (u - cosine * port.normal)
+    k2 = wp.dot(across, across)
+    least = wp.min(n[1], n[2])
+    if cosine <= 0.0 or before <= 0.0 or k2 >= least * least:
+        return p
+    q1 = wp.sqrt(n[1] * n[1] - k2)
+    q2 = wp.sqrt(n[2] * n[2] - k2)
+    length = before / cosine
+    glass = port.thickness / q1
+    p.x = x + length * u + glass * across + port.thickness * port.normal
+    p.u = (across + q2 * port.normal) / n[2]
+    p.path = port.delay[0] * length + port.delay[1] * glass * n[1]
+    p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(n[0] * cosine, q1, q1, q2))
+    return p
+
+
+@wp.func
+def cosines_flat(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
+    """Index times cosine at the interfaces of the ray through x in the water along u."""
+    n = port.index
+    across = n[2] * wp.cross(u, port.normal)
+    k2 = wp.dot(across, across)
+    q0 = wp.sqrt(wp.max(n[0] * n[0] - k2, 0.0))
+    q1 = wp.sqrt(wp.max(n[1] * n[1] - k2, 0.0))
+    return wp.vec4(q0, q1, q1, n[2] * wp.abs(wp.dot(u, port.normal)))
+
+
+# ---- A dome port: a spherical window.
+
+
+# After a step of this size, relative to the angle, the error of Newton's method is its square.
+_DOME_STEPS = wp.constant(12)
+
+
+@wp.func
+def _turn(p: float, x: float) -> wp.vec2:
+    """asin(p/x) and its derivative by p."""
+    s = p / x
+    return wp.vec2(wp.asin(s), 1.0 / (x * wp.sqrt(wp.max(1.0 - s * s, 1.0e-12))))
+
+
+@wp.func
+def _chord(r: float, b: float) -> float:
+    """Half the chord of a circle at the distance b from its centre [m]."""
+    return wp.sqrt(wp.max((r - b) * (r + b), 0.0))
+
+
+@wp.func
+def _cosines(port: Port, p: float) -> wp.vec4:
+    """Index times cosine at the interfaces, of a ray of index times distance p [m]."""
+    n = port.index
+    inner = port.radius
+    outer = port.radius + port.thickness
+    b = p / n[1]
+    return wp.vec4(
+        n[0] * _chord(inner, p / n[0]) / inner,
+        n[1] * _chord(inner, b) / inner,
+        n[1] * _chord(outer, b) / outer,
+        n[2] * _chord(outer, p / n[2]) / outer,
+    )
+
+
+@wp.func
+def cosines_dome(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
+    """Index times cosine at the interfaces of the ray through x in the water along u."""
+    return _cosines(port, port.index[2] * wp.length(wp.cross(x - port.centre, u)))
+
+
+@wp.func
+def _transmission(port: Port, p: float) -> float:
+    """That of a ray of index times distance p [m]."""
+    n = port.index
+    return transmission(wp.vec4(n[0], n[1], n[1], n[2]), _cosines(port, p))
+
+
+@wp.func
+def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
+    """The way from x in the water to o inside."""
+    c = Connection()
+    n = port.index
+    inner = port.radius
+    outer = port.radius + port.thickness
+    y = x - port.centre
+    r = wp.length(y)
+    z = o - port.centre
+    d = wp.length(z)
+    if r <= outer or d >= inner:
+        return c
+    to_x = y / r
+    e = to_x
+    if d > 1.0e-9:
+        e = z / d
+    cosine = wp.dot(e, to_x)
+    if cosine < 0.0:  # the axis through o and the centre, on the side of x, where no angle is near pi
+        e = -e
+        d = -d
+        cosine = -cosine
+    aside = wp.cross(e, to_x)
+    sine = wp.length(aside)
+    beta = wp.atan2(sine, cosine)
+    i = wp.atan2(r * sine, r * cosine - d)
+    slope = float(1.0)
+    for _ in range(_DOME_STEPS):
+        p = n[0] * d * wp.sin(i)
+        t0 = _turn(p, n[0] * inner)
+        t1 = _turn(p, n[1] * inner)
+        t2 = _turn(p, n[1] * outer)
+        t3 = _turn(p, n[2] * outer)
+        t4 = _turn(p, n[2] * r)
+        bend = (t1 - t0) + (t3 - t2) - t4
+        slope = 1.0 + n[0] * d * wp.cos(i) * bend[1]
+        step = (beta - i - bend[0]) / slope
+        i += step
+        if wp.abs(step) <= _LAST_STEP * i:
+            break
+    sin_i = wp.sin(i)
+    cos_i = wp.cos(i)
+    p = n[0] * d * sin_i
+    toward = (to_x - cosine * e) / wp.max(sine, 1.0e-20)
+    heading = beta + wp.asin(p / (n[2] * r))
+    c.to_port = -wp.cos(heading) * e - wp.sin(heading) * toward
+    c.inside = -cos_i * e - sin_i * toward
+    air = _chord(inner, p / n[0]) - d * cos_i
+    glass = _chord(outer, p / n[1]) - _chord(inner, p / n[1])
+    water_out = _chord(r, p / n[2])
+    c.water = water_out - _chord(outer, p / n[2])
+    c.exit = x + c.water * c.to_port
+    c.path = c.water + port.delay[0] * air + port.delay[1] * glass
+    c.transmission = _transmission(port, p)
+    # sin(alpha) |d alpha/d beta|/(d^2 sin(beta) |cos i|) with alpha = asin(p/(n_w r)) put in.
+    spread = 1.0 / slope
+    if sine > 1.0e-12:
+        spread = sin_i / sine
+    c.density = n[0] * n[0] * spread / (n[2] * n[2] * r * water_out * wp.abs(slope))
+    return c
+
+
+@wp.func
+def apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
+    """The point of the ray of a connection from x to o, if it goes straight on, that is nearest to o."""
+    return x + wp.dot(o - x, c.to_port) * c.to_port
+
+
+@wp.func
+def apparent_centre_dome(port: Port) -> wp.vec3:
+    """The lens's centre: from near the centre of a dome, rays hardly bend."""
+    return wp.vec3(0.0)
+
+
+@wp.func
+def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
+    ray as it goes straight on."""
+    p = Passage()
+    n = port.index
+    inner = port.radius
+    outer = port.radius + port.thickness
+    y = x - port.centre
+    to_middle = -wp.dot(y, u)
+    b = wp.length(wp.cross(y, u))
+    if b >= outer:
+        return p
+    water = to_middle - _chord(outer, b)
+    first = y + water * u
+    glass = refracted(u, wp.normalize(first), n[2] / n[1])
+    b1 = b * n[2] / n[1]
+    b0 = b * n[2] / n[0]
+    if b1 >= inner or b0 >= inner:
+        return p
+    through = _chord(outer, b1) - _chord(inner, b1)
+    second = first + through * glass
+    p.u = refracted(glass, wp.normalize(second), n[1] / n[0])
+    if p.u[2] >= 0.0:
+        return p
+    length = -(second[2] + port.centre[2]) / p.u[2]
+    if length <= 0.0 or length >= 2.0 * _chord(inner, b0):
+        return p
+    p.water = water
+    p.x = second + port.centre + length * p.u
+    p.path = port.delay[0] * length + port.delay[1] * through
+    p.transmission = _transmission(port, n[0] * b0)
+    return p
+
+
+@wp.func
+def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+    """What comes of a ray from x inside along u, up to where it enters the water."""
+    p = Passage()
+    n = port.index
+    inner = port.radius
+    outer = port.radius + port.thickness
+    y = x - port.centre
+    b0 = wp.length(wp.cross(y, u))
+    b1 = b0 * n[0] / n[1]
+    b2 = b0 * n[0] / n[2]
+    if wp.dot(y, y) >= inner * inner or b1 >= inner or b2 >= outer:
+        return p
+    length = _chord(inner, b0) - wp.dot(y, u)
+    first = y + length * u
+    glass = refracted(u, wp.normalize(first), n[0] / n[1])
+    through = _chord(outer, b1) - _chord(inner, b1)
+    second = first + through * glass
+    p.x = second + port.centre
+    p.u = refracted(glass, wp.normalize(second), n[1] / n[2])
+    p.path = port.delay[0] * length + port.delay[1] * through
+    p.transmission = _transmission(port, n[0] * b0)
+    return p
+
+
+# ---- Kinds of ports, as the transport kernels take them, and their parameters from lengths and indices.
+
+
+# Stands for no bound.
+_FAR = 1.0e6
+
+
+class PortKind(NamedTuple):
+    """A kind of port; its name identifies it in the kernel cache.
+
+    Attributes:
+        name: "flat" or "dome".
+        connect: Warp function (port, x, o) -> Connection from x in the water to o inside.
+        apparent: Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m].
+        apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
+        leave: Warp function (port, x, u) -> Passage of a ray from the water to the plane z = 0 inside.
+        enter: Warp function (port, x, u) -> Passage of a ray from inside into the water.
+        cosines: Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces,
+            in the order of `transmission`, of the ray through x in the water along u, on its way in or out.
+    """
+
+    name: str
+    connect: wp.Function
+    apparent: wp.Function
+    apparent_centre: wp.Function
+    leave: wp.Function
+    enter: wp.Function
+    cosines: wp.Function
+
+
+FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat, cosines_flat)
+"""A plane window, or a calm surface without one."""
+
+DOME_PORT = PortKind("dome", connect_dome, apparent_dome, apparent_centre_dome, leave_dome, enter_dome, cosines_dome)
+"""A spherical window."""
+
+
+def make_flat_port(
+    *,
+    distance: float,
+    thickness: float = 0.0,
+    normal: Sequence[float] = (0.0, 0.0, 1.0),
+    index: Sequence[float],
+    group_index: Sequence[float],
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    aperture_radius: float = 0.0,
+    largest_angle: float = 1.5,
+) -> Port:
+    """The parameters of a plane window.
+
+    Args:
+        distance: From the camera's lens centre along the normal to the inner face [m].
+        thickness: Of the window [m], >= 0.
+        normal: Unit vector into the water.
+        index, group_index: Of what is inside, of the window, of the water; >= 1.
+        origin: The lens centre, or the position of a laser, which must be inside [m].
+        aperture_radius: Of the camera [m]: all of the lens must be inside.
+        largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
+
+    Raises:
+        ArgumentError: A number out of its range.
+    """
+    check_number("distance", distance, "(-inf, inf)")
+    check_vector("normal", normal, unit=True)
+    _check_layers(thickness, index, group_index, origin, aperture_radius)
+    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
+    tilt = aperture_radius * math.hypot(normal[0], normal[1])
+    inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
+    if tilt >= inside:
+        raise ArgumentError(
+            f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
+            "through the port"
+        )
+    port = _port(thickness, index, group_index)
+    port.normal, port.distance = wp.vec3(*normal), distance
+    n = tuple(port.index)
+    slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
+    port.glass_slope, port.water_slope = (wp.vec2(*bounds) for bounds in slopes)
+    steepest = max(math.tan(largest_angle), slopes[0][1] * math.tan(largest_angle))
+    longest = min(math.hypot(1.0, steepest), _FAR)
+    _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
+    return port
+
+
+def make_dome_port(
+    *,
+    radius: float,
+    thickness: float,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    index: Sequence[float],
+    group_index: Sequence[float],
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    aperture_radius: float = 0.0,
+    largest_angle: float = 1.5,
+) -> Port:
+    """The parameters of a spherical window.
+
+    Args:
+        radius: Of the inner sphere [m], > 0.
+        thickness: Of the window [m], >= 0.
+        centre: Of the spheres, from the camera's lens centre [m].
+        index, group_index: Of what is inside, of the window, of the water; >= 1.
+        origin: The lens centre, or the position of a laser, which must be inside [m].
+        aperture_radius: Of the camera [m].
+        largest_angle: Between the optical axis and any ray of the view, inside, in [0, pi/2) [rad].
+
+    Raises:
+        ArgumentError: A number out of its range, or a lens so far from the centre that some of its light could not get
+            through.
+    """
+    check_number("radius", radius, "(0, 1e9]")
+    check_vector("centre", centre)
+    _check_layers(thickness, index, group_index, origin, aperture_radius)
+    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
+    port = _port(thickness, index, group_index)
+    port.radius, port.centre = radius, wp.vec3(*centre)
+    n = tuple(port.index)
+    furthest = math.dist(centre, origin) + aperture_radius
+    if not furthest < min(1.0, n[1] / n[0], n[2] / n[0] * (1.0 + thickness / radius)) * radius:
+        raise ArgumentError(
+            f"centre = {tuple(centre)} m: a lens or laser reaches {furthest:g} m from it, too far for a dome of radius "
+            f"{radius} m"
+        )
+    p, outer = np.linspace(0.0, n[0] * furthest, 257), radius + thickness
+    angle = [np.arcsin(p / x) for x in (n[0] * radius, n[1] * radius, n[1] * outer, n[2] * outer)]
+    turn = float(np.abs(angle[1] - angle[0] + angle[3] - angle[2]).max())
+    widest = largest_angle + turn
+    port.turn = math.sin(turn) / math.cos(widest) if widest < 1.57 else _FAR
+    port.aside = max(1.0, n[0] / n[2]) * furthest
+    b = n[0] * furthest / n[1]
+    oblique = math.sqrt(outer**2 - b**2) - math.sqrt(radius**2 - b**2)
+    _set_times(port, ((radius - furthest, radius + furthest), (thickness, oblique)))
+    return port
+
+
+def check_port(name: str, port: Port, kind: PortKind) -> None:
+    """Parameters of a port of that kind; raises `ArgumentError`."""
+    for k, value in enumerate(port.index):
+        check_number(f"{name}.index[{k}]", value, "[1, inf)")
+    if kind.name == FLAT_PORT.name:
+        check_number(f"{name}.distance", port.distance, "(-inf, inf)")
+        check_vector(f"{name}.normal", port.normal, unit=True)
+    else:
+        check_number(f"{name}.radius", port.radius, "(0, inf)")
+        check_vector(f"{name}.centre", port.centre)
+
+
+def _check_layers(
+    thickness: float,
+    index: Sequence[float],
+    group_index: Sequence[float],
+    origin: Sequence[float],
+    aperture_radius: float,
+) -> None:
+    check_vector("origin", origin)
+    check_number("thickness", thickness, "[0, 1e9]")
+    check_number("aperture_radius", aperture_radius, "[0, 1e9]")
+    for name, values in (("index", index), ("group_index", group_index)):
+        check_vector(name, values)
+        for k, value in enumerate(values):
+            check_number(f"{name}[{k}]", value, "[1, inf)")
+
+
+def _port(thickness: float, index: Sequence[float], group_index: Sequence[float]) -> Port:
+    port = Port()
+    port.thickness = thickness
+    # A window without thickness has no faces, and must not be the layer of the least index.
+    port.index = wp.vec3(index[0], index[1] if thickness > 0.0 else index[0], index[2])
+    port.delay = wp.vec2(group_index[0] / group_index[2], group_index[1] / group_index[2])
+    return port
+
+
+def _slopes(inside: float, layer: float, angle: float) -> tuple[float, float]:
+    """Least and largest tan(theta_layer)/tan(theta_inside) of rays within an angle of the normal; rising or falling."""
+    rest = layer**2 - (inside * math.sin(angle)) ** 2
+    oblique = inside * math.cos(angle) / math.sqrt(rest) if rest > 0.0 else _FAR
+    return min(inside / layer, oblique), max(inside / layer, oblique)
+
+
+def _set_times(port: Port, lengths: Sequence[tuple[float, float]]) -> None:
+    """Bounds of a way's time, from the least and largest lengths in the layers.
+
+    The ray is no shorter than the straight line, and by Fermat's principle its optical length is not longer.
+    """
+    early, late = 0.0, 0.0
+    for k, (least, largest) in enumerate(lengths):
+        delay, ratio = port.delay[k], port.index[k] / port.index[2]
+        early += max(1.0 - delay, 0.0) * largest
+        late += (ratio - 1.0) * (least if ratio < 1.0 else largest)
+        late += (delay - ratio) * (least if delay < ratio else largest)
+    port.early, port.late = early, late

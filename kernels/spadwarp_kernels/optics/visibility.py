@@ -1,0 +1,126 @@
+"""Which points the lens sees for certain: a coarse map that answers most shadow rays without a BVH."""
+
+import warp as wp
+
+from spadwarp_kernels.base.arguments import check_array, check_kind
+
+from .camera import Camera, check_camera, field
+
+__all__ = ["near_depth_map"]
+
+# Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
+_TEXELS = wp.constant(128)
+_NOTHING = wp.constant(1.0e30)
+
+
+@wp.func
+def _texel(tangent: float, low: float, high: float) -> float:
+    return (tangent - low) / (high - low) * float(_TEXELS)
+
+
+@wp.func
+def _map_view(camera: Camera) -> wp.vec4:
+    """Tangents (left, top, right, bottom) of the map: those of the camera's view, or its field where that is empty."""
+    view = camera.view
+    if view[2] == view[0]:
+        view = field(camera)
+    return view
+
+
+@wp.func
+def _rectangle(camera: Camera, view: wp.vec4, p: wp.vec3, q: wp.vec3, r: wp.vec3, depth: float) -> wp.vec4i:
+    """First column and row, last column and row of the texels that a face before the lens may cover."""
+    # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent.
+    spread = camera.aperture_radius / depth
+    left = wp.min(p[0] / p[2], wp.min(q[0] / q[2], r[0] / r[2])) - spread
+    right = wp.max(p[0] / p[2], wp.max(q[0] / q[2], r[0] / r[2])) + spread
+    top = wp.min(p[1] / p[2], wp.min(q[1] / q[2], r[1] / r[2])) - spread
+    bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + spread
+    # One texel more on each side makes up for rounding.
+    edge = float(_TEXELS)
+    return wp.vec4i(
+        int(wp.clamp(_texel(left, view[0], view[2]) - 1.0, 0.0, edge)),
+        int(wp.clamp(_texel(top, view[1], view[3]) - 1.0, 0.0, edge)),
+        int(wp.clamp(_texel(right, view[0], view[2]) + 1.0, -1.0, edge - 1.0)),
+        int(wp.clamp(_texel(bottom, view[1], view[3]) + 1.0, -1.0, edge - 1.0)),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth: wp.array2d(dtype=float)):
+    """Lowers each texel to the least depth of the faces that may cover it. Launch: (faces, threads of a face)."""
+    face, thread = wp.tid()
+    m = wp.mesh_get(mesh)
+    p = m.points[m.indices[3 * face]]
+    q = m.points[m.indices[3 * face + 1]]
+    r = m.points[m.indices[3 * face + 2]]
+    if wp.max(p[2], wp.max(q[2], r[2])) < 0.0:
+        return  # behind the lens, and between nothing and it
+    view = _map_view(camera)
+    depth = wp.min(p[2], wp.min(q[2], r[2]))
+    box = wp.vec4i(0, 0, int(_TEXELS - 1), int(_TEXELS - 1))
+    if depth > camera.aperture_radius:
+        box = _rectangle(camera, view, p, q, r, depth)
+    else:
+        depth = 0.0  # beside the lens: of its points, only those of the plane tell
+    # Also no nearer than its plane: n y >= far for all y of the face. A ray from x to a point o of the lens meets it at
+    # a depth z with z n (x / x[2]) + n o (1 - z / x[2]) >= far, the second term being at most the radius of the lens.
+    n = wp.normalize(wp.cross(q - p, r - p))
+    if wp.dot(n, p) < 0.0:
+        n = -n
+    far = wp.min(wp.dot(n, p), wp.min(wp.dot(n, q), wp.dot(n, r))) - camera.aperture_radius
+    far -= 1.0e-6 * (wp.length(p) + wp.length(q) + wp.length(r))  # rounding
+    width = (view[2] - view[0]) / float(_TEXELS)
+    height = (view[3] - view[1]) / float(_TEXELS)
+    reach = 0.501 * (wp.abs(n[0]) * width + wp.abs(n[1]) * height)
+    columns = wp.max(box[2] - box[0] + 1, 0)
+    for k in range(thread, columns * wp.max(box[3] - box[1] + 1, 0), threads):
+        column = box[0] + k % columns
+        row = box[1] + k / columns
+        x = view[0] + (float(column) + 0.5) * width
+        y = view[1] + (float(row) + 0.5) * height
+        slope = n[0] * x + n[1] * y + n[2] + reach + 1.0e-6  # the largest in the texel
+        if far <= 0.0:
+            wp.atomic_min(near_depth, row, column, depth)
+        elif slope > 0.0:
+            wp.atomic_min(near_depth, row, column, wp.max(depth, far / slope))
+
+
+def near_depth_map(mesh: wp.Mesh, camera: Camera) -> wp.array:
+    """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns].
+
+    A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
+    the texel's cone, up to what the outlines of faces are widened by, and before every face in it. Raises
+    `ArgumentError` for a camera that images nothing.
+    """
+    check_kind("mesh", mesh, wp.Mesh)
+    near_depth = wp.empty((int(_TEXELS), int(_TEXELS)), dtype=float, device=mesh.device)
+    update_near_depth(near_depth, mesh, camera)
+    return near_depth
+
+
+def update_near_depth(near_depth: wp.array, mesh: wp.Mesh, camera: Camera) -> None:
+    """`near_depth_map` anew, in place, on the device."""
+    check_camera("camera", camera, calibrated=False)
+    check_array("near_depth", near_depth, wp.float32, (int(_TEXELS), int(_TEXELS)), mesh.device)
+    near_depth.fill_(_NOTHING)
+    # A warp for each face on a GPU: some cover all of the map.
+    threads = 32 if mesh.device.is_cuda else 1
+    faces = (mesh.indices.size // 3, threads)
+    wp.launch(_near_depth_kernel, faces, [camera, mesh.id, threads], [near_depth], device=mesh.device)
+
+
+@wp.func
+def may_be_hidden(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+    """Whether something may stand between the point x, x[2] > 0, and the lens; False is certain.
+
+    True for points beside the view (left, top, right, bottom), which the lens sees out of focus.
+    """
+    if near_depth.shape[0] == 0:
+        return True
+    column = _texel(x[0] / x[2], view[0], view[2])
+    row = _texel(x[1] / x[2], view[1], view[3])
+    edge = float(_TEXELS)
+    if not (column >= 0.0 and row >= 0.0 and column < edge and row < edge):
+        return True
+    return x[2] >= near_depth[int(row), int(column)]

@@ -1,0 +1,242 @@
+"""Rays against the target: its nearest face, and where the next ray starts."""
+
+import warp as wp
+
+from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.optics.camera import Camera, pixel_direction
+
+from .box import inverse_direction
+from .bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
+from .mesh import Surfaces
+from .patches import nearest_patch, normal_and_face, patch_faces, patch_normal
+from .reflectance import reflectance_at
+from .triangle import face_in, face_normal
+from .wide import walk_wide
+
+__all__ = [
+    "SurfaceHit",
+    "intersect_mesh",
+    "intersect_surfaces",
+    "offset_from_surface",
+    "truth_along_kernel",
+    "truth_kernel",
+]
+
+
+@wp.struct
+class SurfaceHit:
+    """Nearest surface along a ray.
+
+    Attributes:
+        distance: [m].
+        normal: Unit vector on the ray's side.
+        face: Its index; -1 for a miss.
+        slot: Its index in the order of the mesh's tree, where that was walked; -1 for a miss.
+    """
+
+    distance: float
+    normal: wp.vec3
+    face: int
+    slot: int
+
+
+@wp.func
+def surface_hit(surfaces: Surfaces, walk: TreeWalk, u: wp.vec3) -> SurfaceHit:
+    """What a ray along u has found on its way down the tree."""
+    hit = SurfaceHit()
+    hit.distance = walk.nearest
+    hit.slot = walk.found
+    hit.face = -1
+    if walk.found >= 0:
+        hit.face = face_in(surfaces.order, walk.found)
+        hit.normal = face_normal(surfaces.faces, walk.found, u)
+    return hit
+
+
+@wp.func
+def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float) -> SurfaceHit:
+    """Nearest hit of the ray x + s u, 0 <= s < max_distance, against the BVH of a `wp.Mesh`."""
+    hit = SurfaceHit()
+    hit.face = -1
+    hit.slot = -1
+    hit.distance = max_distance
+    query = wp.mesh_query_ray(mesh, x, u, max_distance)
+    if query.result:
+        hit.face = query.face
+        hit.distance = query.t
+        hit.normal = wp.where(wp.dot(query.normal, u) > 0.0, -query.normal, query.normal)
+    return hit
+
+
+@wp.func
+def patch_hit(surfaces: Surfaces, met: wp.vec4) -> SurfaceHit:
+    """The hit on the patch that `nearest_patch` has found."""
+    row = bits_of(met[3])
+    named = patch_faces(surfaces.patches, row, met[2] > 0.0)
+    hit = SurfaceHit()
+    hit.distance = met[0]
+    hit.normal = patch_normal(surfaces.patches, row, met[1])
+    hit.slot = named[0]
+    hit.face = named[1]
+    return hit
+
+
+@wp.func
+def meets_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> bool:
+    """Whether the ray x + s u, 0 <= s < max_distance, hits one of a handful of faces."""
+    return bits_of(nearest_patch(surfaces.patches, x, u, max_distance)[3]) >= 0
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+    return true;
+#endif
+""")
+def _on_cpu() -> bool:
+    """Known when the kernel is compiled, so that each device has one of the two walks."""
+    ...
+
+
+@wp.func
+def tree_face(surfaces: Surfaces, slot: int, u: wp.vec3):
+    """The face in a slot: its index, and its unit normal against u."""
+    return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
+
+
+@wp.func
+def patch_face(surfaces: Surfaces, slot: int, u: wp.vec3):
+    """`tree_face` for surfaces with patches."""
+    if _on_cpu():
+        return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
+    row = normal_and_face(surfaces.normals, slot)
+    normal = wp.vec3(row[0], row[1], row[2])
+    return bits_of(row[3]), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+
+
+@wp.func
+def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float, any_hit: bool) -> SurfaceHit:
+    """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
+
+    Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
+    Surfaces of `public_tree` take `intersect_mesh`.
+    """
+    if surfaces.nodes.shape[0] == 0:
+        hit = intersect_mesh(surfaces.mesh, x, u, max_distance)
+        hit.slot = hit.face
+        return hit
+    stack = Stack()
+    stack[0] = NO_NODE
+    walk = TreeWalk()
+    walk.depth = 1
+    walk.nearest = max_distance
+    walk.found = -1
+    inverse = inverse_direction(u)
+    shift = wp.cw_mul(x, inverse)
+    if _on_cpu():
+        wide = walk_wide(surfaces.nodes, surfaces.faces, surfaces.order, x, u, inverse, shift, max_distance, any_hit)
+        walk.nearest = wide[0]
+        walk.found = bits_of(wide[1])
+        walk.node = NO_NODE
+    while walk.node != NO_NODE:
+        if walk.node > NO_NODE:
+            met = step_node(surfaces.nodes, walk, inverse, shift)
+            walk.node = NO_NODE
+            if met.entry[0] <= met.reach:
+                walk.node = met.child[0]
+            for k in range(3):
+                if met.entry[3 - k] <= met.reach:
+                    stack[place(walk.depth)] = met.child[3 - k]
+                    walk.depth += 1
+        else:
+            step = step_leaf(surfaces.faces, surfaces.order, walk, x, u)
+            walk.node = step.node
+            if step.hit:
+                walk.nearest = step.distance
+                walk.found = step.slot
+                if any_hit:
+                    walk.depth = 1
+        if walk.node == NO_NODE and walk.depth > 0:
+            walk.depth -= 1
+            walk.node = stack[place(walk.depth)]
+    return surface_hit(surfaces, walk, u)
+
+
+@wp.func
+def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
+    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
+    same face.
+
+    The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
+    """
+    magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
+    return x + (5.0e-7 * (magnitude + distance)) * normal
+
+
+# ---- What the camera would see through clear water: one ray a pixel against the mesh.
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def truth_along_kernel(
+    surfaces: Surfaces,
+    origins: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=wp.vec3),
+    # Out, [height, width]:
+    depth: wp.array2d(dtype=float),
+    range: wp.array2d(dtype=float),
+    normal: wp.array2d(dtype=wp.vec3),
+    reflectance: wp.array2d(dtype=float),
+):
+    """As `truth_kernel` along rays of any origins [m], from which the range counts, such as those behind a port.
+
+    Launch: (height, width).
+    """
+    row, column = wp.tid()
+    x = origins[row, column]
+    u = directions[row, column]
+    hit = intersect_surfaces(surfaces, x, u, 1.0e29, False)
+    if hit.face >= 0:
+        depth[row, column] = x[2] + hit.distance * u[2]
+        range[row, column] = hit.distance
+        normal[row, column] = hit.normal
+        reflectance[row, column] = reflectance_at(surfaces, hit.face, x + hit.distance * u)
+    else:
+        depth[row, column] = wp.NAN
+        range[row, column] = wp.NAN
+        normal[row, column] = wp.vec3(wp.NAN)
+        reflectance[row, column] = wp.NAN
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def truth_kernel(
+    camera: Camera,
+    surfaces: Surfaces,
+    directions: wp.array2d(dtype=wp.vec3),
+    # Out, [height, width]:
+    depth: wp.array2d(dtype=float),
+    range: wp.array2d(dtype=float),
+    normal: wp.array2d(dtype=wp.vec3),
+    reflectance: wp.array2d(dtype=float),
+):
+    """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
+    width).
+
+    Rays go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
+    square pixels about its axis.
+    """
+    row, column = wp.tid()
+    u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
+    if directions.shape[0] > 0:
+        u = directions[row, column]
+    hit = intersect_surfaces(surfaces, wp.vec3(0.0), u, 1.0e29, False)
+    if hit.face >= 0:
+        depth[row, column] = hit.distance * u[2]
+        range[row, column] = hit.distance
+        normal[row, column] = hit.normal
+        reflectance[row, column] = reflectance_at(surfaces, hit.face, hit.distance * u)
+    else:
+        depth[row, column] = wp.NAN
+        range[row, column] = wp.NAN
+        normal[row, column] = wp.vec3(wp.NAN)
+        reflectance[row, column] = wp.NAN

@@ -1,0 +1,286 @@
+"""Rays against triangles, laid out as planes: see `meet_planes`.
+
+On CUDA a face is three vec4 in a row, which may also stand for a parallelogram, see `meet_planes`. On the CPU eight
+faces make a block of 36 vec4, as 18 rows of eight numbers: the components of three planes, of the first two barycentric
+coordinates and of the face itself, then the lower and the upper corner of each face's own box.
+"""
+
+import warp as wp
+
+from spadwarp_kernels.base.arguments import check_integer
+from spadwarp_kernels.base.native import bits_of, zeros
+
+# Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
+WIDENING = wp.constant(4.0e-7)
+
+# Faces of a block on the CPU.
+LANES = wp.constant(8)
+
+# Slots on the CPU, so that the index of a number stays below 2^31.
+_MOST_SLOTS = (2**31 - 1) // 144 * 8
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // With an index of 64 bits all planes of neighbouring faces have one address and offsets.
+    const float4 v = __ldg(reinterpret_cast<const float4*>(faces.data) + 3 * static_cast<int64_t>(slot) + plane);
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    const float* row = reinterpret_cast<const float*>(faces.data) + 144 * (slot / 8) + 32 * plane + slot % 8;
+    return wp::vec4(row[0], row[8], row[16], row[24]);
+#endif
+""")
+def load_plane(faces: wp.array(dtype=wp.vec4), slot: int, plane: int) -> wp.vec4:
+    """Plane 0, 1 or 2 of the face in a slot; in one load on CUDA."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return plane;
+#else
+    if (which < 2) return wp::vec4(2.0f * plane[0], 2.0f * plane[1], 2.0f * plane[2], 2.0f * plane[3] - 1.0f);
+    const float half = plane[3] < 0.0f ? -0.5f : 0.5f;
+    return wp::vec4(half * plane[0], half * plane[1], half * plane[2], fabsf(half * plane[3]));
+#endif
+""")
+def _from_middle(plane: wp.vec4, which: int) -> wp.vec4:
+    """Plane 0, 1 or 2 of a face as `meet_planes` takes it: on CUDA it is kept so."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
+#else
+    return __builtin_signbit(sign) ? -x : x;
+#endif
+""")
+def _times_sign(x: float, sign: float) -> float:
+    """x, negated where the sign bit is set, also of a zero."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ldg(order.data + slot);
+#else
+    return order.data[slot];
+#endif
+""")
+def number_in(order: wp.array(dtype=int), slot: int) -> int:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
+    ...
+
+
+@wp.func
+def face_in(order: wp.array(dtype=int), slot: int) -> int:
+    """Index of the face in a slot."""
+    face = number_in(order, slot)
+    return wp.where(face < 0, ~face, face)
+
+
+@wp.func
+def _planes(mesh: wp.uint64, face: int):
+    """Normals and offsets of the three planes of a face on the CPU."""
+    m = wp.mesh_get(mesh)
+    p = m.points[m.indices[3 * face]]
+    e1 = m.points[m.indices[3 * face + 1]] - p
+    e2 = m.points[m.indices[3 * face + 2]] - p
+    n = wp.cross(e1, e2)
+    inverse = 1.0 / wp.dot(n, n)  # infinite for a face without area, which no ray then hits
+    a = inverse * wp.cross(e2, n)
+    b = inverse * wp.cross(n, e1)
+    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), wp.length(a + b))
+    n = wp.normalize(n) / steepest
+    return (
+        wp.vec4(a[0], a[1], a[2], -wp.dot(a, p)),
+        wp.vec4(b[0], b[1], b[2], -wp.dot(b, p)),
+        wp.vec4(n[0], n[1], n[2], wp.dot(n, p)),
+    )
+
+
+@wp.func
+def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
+    """Planes of a triangle with corner p and edges e1, e2 from it, or with `triangle` = 0 of the parallelogram.
+
+    Returns:
+        Two coordinates as normals and offsets, -1 to 1 from edge to edge of the parallelogram; the unit normal and the
+        offset of its plane; half its least height [m]. Without area nothing is finite or the normal is 0.
+    """
+    n = wp.cross(e1, e2)
+    inverse = 1.0 / wp.dot(n, n)
+    a = inverse * wp.cross(e2, n)
+    b = inverse * wp.cross(n, e1)
+    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), triangle * wp.length(a + b))
+    middle = p + 0.5 * (e1 + e2)
+    n = wp.normalize(n)
+    return (
+        2.0 * wp.vec4(a[0], a[1], a[2], -wp.dot(a, middle)),
+        2.0 * wp.vec4(b[0], b[1], b[2], -wp.dot(b, middle)),
+        wp.vec4(n[0], n[1], n[2], wp.dot(n, middle)),
+        0.5 / steepest,
+    )
+
+
+@wp.func
+def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array(dtype=wp.vec4)):
+    """Writes a face, or the parallelogram that it is a half of: then `triangle` is 0, and the corner is the one that is
+    not on the diagonal."""
+    m = wp.mesh_get(mesh)
+    p = m.points[m.indices[3 * face + corner]]
+    q = m.points[m.indices[3 * face + (corner + 1) % 3]]
+    r = m.points[m.indices[3 * face + (corner + 2) % 3]]
+    a, b, n, height = middle_planes(p, q - p, r - p, triangle)
+    faces[3 * slot] = a
+    faces[3 * slot + 1] = b
+    turned = _times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
+    if triangle == 0.0:
+        turned = -1.0 * turned
+    offset = height * wp.abs(n[3])
+    faces[3 * slot + 2] = wp.vec4(turned[0], turned[1], turned[2], _times_sign(offset, triangle - 0.5))
+
+
+@wp.kernel(enable_backward=False)
+def _rows_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+    """Launch: slots."""
+    slot = wp.tid()
+    set_row(mesh, face_in(order, slot), 0, 1.0, slot, faces)
+
+
+def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array) -> None:
+    """Writes the faces in their slots as CUDA takes them, each by itself."""
+    wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
+
+
+@wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
+def number_at(rows: wp.array(dtype=wp.vec4), index: int) -> float:
+    """A number of contiguous rows."""
+    ...
+
+
+@wp.func_native("reinterpret_cast<float*>(rows.data)[index] = value;")
+def set_number(rows: wp.array(dtype=wp.vec4), index: int, value: float):
+    """Writes a number of contiguous rows."""
+    ...
+
+
+@wp.func
+def face_number(slot: int, row: int) -> int:
+    """Index of a number of the face in a slot, in the blocks of the CPU."""
+    return 144 * (slot / LANES) + LANES * row + slot % LANES
+
+
+@wp.kernel(enable_backward=False)
+def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+    """Launch: slots; CPU. A slot without a face keeps planes of zeros and a box that no ray meets."""
+    slot = wp.tid()
+    face = order[slot]
+    low = wp.vec3(1.0e30)
+    high = wp.vec3(-1.0e30)
+    if face >= 0:
+        a, b, n = _planes(mesh, face)
+        for i in range(4):
+            set_number(faces, face_number(slot, i), a[i])
+            set_number(faces, face_number(slot, 4 + i), b[i])
+            set_number(faces, face_number(slot, 8 + i), n[i])
+        m = wp.mesh_get(mesh)
+        for corner in range(3):
+            p = m.points[m.indices[3 * face + corner]]
+            low = wp.min(low, p - wp.vec3(padding))
+            high = wp.max(high, p + wp.vec3(padding))
+    for axis in range(3):
+        set_number(faces, face_number(slot, 12 + axis), low[axis])
+        set_number(faces, face_number(slot, 15 + axis), high[axis])
+
+
+def box_padding(extent: float) -> float:
+    """By how much boxes are larger than what is in them [m], for coordinates up to the extent."""
+    return 2.5 * WIDENING * extent + 1e-9
+
+
+def face_vectors(slots: int, device: wp.Device) -> int:
+    """How many vec4 the faces in so many slots take."""
+    return 3 * slots if device.is_cuda else 36 * (slots // 8)
+
+
+def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) -> None:
+    """Writes the faces in their slots, for the mesh's points as they are."""
+    if mesh.device.is_cuda:
+        set_rows(mesh, order, faces)
+    else:
+        wp.launch(_blocks_kernel, order.size, [mesh.id, box_padding(extent), order], [faces], device=mesh.device)
+
+
+def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
+    """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks].
+
+    Raises `ArgumentError` for more of them than a CPU's indices reach.
+    """
+    if not mesh.device.is_cuda:
+        check_integer("faces of the mesh, in slots,", order.size, 0, _MOST_SLOTS)
+    faces = zeros(face_vectors(order.size, mesh.device), wp.vec4, mesh.device)
+    set_faces(mesh, extent, order, faces)
+    return faces
+
+
+@wp.func
+def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> wp.vec2:
+    """A ray from x along the unit vector u against a triangle or a parallelogram, two triangles side by side.
+
+    Args:
+        a, b: Two coordinates in its plane as normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
+            parallelogram. The sum of a triangle's is not above 0.
+        n: Normal and offset of the plane; the normal is half as long as the least height. The sign of the offset, also
+            of a zero, says what it is: negative for a parallelogram.
+
+    Returns:
+        The distance, >= 0, or -1 for a miss; the sum of the coordinates there, which is above 0 in the second triangle
+        of a parallelogram. A ray may pass a hair outside, measured across the ray, so that none slips between two
+        faces; more than that beyond the short edges of a sliver, where its box ends it.
+    """
+    rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
+    height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
+    distance = height / rate  # infinite or not a number for a ray in the plane, which fails below
+    y = x + distance * u
+    first = a[0] * y[0] + a[1] * y[1] + a[2] * y[2] + a[3]
+    second = b[0] * y[0] + b[1] * y[1] + b[2] * y[2] + b[3]
+    both = first + second
+    # Of a parallelogram the last does not count: negated it is the largest only beyond a corner.
+    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), _times_sign(both + 1.0, n[3]))
+    hair = WIDENING * (wp.abs(y[0]) + wp.abs(y[1]) + wp.abs(y[2]) + distance)
+    if not ((1.0 - most) * wp.abs(rate) >= -hair and distance >= 0.0):
+        distance = -1.0
+    return wp.vec2(distance, both)
+
+
+@wp.func
+def meet_face(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3):
+    """What is kept in a slot against a ray, see `meet_planes`.
+
+    Returns:
+        The distance; the slot of the triangle that the ray would hit; the last slot that belongs to it, the next one
+        for a parallelogram.
+    """
+    a = _from_middle(load_plane(faces, slot, 0), 0)
+    b = _from_middle(load_plane(faces, slot, 1), 1)
+    n = _from_middle(load_plane(faces, slot, 2), 2)
+    met = meet_planes(a, b, n, x, u)
+    last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
+    return met[0], wp.where(met[1] > 0.0, last, slot), last
+
+
+@wp.func
+def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
+    CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
+    distance, _, _ = meet_face(faces, slot, x, u)
+    return distance
+
+
+@wp.func
+def face_normal(faces: wp.array(dtype=wp.vec4), slot: int, u: wp.vec3) -> wp.vec3:
+    """The unit normal of a face, against u."""
+    n = load_plane(faces, slot, 2)
+    normal = wp.normalize(wp.vec3(n[0], n[1], n[2]))
+    return wp.where(wp.dot(normal, u) > 0.0, -normal, normal)

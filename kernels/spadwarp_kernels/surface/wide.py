@@ -1,0 +1,329 @@
+"""Rays against a triangle mesh on the CPU: a tree of eight children a node, for the vector registers of a core.
+
+The tree is Warp's, as `read_tree` gives it: of each node the child with the largest surface is opened until there are
+eight (Wald, Benthin & Boulos, Interactive Ray Tracing 2008), and what holds eight faces or fewer becomes a leaf. A ray
+is tested against eight boxes, and against eight faces, at once. The nearer boxes come first, and those that wait are
+left out where they begin behind the nearest face so far.
+
+A node is 14 vec4, as seven rows of eight numbers: lower x, y and z of its children, upper x, y and z, and the children
+as bits: a node's index, -2 - slot of the first face of a leaf, or NO_NODE. A leaf is a block of faces, see `triangle`.
+A hit must lie in the box of the face itself too, as in a tree of one face a leaf, and of faces at the same distance the
+first in the mesh counts: so hits do not depend on the tree.
+"""
+
+import numpy as np
+import warp as wp
+
+from spadwarp_kernels.base.native import bits_of
+
+from .patches import NO_NODE, read_tree
+from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
+
+# Entries of the stack of `_faces_in_order_kernel`: three a level of Warp's trees, which are at most 32 deep.
+_Stack = wp.types.vector(length=104, dtype=int)
+
+
+@wp.struct
+class _Part:
+    """Faces that follow each other in the tree's order.
+
+    Attributes:
+        pair: Of Warp's nodes below it, see `pairs`; -1 for none: then they are parted in the middle.
+        start, stop: The faces.
+        area: Half the surface of their box [m²].
+    """
+
+    pair: int
+    start: int
+    stop: int
+    area: float
+
+
+@wp.kernel(enable_backward=False)
+def _faces_in_order_kernel(
+    nodes: wp.array(dtype=wp.vec4),
+    order: wp.array(dtype=int),
+    start: wp.array(dtype=int),
+    stop: wp.array(dtype=int),
+    sorted: wp.array(dtype=int),
+):
+    """The faces from left to right, and where those below each of Warp's nodes start and stop. Launch: 1."""
+    stack = _Stack()
+    stack[0] = 1  # the second node of the root's pair
+    depth = int(2)
+    count = int(0)
+    while depth > 0:
+        depth -= 1
+        node = stack[depth]
+        if node < 0:
+            stop[~node] = count
+        else:
+            start[node] = count
+            stack[depth] = ~node
+            depth += 1
+            child = bits_of(nodes[2 * node][3])
+            if child >= 0:
+                stack[depth] = 2 * child + 1
+                stack[depth + 1] = 2 * child
+                depth += 2
+            slot = -2 - child
+            more = child < NO_NODE
+            while more:
+                more = order[slot] < 0
+                sorted[count] = wp.where(more, ~order[slot], order[slot])
+                count += 1
+                slot += 1
+
+
+@wp.func
+def _half(nodes: wp.array(dtype=wp.vec4), start: wp.array(dtype=int), stop: wp.array(dtype=int), part: _Part, k: int):
+    half = _Part()
+    if part.pair >= 0:
+        node = 2 * part.pair + k
+        low = nodes[2 * node]
+        size = nodes[2 * node + 1] - low
+        half.pair = wp.max(bits_of(low[3]), -1)
+        half.start = start[node]
+        half.stop = stop[node]
+        half.area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
+    else:
+        middle = (part.start + part.stop) / 2
+        half.pair = -1
+        half.start = wp.where(k == 0, part.start, middle)
+        half.stop = wp.where(k == 0, middle, part.stop)
+        half.area = part.area
+    return half
+
+
+@wp.func
+def _largest(parts: wp.array(dtype=_Part), count: int) -> int:
+    """The part with the largest surface of those that are no leaves; -1 for none."""
+    found = int(-1)
+    for k in range(count):
+        if parts[k].stop - parts[k].start > LANES and (found < 0 or parts[k].area > parts[found].area):
+            found = k
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def _open_kernel(
+    nodes: wp.array(dtype=wp.vec4),
+    start: wp.array(dtype=int),
+    stop: wp.array(dtype=int),
+    sorted: wp.array(dtype=int),
+    parts: wp.array(dtype=_Part),
+    waiting: wp.array(dtype=_Part),
+    children: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
+):
+    """Children of all nodes, level after level, and the faces in their slots; `counts`: nodes, leaves. Launch: 1."""
+    root = _Part()
+    root.stop = sorted.shape[0]
+    waiting[0] = root
+    total = int(1)
+    leaves = int(0)
+    node = int(0)
+    while node < total:
+        parts[0] = waiting[node]
+        count = int(1)
+        opened = _largest(parts, count)
+        while opened >= 0 and count < LANES:
+            part = parts[opened]
+            parts[opened] = _half(nodes, start, stop, part, 0)
+            parts[count] = _half(nodes, start, stop, part, 1)
+            count += 1
+            opened = _largest(parts, count)
+        for k in range(LANES):
+            child = int(NO_NODE)
+            if k < count and parts[k].start < parts[k].stop:
+                if parts[k].stop - parts[k].start > LANES:
+                    waiting[total] = parts[k]
+                    child = total
+                    total += 1
+                else:
+                    child = -2 - LANES * leaves
+                    for i in range(parts[k].stop - parts[k].start):
+                        order[LANES * leaves + i] = sorted[parts[k].start + i]
+                    leaves += 1
+            children[LANES * node + k] = child
+        node += 1
+    counts[0] = total
+    counts[1] = leaves
+
+
+@wp.kernel(enable_backward=False)
+def _boxes_kernel(faces: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4)):
+    """Boxes of all children, from the last node to the first, which stand after their parents. Launch: 1."""
+    count = nodes.shape[0] / 14
+    for i in range(count):
+        node = count - 1 - i
+        for k in range(LANES):
+            child = bits_of(number_at(nodes, 56 * node + 48 + k))
+            for axis in range(3):
+                low = float(1.0e30)
+                high = float(-1.0e30)
+                if child != NO_NODE:
+                    for lane in range(LANES):
+                        if child >= 0:
+                            low = wp.min(low, number_at(nodes, 56 * child + 8 * axis + lane))
+                            high = wp.max(high, number_at(nodes, 56 * child + 24 + 8 * axis + lane))
+                        else:
+                            slot = -2 - child + lane
+                            low = wp.min(low, number_at(faces, face_number(slot, 12 + axis)))
+                            high = wp.max(high, number_at(faces, face_number(slot, 15 + axis)))
+                set_number(nodes, 56 * node + 8 * axis + k, low)
+                set_number(nodes, 56 * node + 24 + 8 * axis + k, high)
+
+
+def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of a mesh's tree, for `walk_wide`; see `refit_wide` for moved points.
+
+    Args:
+        mesh: Any `wp.Mesh` on the CPU.
+        extent: Its largest coordinate [m], for the padding of the boxes.
+
+    Returns:
+        nodes: vec4 [14 * nodes], see above; boxes are padded against rounding.
+        faces: vec4 [36 * leaves], see `triangle`.
+        order: int32 [8 * leaves]: the face in each slot, -1 for none.
+    """
+    pairs, slots = read_tree(mesh, extent)
+    count = slots.size
+    # Nodes of fewer than eight children have more than eight faces, all in leaves of their own.
+    most = count // 7 + count // 9 + 1
+
+    def integers(size: int) -> wp.array:
+        return wp.empty(size, dtype=int, device="cpu")
+
+    start, stop, sorted_, children, counts = map(integers, (pairs.size // 2, pairs.size // 2, count, LANES * most, 2))
+    order = wp.full(LANES * count, -1, dtype=int, device="cpu")
+    parts, waiting = (wp.empty(size, dtype=_Part, device="cpu") for size in (LANES, most))
+    wp.launch(_faces_in_order_kernel, 1, [pairs, slots], [start, stop, sorted_], device="cpu")
+    wp.launch(_open_kernel, 1, [pairs, start, stop, sorted_, parts, waiting], [children, order, counts], device="cpu")
+    nodes, leaves = counts.numpy()
+    rows = np.zeros((nodes, 7, LANES), np.float32)
+    rows[:, 6] = children.numpy()[: LANES * nodes].reshape(nodes, LANES).view(np.float32)
+    tree = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu", copy=False)  # in large pages, see `zeros`
+    order = wp.clone(order[: LANES * leaves])
+    faces = pack_faces(mesh, extent, order)
+    wp.launch(_boxes_kernel, 1, [faces], [tree], device="cpu")
+    return tree, faces, order
+
+
+def refit_wide(mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array) -> None:
+    """Boxes and faces of a packed tree for points that have moved."""
+    set_faces(mesh, extent, order, faces)
+    wp.launch(_boxes_kernel, 1, [faces], [nodes], device="cpu")
+
+
+def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
+    """What `pack_wide` returns, for no faces at all."""
+    rows = np.zeros((7, LANES), np.float32)
+    rows[:3], rows[3:6], rows[6] = 1.0e30, -1.0e30, np.array(-1, np.int32).view(np.float32)
+    nodes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu")
+    return nodes, wp.zeros(0, dtype=wp.vec4, device="cpu"), wp.zeros(0, dtype=int, device="cpu")
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return wp::vec2(reach, 0.0f);
+#else
+    typedef float row __attribute__((ext_vector_type(8), aligned(4)));
+    typedef int32_t irow __attribute__((ext_vector_type(8), aligned(4)));
+    typedef bool flags __attribute__((ext_vector_type(8)));
+    const auto more = [](row p, row q) { return p > q ? p : q; };
+    const auto less = [](row p, row q) { return p < q ? p : q; };
+    const auto size = [](row p) { return __builtin_elementwise_abs(p); };
+    const auto bits = [](irow p) { return (unsigned)__builtin_bit_cast(uint8_t, __builtin_convertvector(p, flags)); };
+
+    // Of the rows of lower and upper corners, those that a ray in this direction meets first.
+    const int x0 = inverse[0] < 0.0f ? 3 : 0, y0 = inverse[1] < 0.0f ? 4 : 1, z0 = inverse[2] < 0.0f ? 5 : 2;
+    const int x1 = 3 - x0, y1 = 5 - y0, z1 = 7 - z0;
+    float nearest = reach;
+    const auto enter = [&](const row* box) {
+        return more(more(box[x0] * inverse[0] - shift[0], box[y0] * inverse[1] - shift[1]),
+                    more(box[z0] * inverse[2] - shift[2], row(0.0f)));
+    };
+    const auto leave = [&](const row* box) {
+        return less(less(box[x1] * inverse[0] - shift[0], box[y1] * inverse[1] - shift[1]),
+                    less(box[z1] * inverse[2] - shift[2], row(nearest)));
+    };
+
+    // Seven children wait at each of Warp's 32 levels at most, and where many faces lie on each other at 10 more.
+    int waiting[300], depth = 1, node = 0, found = -1;
+    float entries[300];
+    waiting[0] = -1;
+    entries[0] = 0.0f;
+    while (node != -1) {
+        if (node >= 0) {
+            const row* box = reinterpret_cast<const row*>(nodes.data) + 7 * node;
+            const row entry = enter(box);
+            const irow children = __builtin_bit_cast(irow, box[6]);
+            node = -1;
+            float first = 0.0f;
+            for (unsigned met = bits(entry <= leave(box)); met; met &= met - 1) {
+                const int k = __builtin_ctz(met);
+                const bool nearer = node == -1 || entry[k] < first;
+                if (node != -1) {
+                    waiting[depth] = nearer ? node : children[k];
+                    entries[depth++] = nearer ? first : entry[k];
+                }
+                if (nearer) {
+                    node = children[k];
+                    first = entry[k];
+                }
+            }
+            if (node != -1) continue;
+        } else {
+            // As meet_planes.
+            const int slot = -2 - node;
+            const row* f = reinterpret_cast<const row*>(faces.data) + 18 * (slot / 8);
+            const row rate = f[8] * u[0] + f[9] * u[1] + f[10] * u[2];
+            const row height = f[11] - (f[8] * x[0] + f[9] * x[1] + f[10] * x[2]);
+            const row distance = height / rate;
+            const row a = x[0] + distance * u[0], b = x[1] + distance * u[1], c = x[2] + distance * u[2];
+            const row p = f[0] * a + f[1] * b + f[2] * c + f[3];
+            const row q = f[4] * a + f[5] * b + f[6] * c + f[7];
+            const row least = less(less(p, q), 1.0f - p - q);
+            const row hair = 4.0e-7f * (size(a) + size(b) + size(c) + distance);
+            unsigned hit = bits((least * size(rate) >= -hair) & (distance >= 0.0f) & (distance <= nearest));
+            if (hit) hit &= bits(enter(f + 12) <= leave(f + 12));
+            for (; hit; hit &= hit - 1) {
+                const int k = __builtin_ctz(hit);
+                const bool level = distance[k] == nearest && found >= 0;
+                if (distance[k] < nearest || (level && order.data[slot + k] < order.data[found])) {
+                    nearest = distance[k];
+                    found = slot + k;
+                }
+            }
+            if (any_hit && found >= 0) break;
+        }
+        do node = waiting[--depth]; while (entries[depth] > nearest);
+    }
+    union { float number; int bits; } both;
+    both.bits = found;
+    return wp::vec2(nearest, both.number);
+#endif
+""")
+def walk_wide(
+    nodes: wp.array(dtype=wp.vec4),
+    faces: wp.array(dtype=wp.vec4),
+    order: wp.array(dtype=int),
+    x: wp.vec3,
+    u: wp.vec3,
+    inverse: wp.vec3,
+    shift: wp.vec3,
+    reach: float,
+    any_hit: bool,
+) -> wp.vec2:
+    """Distance of the nearest face along a ray and the bits of its slot; CPU alone.
+
+    Args:
+        nodes, faces, order: From `pack_wide`.
+        x, u: Origin and unit direction.
+        inverse, shift: `inverse_direction` of the ray, and its origin times that, by components.
+        reach: Length of the ray [m], which is returned with slot -1 where it meets no face.
+        any_hit: Whether the first leaf with a face that it meets is enough.
+    """
+    ...

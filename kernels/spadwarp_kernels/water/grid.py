@@ -1,0 +1,391 @@
+"""A box of cells of water, each with its own coefficients, and straight lines through it cell by cell.
+
+Lines are followed by the faces of the cells that they cross (Amanatides & Woo 1987), through the cells themselves or
+through blocks of them. The position of a face is an integer and never a sum of steps: the lengths in the cells add up
+to the length in the box, and a line leaves the last cell where it leaves the box.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_device,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_vector,
+)
+
+__all__ = ["Grid", "make_grid", "voxel_values_kernel"]
+
+# Cells of all grids are counted by int32, with room for the blocks.
+LARGEST_CELL_COUNT = 1 << 30
+
+
+@wp.struct
+class Grid:
+    """Cells of water in a box, made by `make_grid`.
+
+    Attributes:
+        turn, shift: A point x [m] lies at turn x + shift in cells; the box has 0 ... size there.
+        size: Number of cells along the three edges.
+        extinction: c [1/m] by cell, the last edge fastest.
+        albedo: Single-scattering albedo in [0, 1].
+        anisotropy: g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere.
+        block_edge: Cells along the edges of a block.
+        block_size: Number of blocks along the three edges of the box; the last may be incomplete.
+        block_majorant: Largest c in each block [1/m].
+        block_control: Mean c of each block, and the largest difference from it in the block [1/m].
+        residual: c less the block's, see `block_statistics` [1/m], by cell.
+    """
+
+    turn: wp.mat33
+    shift: wp.vec3
+    size: wp.vec3i
+    extinction: wp.array(dtype=float)
+    albedo: wp.array(dtype=float)
+    anisotropy: wp.array(dtype=float)
+    block_edge: int
+    block_size: wp.vec3i
+    block_majorant: wp.array(dtype=float)
+    block_control: wp.array(dtype=wp.vec2)
+    residual: wp.array(dtype=float)
+
+
+@wp.struct
+class GridLine:
+    """A line x + t u through the cells of a grid.
+
+    Attributes:
+        begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
+        inverse, shift: The plane of number k across an axis is met at t = k inverse + shift.
+        first: The cell in which it begins.
+        stride: What a step along each axis adds to the index of the cell.
+        last: Index of the last cell.
+    """
+
+    begin: float
+    end: float
+    inverse: wp.vec3
+    shift: wp.vec3
+    first: wp.vec3
+    stride: wp.vec3i
+    last: int
+
+
+@wp.struct
+class GridPlace:
+    """A place on a line.
+
+    Attributes:
+        t: Where the cell begins, or a place within it [m].
+        leave: Where the line leaves the cell [m].
+        cell: Its index.
+        ahead: Numbers of the planes that the line meets next, by axis.
+        at: Where it meets them [m].
+    """
+
+    t: float
+    leave: float
+    cell: int
+    ahead: wp.vec3
+    at: wp.vec3
+
+
+@wp.func
+def _inverse(d: float) -> float:
+    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
+
+
+@wp.func
+def grid_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
+    """The part of the line x + t u, 0 <= t <= length, in the box."""
+    line = GridLine()
+    size = grid.size
+    p = grid.turn * x + grid.shift
+    d = grid.turn * u
+    line.inverse = wp.vec3(_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+    line.shift = -wp.cw_mul(p, line.inverse)
+    line.end = length
+    for i in range(3):
+        low = line.shift[i]
+        high = float(size[i]) * line.inverse[i] + line.shift[i]
+        line.begin = wp.max(line.begin, wp.min(low, high))
+        line.end = wp.min(line.end, wp.max(low, high))
+    for i in range(3):
+        line.first[i] = wp.clamp(wp.floor(p[i] + line.begin * d[i]), 0.0, float(size[i] - 1))
+    line.stride = wp.vec3i(
+        wp.where(line.inverse[0] > 0.0, size[1] * size[2], -size[1] * size[2]),
+        wp.where(line.inverse[1] > 0.0, size[2], -size[2]),
+        wp.where(line.inverse[2] > 0.0, 1, -1),
+    )
+    line.last = size[0] * size[1] * size[2] - 1
+    return line
+
+
+@wp.func
+def _sign(x: float) -> float:
+    return wp.where(x > 0.0, 1.0, -1.0)
+
+
+@wp.func
+def first_place(line: GridLine, size: wp.vec3i) -> GridPlace:
+    """Where a line that meets the box enters it."""
+    place = GridPlace()
+    place.t = line.begin
+    place.cell = (int(line.first[0]) * size[1] + int(line.first[1])) * size[2] + int(line.first[2])
+    place.ahead = wp.vec3(
+        wp.where(line.inverse[0] > 0.0, line.first[0] + 1.0, line.first[0]),
+        wp.where(line.inverse[1] > 0.0, line.first[1] + 1.0, line.first[1]),
+        wp.where(line.inverse[2] > 0.0, line.first[2] + 1.0, line.first[2]),
+    )
+    place.at = wp.cw_mul(place.ahead, line.inverse) + line.shift
+    place.leave = wp.min(place.at[0], wp.min(place.at[1], place.at[2]))
+    return place
+
+
+@wp.func
+def next_place(line: GridLine, here: GridPlace) -> GridPlace:
+    """Where the line enters the next cell."""
+    place = here
+    place.t = here.leave
+    x = here.at[0] <= here.leave
+    y = not x and here.at[1] <= here.leave
+    place.ahead = wp.vec3(
+        wp.where(x, here.ahead[0] + _sign(line.inverse[0]), here.ahead[0]),
+        wp.where(y, here.ahead[1] + _sign(line.inverse[1]), here.ahead[1]),
+        wp.where(x or y, here.ahead[2], here.ahead[2] + _sign(line.inverse[2])),
+    )
+    place.at = wp.cw_mul(place.ahead, line.inverse) + line.shift
+    place.leave = wp.min(place.at[0], wp.min(place.at[1], place.at[2]))
+    stride = wp.where(x, line.stride[0], wp.where(y, line.stride[1], line.stride[2]))
+    # Rounding may let a line leave the box a step late: no index leaves the arrays.
+    place.cell = wp.clamp(here.cell + stride, 0, line.last)
+    return place
+
+
+@wp.func
+def grid_cell(grid: Grid, x: wp.vec3) -> int:
+    """Index of the cell at a point [m]; -1 outside the box."""
+    p = grid.turn * x + grid.shift
+    i = int(wp.floor(p[0]))
+    j = int(wp.floor(p[1]))
+    k = int(wp.floor(p[2]))
+    inside = i >= 0 and j >= 0 and k >= 0 and i < grid.size[0] and j < grid.size[1] and k < grid.size[2]
+    return wp.where(inside, (i * grid.size[1] + j) * grid.size[2] + k, -1)
+
+
+@wp.func
+def cell_on_line(grid: Grid, p: wp.vec3, d: wp.vec3, t: float) -> int:
+    """Index of the cell at p + t d, in cells, of a line within the box; the nearest one for what rounding puts beside
+    it."""
+    i = wp.min(int(p[0] + t * d[0]), grid.size[0] - 1)
+    j = wp.min(int(p[1] + t * d[1]), grid.size[1] - 1)
+    k = wp.min(int(p[2] + t * d[2]), grid.size[2] - 1)
+    return wp.max((i * grid.size[1] + j) * grid.size[2] + k, 0)
+
+
+@wp.struct
+class BlockLine:
+    """A line x + t u through the blocks of a grid.
+
+    Attributes:
+        begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
+        p, d: x and u in cells.
+        step: By which t rises through a block, by axis [m].
+        stride: What a step along each axis adds to the index of the block.
+    """
+
+    begin: float
+    end: float
+    p: wp.vec3
+    d: wp.vec3
+    step: wp.vec3
+    stride: wp.vec3i
+
+
+@wp.struct
+class BlockPlace:
+    """A place on a line.
+
+    Attributes:
+        t: Where it is [m].
+        stop: Where it leaves the block, or the line ends [m].
+        block: Index of the block.
+        at: Where the line meets the next planes between blocks, by axis [m].
+    """
+
+    t: float
+    stop: float
+    block: int
+    at: wp.vec3
+
+
+@wp.func
+def block_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> BlockLine:
+    """The part of the line x + t u, 0 <= t <= length, in the box."""
+    line = BlockLine()
+    line.p = grid.turn * x + grid.shift
+    line.d = grid.turn * u
+    line.end = length
+    for i in range(3):
+        inverse = _inverse(line.d[i])
+        low = -line.p[i] * inverse
+        high = (float(grid.size[i]) - line.p[i]) * inverse
+        line.begin = wp.max(line.begin, wp.min(low, high))
+        line.end = wp.min(line.end, wp.max(low, high))
+        line.step[i] = float(grid.block_edge) * wp.abs(inverse)
+    row = grid.block_size[2]
+    layer = grid.block_size[1] * row
+    line.stride = wp.vec3i(
+        wp.where(line.d[0] < 0.0, -layer, layer), wp.where(line.d[1] < 0.0, -row, row), wp.where(line.d[2] < 0.0, -1, 1)
+    )
+    return line
+
+
+@wp.func
+def first_block(grid: Grid, line: BlockLine) -> BlockPlace:
+    """Where a line that meets the box enters it."""
+    place = BlockPlace()
+    place.t = line.begin
+    edge = float(grid.block_edge)
+    for i in range(3):
+        number = wp.clamp(wp.floor((line.p[i] + line.begin * line.d[i]) / edge), 0.0, float(grid.block_size[i] - 1))
+        place.block = place.block * grid.block_size[i] + int(number)
+        plane = edge * wp.where(line.d[i] < 0.0, number, number + 1.0)
+        place.at[i] = (plane - line.p[i]) * _inverse(line.d[i])
+    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
+    return place
+
+
+@wp.func
+def next_block(grid: Grid, line: BlockLine, here: BlockPlace) -> BlockPlace:
+    """Where the line enters the next block; planes are counted by steps, since blocks are few."""
+    place = here
+    place.t = here.stop
+    x = here.at[0] <= here.stop
+    y = not x and here.at[1] <= here.stop
+    z = not x and not y
+    place.at = wp.vec3(
+        wp.where(x, here.at[0] + line.step[0], here.at[0]),
+        wp.where(y, here.at[1] + line.step[1], here.at[1]),
+        wp.where(z, here.at[2] + line.step[2], here.at[2]),
+    )
+    stride = wp.where(x, line.stride[0], wp.where(y, line.stride[1], line.stride[2]))
+    # Rounding may let a line leave the box a step late: no index leaves the arrays.
+    place.block = wp.clamp(here.block + stride, 0, grid.block_majorant.shape[0] - 1)
+    place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
+    return place
+
+
+def make_grid(
+    extinction: ArrayLike,
+    albedo: ArrayLike,
+    anisotropy: ArrayLike | None = None,
+    *,
+    size: Sequence[float],
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    rotation: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    block_edge: int | None = None,
+    device: wp.DeviceLike = None,
+) -> Grid:
+    """Cells for `Layers.grid` of a spec with a grid.
+
+    Args:
+        extinction: c [1/m] >= 0, `[x, y, z]`, along the box's own axes.
+        albedo: In [0, 1], of the same shape.
+        anisotropy: g in (-1, 1), of the same shape; None: the medium's.
+        size: Edges of the box [m].
+        centre: Its middle, in the frame of the photons [m].
+        rotation: Its own axes there, as columns.
+        block_edge: Cells along the edges of the blocks that delta tracking flies through; None: 6 blocks along the
+            longest edge, the fastest for 128^3 cells on an H200.
+
+    Raises:
+        ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
+    """
+    device = check_device("device", device)
+    columns = {"extinction": (extinction, "[0, inf)"), "albedo": (albedo, "[0, 1]")}
+    if anisotropy is not None:
+        columns["anisotropy"] = (anisotropy, "(-1, 1)")
+    arrays = {name: _checked_cells(name, values, interval) for name, (values, interval) in columns.items()}
+    shape = arrays["extinction"].shape
+    for name, array in arrays.items():
+        if array.shape != shape:
+            raise ArgumentError(f"{name} has cells {array.shape}, extinction {shape}")
+    check_vector("size", size)
+    for edge in size:
+        check_number("size", edge, "(0, inf)")
+    check_vector("centre", centre)
+    axes = check_numbers("rotation", rotation, 2)
+    if axes.shape != (3, 3) or not np.allclose(axes.T @ axes, np.eye(3), atol=1e-5):
+        raise ArgumentError(f"rotation = {axes.tolist()} is not a rotation matrix")
+    longest = max(shape)
+    edge_cells = max(1, math.ceil(longest / 6)) if block_edge is None else block_edge
+    edge_cells = check_integer("block_edge", edge_cells, 1, longest)
+
+    grid = Grid()
+    turn = (np.array(shape) / np.array(size, np.float64))[:, None] * axes.T
+    grid.turn = wp.mat33(*turn.ravel().tolist())
+    grid.shift = wp.vec3(*(0.5 * np.array(shape) - turn @ np.asarray(centre, np.float64)).tolist())
+    grid.size = wp.vec3i(*shape)
+    for name, array in arrays.items():
+        setattr(grid, name, wp.array(array.ravel(), dtype=float, device=device))
+    if anisotropy is None:
+        grid.anisotropy = wp.empty(0, dtype=float, device=device)
+    blocks = block_statistics(arrays["extinction"], edge_cells)
+    grid.block_edge = edge_cells
+    grid.block_size = wp.vec3i(*blocks[0].shape)
+    grid.block_majorant = wp.array(blocks[0].ravel(), dtype=float, device=device)
+    grid.block_control = wp.array(np.stack([b.ravel() for b in blocks[1:]], axis=1), dtype=wp.vec2, device=device)
+    mean = blocks[1]
+    for axis, count in enumerate(shape):
+        mean = np.repeat(mean, edge_cells, axis=axis).take(range(count), axis=axis)
+    grid.residual = wp.array((arrays["extinction"] - mean).ravel(), dtype=float, device=device)
+    return grid
+
+
+def _checked_cells(name: str, values: ArrayLike, interval: str) -> NDArray[np.float32]:
+    array = np.ascontiguousarray(check_numbers(name, values, 3), np.float32)
+    if not 0 < array.size <= LARGEST_CELL_COUNT:
+        raise ArgumentError(f"{name} has cells {array.shape}; 1 to 2^30 of them are needed")
+    for value in (array.min(), array.max()):
+        check_number(name, float(value), interval)
+    return array
+
+
+def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArray[np.float32], ...]:
+    """Largest value, a value near the mean and largest difference from it in blocks of `edge` cells; the last may be
+    incomplete."""
+    starts = [np.arange(0, n, edge) for n in extinction.shape]
+
+    def over_blocks(reduce: np.ufunc, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        for axis, start in enumerate(starts):
+            values = reduce.reduceat(values, start, axis=axis)
+        return values
+
+    ones = [np.diff([*start, n]) for start, n in zip(starts, extinction.shape, strict=True)]
+    counts = ones[0][:, None, None] * ones[1][None, :, None] * ones[2][None, None, :]
+    low, high = over_blocks(np.minimum, extinction), over_blocks(np.maximum, extinction)
+    mean = np.clip(over_blocks(np.add, extinction.astype(np.float64)) / counts, low, high).astype(np.float32)
+    # Above the mean, since few cells are far above it, whose difference decides how many points ratio tracking takes.
+    mean = (mean + np.float32(0.1) * (high - mean)).astype(np.float32)
+    # Not below the true difference, whatever its rounding.
+    deviation = np.maximum(high - mean, mean - low) * np.float32(1.0 + 2.0**-20)
+    return high.astype(np.float32), mean, deviation.astype(np.float32)
+
+
+# ---- Voxels of a NanoVDB grid.
+
+
+@wp.kernel(enable_backward=False)
+def voxel_values_kernel(volume: wp.uint64, voxels: wp.array(dtype=wp.vec3i), values: wp.array(dtype=float)):
+    """Values of a `wp.Volume` of float32 at the indices of `Volume.get_voxels`. Launch: voxels."""
+    i = wp.tid()
+    v = voxels[i]
+    values[i] = wp.volume_lookup_f(volume, v[0], v[1], v[2])

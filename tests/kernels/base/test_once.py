@@ -1,0 +1,33 @@
+"""Warp functions that threads make at the same time."""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import warp as wp
+
+from spadwarp_kernels.base.kernels import made_once
+
+
+@pytest.fixture
+def hasty():
+    """Threads that take turns all the time."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def test_each_thread_gets_its_own_function(hasty):
+    @made_once
+    def make(number):
+        @wp.func
+        def one() -> int:
+            return wp.static(number)
+
+        return one
+
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(make, range(100)))
+    assert [function.func.__closure__[0].cell_contents for function in made] == list(range(100))
+    assert [make(number) for number in range(100)] == made

@@ -1,0 +1,106 @@
+"""Philox4x32-10 against the known answers of its authors' Random123 library."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from helpers.launch import Floats, launched, on_device
+from spadwarp_kernels.base import philox4x32, random_block, u01, u01_fine
+from spadwarp_kernels.base.philox import (
+    WORDS_AHEAD,
+    RoundKeys,
+    block_ahead,
+    make_draw_ahead,
+    random_block_keyed,
+    round_keys,
+)
+
+
+@wp.kernel(enable_backward=False)
+def _philox(words: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.vec4ui)):
+    out[0] = philox4x32(words[0], words[1], words[2], words[3], words[4], words[5])
+
+
+@wp.kernel(enable_backward=False)
+def _uniforms(words: wp.array(dtype=wp.uint32), coarse: Floats, fine: Floats):
+    i = wp.tid()
+    coarse[i] = u01(words[i])
+    fine[i] = u01_fine(words[i])
+
+
+@wp.kernel(enable_backward=False)
+def _blocks(seed: wp.uint64, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
+    i = wp.tid()
+    out[i] = random_block(seed, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
+
+
+@wp.kernel(enable_backward=False)
+def _keyed_blocks(keys: RoundKeys, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
+    i = wp.tid()
+    out[i] = random_block_keyed(keys, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
+
+
+@pytest.mark.parametrize(
+    ("counter_key", "expected"),
+    [
+        ([0] * 6, [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]),
+        ([0xFFFFFFFF] * 6, [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]),
+        (
+            [0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344, 0xA4093822, 0x299F31D0],
+            [0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1],
+        ),
+    ],
+)
+def test_known_answers(counter_key, expected):
+    words = on_device(np.array(counter_key, np.uint32), dtype=wp.uint32)
+    assert launched(_philox, [words], [wp.vec4ui], count=1)[0][0].tolist() == expected
+
+
+def test_uniforms_stay_below_one_and_reach_their_grid():
+    words = np.array([0, 1, 255, 256, 0x7FFFFFFF, 0xFFFFFF00, 0xFFFFFFFF], np.uint32)
+    inputs = [on_device(words, dtype=wp.uint32)]
+    coarse, fine = launched(_uniforms, inputs, (float, float), count=words.size)
+    assert coarse.max() < 1.0 and fine.max() < 1.0
+    np.testing.assert_array_equal(coarse, (words >> 8) / 2.0**24)
+    assert fine[1] == 2.0**-32
+
+
+def test_ids_beyond_32_bits_have_streams_of_their_own():
+    blocks = [launched(_blocks, [7, base], [wp.vec4ui], count=1000)[0] for base in (0, 1 << 32)]
+    assert len(np.unique(np.concatenate(blocks), axis=0)) == 2000
+
+
+@pytest.mark.parametrize("seed", [0, 1, 0x123456789ABCDEF0, 2**64 - 1])
+def test_round_keys_give_the_blocks_of_their_seed(seed, device):
+    plain, keyed = (
+        launched(kernel, [start, 1 << 33], [wp.vec4ui], device, 1000)[0]
+        for kernel, start in ((_blocks, seed), (_keyed_blocks, round_keys(seed)))
+    )
+    np.testing.assert_array_equal(plain, keyed)
+
+
+def _ahead(*streams):
+    events, draw_ahead = make_draw_ahead(*streams)
+
+    @wp.kernel(enable_backward=False)
+    def ahead(keys: RoundKeys, id: wp.uint64, event: wp.uint32, out: wp.array(dtype=wp.vec4ui)):
+        words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
+        draw_ahead(words, keys, id, event)
+        for lane in range(8):
+            out[lane] = block_ahead(words, lane)
+            stream = wp.uint32(wp.static(streams[0]))
+            if lane >= events:
+                stream = wp.uint32(wp.static(streams[-1]))
+            out[8 + lane] = random_block_keyed(keys, id, event + wp.uint32(lane % events), stream)
+
+    return ahead
+
+
+@pytest.mark.parametrize("streams", [(1,), (1, 2)])
+def test_words_of_events_ahead_are_those_of_each_event(streams):
+    keys = round_keys(0x9E3779B97F4A7C15)
+    for id, event in ((7, 1), (2**64 - 2, 2**32 - 3)):
+        out = wp.zeros(16, dtype=wp.vec4ui, device="cpu")
+        wp.launch(_ahead(*streams), dim=1, inputs=[keys, id, event], outputs=[out], device="cpu")
+        together, alone = out.numpy().reshape(2, 8, 4)
+        np.testing.assert_array_equal(together, alone)

@@ -1,0 +1,221 @@
+"""Two faces that make a parallelogram, tried as one in the tree on CUDA."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+import spadwarp_kernels as sk
+from helpers.brute_force import brute_force
+from helpers.launch import Vectors, launched, on_device
+from helpers.meshes import mesh_and_surfaces
+from spadwarp_kernels import intersect_mesh, intersect_surfaces
+from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.surface.bvh import open_pairs
+from spadwarp_kernels.surface.patches import LARGEST_LEAF, SAME, join_leaves, pair_faces, read_tree, shared_corner
+from spadwarp_kernels.surface.triangle import meet_planes, set_rows
+
+Rows = wp.array(dtype=wp.vec4)
+
+
+@wp.kernel(enable_backward=False)
+def _cast(rows: Rows, slots: wp.array(dtype=int), x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
+    """Distance and slot of the nearest of what is kept in the slots."""
+    i = wp.tid()
+    nearest = float(reach)
+    found = int(-1)
+    for k in range(slots.shape[0]):
+        row = 3 * slots[k]
+        hit = meet_planes(rows[row], rows[row + 1], rows[row + 2], x[i], u[i])
+        if hit[0] >= 0.0 and hit[0] < nearest:
+            nearest = hit[0]
+            found = slots[k] + wp.where(hit[1] > 0.0 and bits_of(rows[row + 2][3]) < 0, 1, 0)
+    met[i] = wp.vec2(nearest, float(found))
+
+
+@wp.kernel(enable_backward=False)
+def _walk(surfaces: sk.Surfaces, x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
+    i = wp.tid()
+    hit = intersect_surfaces(surfaces, x[i], u[i], reach, False)
+    met[i] = wp.vec2(hit.distance, float(hit.face))
+
+
+@wp.kernel(enable_backward=False)
+def _warps_walk(mesh: wp.uint64, x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
+    i = wp.tid()
+    hit = intersect_mesh(mesh, x[i], u[i], reach)
+    met[i] = wp.vec2(hit.distance, float(hit.face))
+
+
+@wp.kernel(enable_backward=False)
+def _corners(mesh: wp.uint64, same: float, corners: wp.array(dtype=int)):
+    corners[wp.tid()] = shared_corner(mesh, 2 * wp.tid(), 2 * wp.tid() + 1, same)
+
+
+def packed(shape, leaf_size, device="cpu"):
+    """Mesh, nodes, faces as CUDA takes them, and the face in each slot, or its complement."""
+    mesh = wp.Mesh(
+        on_device(shape.vertices, device),
+        on_device(np.ravel(shape.faces), device, int),
+        bvh_constructor="cubql",
+        bvh_leaf_size=leaf_size,
+    )
+    extent = float(np.abs(shape.vertices).max())
+    pairs, order = read_tree(mesh, extent)
+    rows = wp.zeros(3 * order.size, dtype=wp.vec4, device=device)
+    set_rows(mesh, order, rows)
+    join_leaves(mesh, extent, pairs, order, rows)
+    return mesh, open_pairs(pairs, order).numpy(), rows, order.numpy()
+
+
+def leaves(nodes):
+    """(leaf, lower, upper) of all leaves that the root leads to."""
+    rows, found, stack = nodes.reshape(-1, 16), [], [0]
+    while stack:
+        row = rows[stack.pop()]
+        sides = row[6:12].view(np.uint8).reshape(2, 3, 4)
+        boxes = row[:3, None] + row[3:6, None] * (1.0 + sides / 32768.0)
+        for k, child in enumerate(row[12:].view(np.int32)):
+            if child >= 0:
+                stack.append(int(child))
+            elif child < -1:
+                found.append((int(child), boxes[0, :, k], boxes[1, :, k]))
+    return found
+
+
+def tried(leaf, joined, order):
+    """Slots of a leaf that a ray tries."""
+    slots = [(-2 - leaf) // 2]
+    assert (leaf % 2 == 1) == (order[slots[0]] < 0)
+    while order[slots[-1]] < 0:
+        slots.append(slots[-1] + 1 + joined[slots[-1]])
+    return slots
+
+
+def scenes():
+    rng = np.random.default_rng(12)
+    boxes = []
+    for _ in range(6):
+        boxes.append(trimesh.creation.box(extents=rng.uniform(0.2, 1.2, 3)))
+        boxes[-1].apply_translation(rng.normal(size=3))
+    turned = [box.copy() for box in boxes]
+    for box in turned:
+        box.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
+    soup = rng.normal(size=(60, 1, 3)) + 0.6 * rng.normal(size=(60, 3, 3))
+    triangles = trimesh.Trimesh(soup.reshape(-1, 3), np.arange(180).reshape(-1, 3), process=False)
+    shapes = {"boxes": boxes, "turned": turned, "triangles": [triangles], "both": [*boxes[:3], triangles, *turned[3:]]}
+    shapes["dense"] = [box.subdivide() for box in boxes[:2]]
+    return {name: trimesh.util.concatenate(parts) for name, parts in shapes.items()}
+
+
+SCENES = scenes()
+LEAST = {"boxes": 36, "turned": 18, "triangles": 0, "both": 18, "dense": 48}  # parallelograms
+
+# Faces of a leaf: Warp's trees on CUDA hold both halves of a rectangle in one, also where leaves of one are asked for.
+SIZES = pytest.mark.parametrize("leaf_size", [1, 2, 5, 16])
+
+
+@SIZES
+@pytest.mark.parametrize("name", SCENES)
+def test_each_face_is_in_one_leaf_whose_box_holds_it(name, leaf_size, device):
+    shape = SCENES[name]
+    _kept, nodes, rows, order = packed(shape, leaf_size, device)
+    joined = np.signbit(rows.numpy()[2::3, 3])
+    faces = np.where(order < 0, ~order, order)
+    corners, seen, count = np.asarray(shape.vertices, np.float32)[shape.faces], [], 0
+    for leaf, lower, upper in leaves(nodes):
+        slots = tried(leaf, joined, order)
+        held = [faces[slot + k] for slot in slots for k in range(1 + joined[slot])]
+        assert (corners[held] >= lower).all() and (corners[held] <= upper).all()
+        assert len(held) <= LARGEST_LEAF or not joined[slots].any()
+        seen += held
+        count += joined[slots].sum()
+    assert sorted(seen) == list(range(len(shape.faces)))
+    assert count == joined.sum() <= len(seen) / 2
+    assert count >= LEAST[name] or leaf_size > 2
+    assert count > 0 or name == "triangles" or leaf_size > LARGEST_LEAF
+
+
+@SIZES
+@pytest.mark.parametrize("name", SCENES)
+def test_rays_hit_what_a_search_in_float64_hits(name, leaf_size, device):
+    """In all leaves one by one, and in the device's own tree; at random, and aimed near edges and diagonals."""
+    shape = SCENES[name]
+    rng = np.random.default_rng(2)
+    corners = np.asarray(shape.vertices, np.float32).astype(float)[shape.faces]
+    x = 2.0 * rng.normal(size=(20_000, 3)).astype(np.float32)
+    ends = rng.integers(len(corners), size=len(x))
+    aim, other = corners[ends, rng.integers(3, size=len(x))], corners[ends, rng.integers(3, size=len(x))]
+    aim += rng.uniform(size=(len(x), 1)) * (other - aim) + 1e-3 * rng.normal(size=x.shape)
+    aim[::2] = rng.normal(size=aim[::2].shape)
+    u = aim - x
+    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+    expected, inside = brute_force(corners, x.astype(float), u.astype(float))
+    expected[expected >= 4.0] = np.inf
+    nearest = expected.min(axis=1)
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosine = np.abs(u @ (n / np.linalg.norm(n, axis=1, keepdims=True)).T)
+    # Within a hair of an outline a ray may hit or miss; of two faces at nearly one distance either may count.
+    clear = (np.where(np.isfinite(inside), np.abs(inside) * cosine, 1.0) > 1e-5).all(axis=1)
+    clear &= (np.abs(np.where(np.isfinite(expected), expected, 9.0) - 4.0) > 1e-4).all(axis=1)
+    second = np.partition(expected, 1, axis=1)[:, 1]
+    alone = clear & ~(second < nearest + 1e-4)
+
+    _kept, nodes, rows, order = packed(shape, leaf_size, device)
+    joined = np.signbit(rows.numpy()[2::3, 3])
+    slots = np.concatenate([tried(leaf, joined, order) for leaf, _, _ in leaves(nodes)])
+    slots = on_device(slots, device, int)
+    (met,) = launched(_cast, [rows, slots, x, u, 4.0], [wp.vec2], device, len(x))
+    slot = met[:, 1].astype(int)
+    found = np.where(slot >= 0, np.where(order[slot] < 0, ~order[slot], order[slot]), -1)
+    kept, surfaces = mesh_and_surfaces(shape, device, builder="cubql", leaf_size=leaf_size)
+    (walked,) = launched(_walk, [surfaces, x, u, 4.0], [wp.vec2], device, len(x))
+    assert kept.id
+    for face, distance in ((found, met[:, 0]), (walked[:, 1].astype(int), walked[:, 0])):
+        hit = face >= 0
+        np.testing.assert_array_equal(hit[clear], np.isfinite(nearest)[clear])
+        assert (alone & hit).mean() > 0.2
+        np.testing.assert_array_equal(face[alone & hit], expected[alone & hit].argmin(axis=1))
+        both = np.flatnonzero(alone & hit)
+        assert (np.abs(distance - nearest)[both] * cosine[both, face[both]]).max() < 6e-6
+        # Any hit, near an outline or not, is on the face that is named.
+        rays = np.flatnonzero(hit)
+        assert (inside[rays, face[rays]] * cosine[rays, face[rays]]).min() > -1e-5
+
+
+@SIZES
+def test_a_moving_mesh_has_leaves_of_triangles(leaf_size, device):
+    """What was a parallelogram is none later."""
+    shape = SCENES["boxes"]
+    mesh, _ = mesh_and_surfaces(shape, device, builder="cubql", leaf_size=leaf_size)
+    surfaces = sk.make_surfaces(mesh, extent=9.0)
+    rng = np.random.default_rng(6)
+    mesh.points.assign((shape.vertices + rng.normal(scale=0.3, size=shape.vertices.shape)).astype(np.float32))
+    sk.update_surfaces(surfaces, mesh)
+    mesh.refit()
+    x, u = rng.normal(size=(2, 20_000, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    (mine,) = launched(_walk, [surfaces, x, u, 4.0], [wp.vec2], device, len(x))
+    (hers,) = launched(_warps_walk, [mesh.id, x, u, 4.0], [wp.vec2], device, len(x))
+    assert (mine[:, 1] >= 0).mean() > 0.2
+    assert (mine[:, 1] == hers[:, 1]).mean() > 0.999
+    assert (np.abs(mine[:, 0] - hers[:, 0]) < 1e-4).mean() > 0.999
+
+
+def test_pairs_are_found_as_among_a_few_faces(device):
+    """Squares and slanted ones in any order of corners, others that are nearly such, faces without area."""
+    rng = np.random.default_rng(9)
+    points = []
+    for k in range(300):
+        o, a, b = rng.normal(size=(3, 3)).astype(np.float32)
+        quad = np.array([o, o + a, o + a + b, o + b])
+        quad[3] += [0.0, 0.0, 1e-4, 1e-2][k % 4] * rng.normal(size=3)
+        second = [(0, 2, 3), (0, 2, 3), (0, 3, 2), (0, 2, 3), (0, 0, 3)][k % 5]
+        points += [np.roll(quad[list(face)], rng.integers(3), axis=0) for face in ((0, 1, 2), second)]
+    points = np.concatenate(points).astype(np.float32)
+    mesh = wp.Mesh(on_device(points, device), on_device(np.arange(len(points)), device, int))
+    same = SAME * float(np.abs(points).max())
+    (corners,) = launched(_corners, [mesh.id, same], [int], device, 300)
+    expected = [pair_faces(six, [[0, 1, 2], [3, 4, 5]])[0] for six in points.reshape(300, 6, 3)]
+    assert 80 < sum(second for _, second, _ in expected) < 150
+    np.testing.assert_array_equal(corners, [corner if second else -1 for _, second, corner in expected])

@@ -1,0 +1,204 @@
+"""A handful of faces, all of which are tried: which of them make parallelograms, and what rays hit."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from helpers.brute_force import brute_force
+from helpers.launch import Vectors, launched, on_device
+from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.surface.patches import (
+    nearest_patch,
+    normal_and_face,
+    pack_patches,
+    pair_faces,
+    patch_faces,
+    patch_normal,
+    set_patches,
+)
+
+OUT = (float, wp.vec3, wp.vec3i)
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+
+
+@wp.kernel(enable_backward=False)
+def _cast(
+    patches: wp.array(dtype=wp.vec4),
+    normals: wp.array(dtype=wp.vec4),
+    x: Vectors,
+    u: Vectors,
+    reach: float,
+    distance: wp.array(dtype=float),
+    normal: Vectors,
+    faces: wp.array(dtype=wp.vec3i),
+):
+    """Distance, normal against the ray, and (slot, face, face in that slot)."""
+    i = wp.tid()
+    met = nearest_patch(patches, x[i], u[i], reach)
+    row = bits_of(met[3])
+    distance[i] = met[0]
+    faces[i] = wp.vec3i(-1)
+    if row >= 0:
+        named = patch_faces(patches, row, met[2] > 0.0)
+        normal[i] = patch_normal(patches, row, met[1])
+        faces[i] = wp.vec3i(named[0], named[1], bits_of(normal_and_face(normals, named[0])[3]))
+
+
+def packed(shape, pairs=True, device="cpu"):
+    """The mesh, its patches, and the normals of its faces, which stand in slots in the opposite order."""
+    mesh = wp.Mesh(on_device(shape.vertices, device), on_device(np.ravel(shape.faces), device, int))
+    return mesh, *pack_patches(mesh, np.arange(len(shape.faces))[::-1], pairs)
+
+
+def scenes():
+    rng = np.random.default_rng(11)
+    quads, triangles = [], []
+    for _ in range(3):
+        o, a, b = rng.normal(size=(3, 3))
+        quads += [[o, o + a, o + a + b], [o, o + a + b, o + b]]
+    for _ in range(4):
+        triangles.append(rng.normal(size=(3, 3)))
+    shapes = {"parallelograms": quads, "triangles": triangles, "both": [*quads[:3], *triangles, *quads[3:]]}
+    soups = {
+        name: trimesh.Trimesh(np.reshape(corners, (-1, 3)), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+        for name, corners in shapes.items()
+    }
+    box = trimesh.creation.box(extents=(1.0, 2.0, 0.5))
+    box.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.6, 0.9])))
+    return soups | {"box": box}
+
+
+SCENES = scenes()
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+@pytest.mark.parametrize("name", SCENES)
+def test_rays_hit_what_a_search_in_float64_hits(name, pairs, device):
+    """At random, and aimed within 1e-3 of edges, diagonals and corners."""
+    shape = SCENES[name]
+    rng = np.random.default_rng(2)
+    kept, patches, normals = packed(shape, pairs, device)
+    corners = np.asarray(shape.vertices, np.float32).astype(float)[shape.faces]
+    x = rng.normal(size=(40_000, 3)).astype(np.float32)
+    aim = corners[rng.integers(len(corners), size=len(x)), rng.integers(3, size=len(x))]
+    other = corners[rng.integers(len(corners), size=len(x)), 0]
+    share = rng.uniform(size=(len(x), 1))
+    ends = rng.integers(len(corners), size=20_000)
+    aim[:20_000], other[:20_000] = corners[ends, 0], corners[ends, 2 - (np.arange(20_000) % 2)]
+    u = aim + share * (other - aim) + 1e-3 * rng.normal(size=x.shape) * rng.integers(2, size=(len(x), 1)) - x
+    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+
+    distance, normal, faces = launched(_cast, [patches, normals, x, u, 4.0], OUT, device, len(x))
+    expected, inside = brute_force(corners, x.astype(float), u.astype(float))
+    expected[expected >= 4.0] = np.inf
+    nearest = expected.min(axis=1)
+    # Within a hair of an outline a ray may hit or miss; grazing rays meet a plane where rounding has it.
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cosine = np.abs(u @ (n / np.linalg.norm(n, axis=1, keepdims=True)).T)
+    clear = (np.where(np.isfinite(inside), np.abs(inside) * cosine, 1.0) > 1e-5).all(axis=1)
+    clear &= (np.abs(np.where(np.isfinite(expected), expected, 9.0) - 4.0) > 1e-4).all(axis=1)
+    hit = faces[:, 1] >= 0
+    assert (clear & hit).mean() > 0.05
+    np.testing.assert_array_equal(hit[clear], np.isfinite(nearest)[clear])
+    both = clear & hit
+    assert (np.abs(distance - nearest)[both] * cosine[both, faces[both, 1]]).max() < 4e-6
+    np.testing.assert_array_equal(faces[both, 1], expected[both].argmin(axis=1))
+    # Any hit, near an outline or not, is on the face that is named, with its normal and in its slot.
+    y = x + distance[:, None] * u
+    named = faces[hit, 1]
+    assert (inside[hit, named] * cosine[hit, named]).min() > -1e-5
+    assert np.abs(((y[hit] - corners[named, 0]) * n[named]).sum(axis=1) / np.linalg.norm(n[named], axis=1)).max() < 1e-5
+    np.testing.assert_array_equal(faces[hit, 0], len(shape.faces) - 1 - named)
+    np.testing.assert_array_equal(faces[hit, 2], named)
+    assert ((normal[hit] * u[hit]).sum(axis=1) <= 0).all()
+    turned = np.abs((normal[hit] * n[named]).sum(axis=1)) / np.linalg.norm(n[named], axis=1)
+    np.testing.assert_allclose(turned, 1.0, atol=1e-6)
+    assert kept.id
+
+
+def test_no_ray_slips_through_a_diagonal_or_an_edge(device):
+    """From inside a closed box, at the edges and diagonals of all faces."""
+    box = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
+    box.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.7])))
+    rng = np.random.default_rng(3)
+    edges = box.vertices[box.edges_unique]
+    chosen = rng.integers(len(edges), size=200_000)
+    share = rng.uniform(size=(len(chosen), 1))
+    to = edges[chosen, 0] + share * (edges[chosen, 1] - edges[chosen, 0])
+    x = 0.9 * box.vertices[rng.integers(8, size=len(to))] * rng.uniform(size=(len(to), 1))
+    u = (to - x) / np.linalg.norm(to - x, axis=1, keepdims=True)
+    for pairs in (True, False):
+        _kept, patches, normals = packed(box, pairs, device)
+        _, _, faces = launched(_cast, [patches, normals, x, u, 9.0], OUT, device, len(x))
+        assert (faces[:, 1] < 0).sum() <= 2
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_box_has_six_patches_and_a_plane_one(scale):
+    rng = np.random.default_rng(4)
+    for turn in range(20):
+        pose = trimesh.transformations.random_rotation_matrix(rng.uniform(size=3))
+        pose[:3, 3] = rng.normal(size=3) * 3
+        box = trimesh.creation.box(extents=scale * rng.uniform(0.3, 3, size=3), transform=pose)
+        faces = box.faces
+        if turn % 2:  # faces that share no vertices, each beginning at any corner
+            box = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+            faces = np.array([np.roll(face, rng.integers(3)) for face in box.faces])
+        patches = pair_faces(box.vertices.astype(np.float32), faces)
+        assert len(patches) == 6
+        assert sorted(face for first, second, _ in patches for face in (first, second)) == list(range(12))
+        for first, second, _ in patches:
+            assert box.face_normals[first] @ box.face_normals[second] > 0.999
+    assert pair_faces(scale * SQUARE, [[0, 1, 2], [0, 2, 3]]) == [(0, 1, 1)]
+    slanted = scale * np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [2, -1, 0]])
+    assert pair_faces(slanted, [[0, 1, 2], [0, 3, 1]]) == [(0, 1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("points", "faces"),
+    [
+        (
+            np.add(SQUARE, [[0, 0, 0], [0, 0, 0], [0.01, 0, 0], [0, 0, 0]]),
+            [[0, 1, 2], [0, 2, 3]],
+        ),  # not a parallelogram
+        (np.add(SQUARE, [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1e-4]]), [[0, 1, 2], [0, 2, 3]]),  # not flat
+        (SQUARE, [[0, 1, 2], [0, 3, 2]]),  # turned the other way
+        (SQUARE, [[0, 1, 2], [0, 1, 2]]),  # twice the same
+        (SQUARE, [[0, 1, 2], [0, 1, 3]]),  # overlapping
+        (SQUARE, [[0, 2, 2], [0, 2, 2]]),  # without area
+        (SQUARE * [1, 1e-6, 1], [[0, 1, 2], [0, 2, 3]]),  # less high than what counts as one point
+    ],
+)
+def test_other_faces_stay_by_themselves(points, faces):
+    assert pair_faces(np.asarray(points, float), faces) == [(0, 0, 0), (1, 1, 0)]
+
+
+def test_each_face_is_of_one_parallelogram():
+    """Of three triangles that fit together pairwise, and of a square that is there twice."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    assert pair_faces(points, [[0, 1, 2], [1, 3, 2], [0, 2, 4]]) == [(0, 1, 0), (2, 2, 0)]
+    square = [[0, 1, 3], [1, 2, 3]]
+    assert pair_faces(SQUARE, square + square) == [(0, 1, 0), (2, 3, 0)]
+
+
+def test_patches_without_area_are_never_hit():
+    shape = trimesh.Trimesh(np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1]], float), [[0, 1, 2], [1, 1, 1]], process=False)
+    _kept, patches, normals = packed(shape)
+    x = np.zeros((3, 3))
+    u = np.array([[0, 0, 1], [0.6, 0, 0.8], [1, 0, 0]])
+    distance, _, faces = launched(_cast, [patches, normals, x, u, 5.0], OUT, count=3)
+    assert (faces == -1).all()
+    np.testing.assert_array_equal(distance, 5.0)
+
+
+def test_patches_of_single_faces_follow_points_that_move():
+    shape = trimesh.Trimesh(np.add(SQUARE, [0, 0, 1]), [[0, 1, 2], [0, 2, 3]], process=False)
+    mesh, patches, normals = packed(shape, pairs=False)
+    moved = np.add(shape.vertices, [[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 3]])
+    mesh.points.assign(on_device(moved))
+    set_patches(mesh, patches, normals)
+    rays = np.array([[0.7, 0.2, 0.0], [0.2, 0.7, 0.0]]), np.array([[0.0, 0.0, 1.0]] * 2)
+    distance, _, faces = launched(_cast, [patches, normals, *rays, 9.0], OUT, count=2)
+    np.testing.assert_array_equal(faces[:, 1], [0, 1])
+    np.testing.assert_allclose(distance, [1.2, 1.0 + 0.7 * 3 - 0.2 * 2], atol=1e-6)
