@@ -12,7 +12,6 @@ from .detection import *
 from .estimators import *
 from .optics import *
 from .photon import *
-from .riders import *
 from .surface import *
 from .tally import *
 from .transport import *
@@ -27,7 +26,6 @@ if not TYPE_CHECKING:  # type checkers follow the stars
         + estimators.__all__
         + optics.__all__
         + photon.__all__
-        + riders.__all__
         + surface.__all__
         + tally.__all__
         + transport.__all__

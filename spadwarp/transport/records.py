@@ -50,7 +50,7 @@ _DIMENSIONS = {
     "path": (("photon",), "m", "geometric path"),
     "collisions": (("photon",), "1", "events, surfaces included"),
     "reason": (("photon",), "1", "index into reasons"),
-    "scores": (("photon", "parameter"), "1", "derivative of the logarithm of what the history has met"),
+    "log_derivatives": (("photon", "parameter"), "1", "derivative of the logarithm of what the history has met"),
 }
 _READ_ME = (
     "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
@@ -74,7 +74,7 @@ class PhotonRecords:
         reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
         ledger: As in `Result`, with its unit.
         derivatives: Names of the P parameters that were asked for.
-        scores: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the derivative of the
+        log_derivatives: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the derivative of the
             expectation of anything that the records tell is the mean of this times the score.
     """
 
@@ -89,7 +89,7 @@ class PhotonRecords:
     ledger: dict[str, int]
     ledger_unit: float
     derivatives: tuple[str, ...] = ()
-    scores: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    log_derivatives: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def ended(self, *names: str) -> NDArray[np.bool_]:
         """Mask of the photons that ended for one of the named reasons."""
@@ -123,13 +123,13 @@ def trace(
     names = resolve_derivatives(scene, derivatives)
     if any(map(is_of_grid, names)):
         raise ArgumentError(
-            f"derivatives: photon records have no scores by block: {names[-1]}; a histogram has, `simulate`"
+            f"derivatives: photon records have no derivatives by block: {names[-1]}; a histogram has, `simulate`"
         )
     model = build_model(scene, pick_device(device), mesh, camera=False, derivatives=names)
     if progress is not None:
         progress("compile", 0, 0)
     spec = transport_spec(scene, mesh, derivatives=names, estimator="none", records=True)
-    arrays = [name for name in _ARRAYS if name != "id"] + (["scores"] if names else [])
+    arrays = [name for name in _ARRAYS if name != "id"] + (["log_derivatives"] if names else [])
     size = LAUNCH_SIZE["cuda" if model.device.is_cuda else "cpu"]
     worker = DeviceWorker(model, spec, seed=seed, launch_size=size, histogram=False)
     parts: list[dict[str, NDArray[Any]]] = []
@@ -181,7 +181,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
             file.create_dataset(name, data=getattr(records, name), compression="gzip", compression_opts=1, shuffle=True)
         if records.derivatives:
             file.attrs["derivatives"] = list(records.derivatives)
-            file.create_dataset("scores", data=records.scores, compression="gzip", compression_opts=1, shuffle=True)
+            file.create_dataset("log_derivatives", data=records.log_derivatives, compression="gzip", compression_opts=1, shuffle=True)
         file.create_dataset("ledger", data=json.dumps(records.ledger))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())
@@ -205,10 +205,10 @@ def load_records(path: str | Path) -> PhotonRecords:
         if count and not 0 <= arrays["reason"].min() <= arrays["reason"].max() < len(reasons):
             file.refuse("reason", f"is outside [0, {len(reasons)}) for some photons")
         names: list[Any] = np.ravel(file.attribute("derivatives", [])).tolist()
-        if bool(names) != ("scores" in file) or not all(isinstance(name, str) for name in names):
-            file.refuse("derivatives", "are not the names of scores")
+        if bool(names) != ("log_derivatives" in file) or not all(isinstance(name, str) for name in names):
+            file.refuse("derivatives", "are not the names of derivatives")
         if names:
-            arrays["scores"] = file.array("scores", np.float32, (count, len(names)))
+            arrays["log_derivatives"] = file.array("log_derivatives", np.float32, (count, len(names)))
         return PhotonRecords(
             **arrays,
             derivatives=tuple(names),

@@ -64,7 +64,7 @@ def _slab_derivatives(run: Run) -> list[Quantity]:
     kinds = ("absorption", "scattering", "anisotropy")[: 2 if run.tables else 3]
 
     def slopes(records: Any) -> list[NDArray]:
-        return [face * score for face in _both_faces(records) for score in records.scores.T.astype(np.float64)]
+        return [face * score for face in _both_faces(records) for score in records.log_derivatives.T.astype(np.float64)]
 
     measured = []
     for slab in references.SLAB_DERIVATIVES:

@@ -199,7 +199,7 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
             resolve_derivatives(scene_, [asked], blocks)
     with pytest.raises(spadwarp.ConfigError, match=r"medium.grid.scattering is named twice"):
         resolve_derivatives(one, [NAMES[0], NAMES[1], NAMES[1]])
-    with pytest.raises(spadwarp.ArgumentError, match="photon records have no scores by block"):
+    with pytest.raises(spadwarp.ArgumentError, match="photon records have no derivatives by block"):
         trace(one, photons=100, device="cpu", derivatives=NAMES[:1])
     large = {"width": 2000, "height": 2000}
     with pytest.raises(spadwarp.ConfigError, match="fewer pixels, bins or blocks"):

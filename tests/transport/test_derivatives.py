@@ -235,12 +235,12 @@ def test_records_have_scores(tmp_path):
     """In water alone the score by absorption is minus the path, that by scattering the mean free path's multiple."""
     one = scene(targets=[], gate={"bins": 8})
     records = trace(one, photons=2000, device="cpu", derivatives=WATER)
-    np.testing.assert_allclose(records.scores[:, 0], -records.path, rtol=1e-5)
-    scattered = 0.4 * (records.scores[:, 1] + records.path)
+    np.testing.assert_allclose(records.log_derivatives[:, 0], -records.path, rtol=1e-5)
+    scattered = 0.4 * (records.log_derivatives[:, 1] + records.path)
     np.testing.assert_allclose(scattered, np.round(scattered), atol=1e-3)
     loaded = load_records(save_records(records, tmp_path / "records.h5"))
     assert loaded.derivatives == resolve_derivatives(one, WATER)
-    np.testing.assert_array_equal(loaded.scores, records.scores)
+    np.testing.assert_array_equal(loaded.log_derivatives, records.log_derivatives)
 
 
 def test_names():

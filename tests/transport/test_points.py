@@ -10,7 +10,7 @@ from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.errors import ConfigError
 from spadwarp.transport import trace
-from spadwarp_kernels.transport.checks import check_spec
+from spadwarp_kernels.transport.launch import check_spec
 
 BARS = [
     {"builtin": "box", "size": [3.0, 3.0, 0.1], "translation": [0.0, 0.0, 2.3], "reflectance": 0.7},

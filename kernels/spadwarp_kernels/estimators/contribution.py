@@ -5,71 +5,168 @@ import warp as wp
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
-from spadwarp_kernels.base.rotations import one_minus_cosine, set_apart, snap_from
+from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.gate import Gate
-from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.riders.rider import NOTHING
+from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import patch_face, tree_face
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, Scores, tally_index
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 
 from .flight_sampling import make_sample_flight
-from .link import make_apparent_lens, make_link
+
+__all__ = ["next_event_value"]
+
+
+# ---- The way of light from a point that is scored to a point of the lens, in water alone or through a port.
 
 
 @wp.struct
-class Request:
-    """What is to be scored; plain enough for another thread to do it.
+class Link:
+    """A way to the lens.
 
     Attributes:
-        wanted: Whether there is anything.
-        x: Where the photon scatters, or where the flight begins [m].
-        u: Its direction until there, or of the flight.
-        weight: Of the photon; in water times the albedo, but for flights through water that varies, whose albedo is
-            that of the sampled point.
-        path: Geometric path up to x [m].
-        lens: The point of the lens by which a flight is scored; others draw one from `first`.
-        interval: The part of the flight to take a point from [m]; empty for a scattering.
-        first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
-            tracking through a grid. With `takes_collisions` the second has the bits of the distance to the collision
-            [m] where that is scored.
-        rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
-        component: Index into COMPONENTS.
-        slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
-        target: The pixel of a scan, else -1.
-        scores: Of the photon up to x.
-        stokes: Of the photon on its way along u, see `PhotonState`.
+        to_lens: Unit direction at the point.
+        image: A point that the lens sees in the same direction, in air alone [m].
+        end: Where the way leaves the water [m].
+        water: Its length in the water [m].
+        path: Length in water that takes as long as all of it [m].
+        gather: What the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2];
+            through a port.
     """
 
-    wanted: bool
-    x: wp.vec3
-    u: wp.vec3
-    weight: float
+    to_lens: wp.vec3
+    image: wp.vec3
+    end: wp.vec3
+    water: float
     path: float
-    lens: wp.vec3
-    interval: wp.vec2
-    first: wp.uint32
-    second: wp.uint32
-    rounding_sample: wp.uint32
-    component: int
-    slot: int
-    target: int
-    scores: Scores
-    stokes: wp.vec4
+    gather: float
 
 
-@wp.struct
-class Asked:
-    """Holds the request of a thread: an attribute is assigned in place, see `PhotonState`."""
+@wp.func
+def next_event_value(
+    camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
+) -> float:
+    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
+    unit vector."""
+    cos_lens = wp.max(-to_lens[2], 0.0)
+    return (
+        # Times -1: Warp's unary minus is 0 - x, an addition.
+        weight
+        * scattering
+        * wp.exp((-1.0 * extinction) * distance)
+        * camera.aperture_area
+        * cos_lens
+        / (distance * distance)
+    )
 
-    request: Request
+
+@wp.func
+def _link_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
+    link = Link()
+    to_lens = o - x
+    r = wp.length(to_lens)
+    link.to_lens = to_lens / r
+    link.image = x
+    link.end = o
+    link.water = r
+    link.path = r
+    return link
+
+
+@wp.func
+def _value_in_water(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+    return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
+
+
+@wp.func
+def _value_behind_port(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+    return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+
+
+@made_once
+def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
+    scattering, link) -> float``, the fraction of the photon that arrives."""
+    if spec.port is None:
+        return _link_in_water, _value_in_water
+    connect = spec.port.connect
+
+    @wp.func
+    def link_behind_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
+        way = connect(camera.port, x, o)
+        link = Link()
+        link.to_lens = way.to_port
+        link.image = o - way.inside
+        link.end = way.exit
+        link.water = way.water
+        link.path = way.path
+        link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        return link
+
+    return link_behind_port, _value_behind_port
+
+
+@wp.func
+def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+    return o
+
+
+@made_once
+def make_apparent_lens(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
+    if spec.port is None:
+        return _lens_in_water
+    connect, apparent = spec.port.connect, spec.port.apparent
+
+    @wp.func
+    def apparent_lens(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        way = connect(camera.port, x, o)
+        seen = wp.vec3(o)
+        if way.density > 0.0:
+            seen = apparent(camera.port, x, o, way)
+        return seen
+
+    return apparent_lens
+
+
+@wp.func
+def _toward_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+    return wp.normalize(o - x)
+
+
+@wp.func
+def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
+    return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
+
+
+@made_once
+def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
+    and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""
+    if spec.port is None:
+        return _toward_in_water, _toward_centre_in_water
+    connect, apparent_centre = spec.port.connect, spec.port.apparent_centre
+
+    @wp.func
+    def toward_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        way = connect(camera.port, x, o)
+        return wp.where(way.density > 0.0, way.to_port, wp.normalize(o - x))
+
+    @wp.func
+    def toward_centre_behind_port(camera: Camera, x: wp.vec3) -> wp.vec3:
+        return wp.normalize(apparent_centre(camera.port) - x)
+
+    return toward_port, toward_centre_behind_port
+
+
+# ---- Requests, and what they come to.
 
 
 @wp.struct
@@ -79,19 +176,11 @@ class Scored:
     Attributes:
         contribution: To the tally, if nothing stands between the scored point and the lens.
         origin, lens: The scored point, and where its light leaves the water: the point of the lens, or of a port [m].
-        to_lens: Unit direction of its light there.
-        inside: Direction in which it arrives, of any length.
-        seen: Whether nothing does; else a shadow ray must be traced.
-        shadow_queries: Shadow rays that were traced.
     """
 
     contribution: Contribution
     origin: wp.vec3
     lens: wp.vec3
-    to_lens: wp.vec3
-    inside: wp.vec3
-    seen: bool
-    shadow_queries: int
 
 
 @wp.struct
@@ -107,21 +196,21 @@ class ScoredPoint:
 
 @made_once
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
+    """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of = spec.lens.view
     shows = spec.lens.shows if spec.port is None else port_view(spec.port).shows
-    reflecting, tracks, derives = spec.reflecting, spec.grid is not None, bool(spec.derivatives)
-    polarised, has_mesh = spec.polarised, spec.mesh
+    reflecting, tracks, has_mesh = spec.reflecting, spec.grid is not None, spec.mesh
+    rides = make_rider(spec) is not NOTHING
 
     @wp.func
-    def event_request(s: PhotonState, camera: Camera) -> Request:
+    def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
         q = Request()
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
         # Mirrored, any point may be seen.
         if wp.static(not flights or reflecting) or on_surface:
-            if wp.static(reflecting) or shows(camera, view_of(camera, s.view), s.x):
+            if wp.static(reflecting) or shows(world.camera, view_of(world.camera, s.view), s.x):
                 q.wanted = True
                 if wp.static(reflecting):
                     q.wanted = s.bounces.face == 0
@@ -137,10 +226,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                 q.slot = -1
                 q.target = s.target
                 q.component = FORWARD_SCATTERED
-                if wp.static(derives):
-                    q.scores = s.scores
-                if wp.static(polarised):
-                    q.stokes = s.stokes
+                if wp.static(rides):
+                    q.carried = s.carried
                 if on_surface:
                     q.slot = s.hit.slot
                     if s.collisions == 1:
@@ -167,8 +254,7 @@ def takes_collisions(spec: TransportSpec) -> bool:
 
 @made_once
 def make_flight_point(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
-    scored."""
+    """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
     local_albedo = spec.varies and not spec.random_albedo
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
@@ -178,7 +264,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     apparent_lens = make_apparent_lens(spec)
 
     @wp.func
-    def flight_point(request: Request, medium: Medium, layers: Layers, camera: Camera) -> ScoredPoint:
+    def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
         point = ScoredPoint()
         # Layers: a density with the mean extinction; what is scored weighs with the exact one.
         s0 = request.interval[0]
@@ -186,20 +272,22 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         middle = request.x + (0.5 * (s0 + request.interval[1])) * request.u
         begin = request.x + s0 * request.u
         seed = join_words(request.first, request.second)
-        from_lens = request.x - apparent_lens(camera, middle, request.lens)
+        from_lens = request.x - apparent_lens(world.camera, middle, request.lens)
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
         if wp.static(collides):
             if scores_collision(request.first):
                 xi = from_bits(int(request.second))
         if wp.static(has_profile):
-            flight = sample_flight(from_lens, request.u, request.interval, 0.0, medium, xi_choice, xi, layers, begin)
+            flight = sample_flight(
+                from_lens, request.u, request.interval, 0.0, world.medium, xi_choice, xi, world.layers, begin
+            )
         else:
-            mean = water_extinction(medium, layers, begin, request.u, width, seed)
-            flight = sample_flight(from_lens, request.u, request.interval, mean, medium, xi_choice, xi)
+            mean = water_extinction(world.medium, world.layers, begin, request.u, width, seed)
+            flight = sample_flight(from_lens, request.u, request.interval, mean, world.medium, xi_choice, xi)
         point.x = request.x + flight.s * request.u
         point.path = request.path + flight.s
-        there = water_at(medium, layers, point.x)
+        there = water_at(world.medium, world.layers, point.x)
         weight = float(request.weight)
         if wp.static(local_albedo):
             weight *= there.albedo
@@ -207,7 +295,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
             # What is scored at collisions has lost light by chance already. Both kinds of points share a density, of
             # about 1/2 c exp(-depth) + 3/4 p(angle): any would do that does not depend on chance (balance heuristic).
             from_angle = 1.5 * flight.density  # half of p
-            about = wp.exp(-depth_along(medium, layers, request.x, request.u, flight.s))
+            about = wp.exp(-depth_along(world.medium, world.layers, request.x, request.u, flight.s))
             flight.density = from_angle + 0.5 * there.extinction * about
             if scores_collision(request.first):
                 weight *= there.extinction * about
@@ -218,10 +306,10 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         elif wp.static(has_profile):
             before = float(0.0)
             if s0 > 0.0:
-                before = depth_along(medium, layers, request.x, request.u, s0)
+                before = depth_along(world.medium, world.layers, request.x, request.u, s0)
             weight *= there.extinction * wp.exp(-before - flight.depth)
         else:
-            passed = water_extinction(medium, layers, request.x, request.u, flight.s, seed)
+            passed = water_extinction(world.medium, world.layers, request.x, request.u, flight.s, seed)
             weight *= there.extinction * wp.exp(-passed * flight.s)
         point.weight = wp.where(flight.density <= 0.0, 0.0, weight / flight.density)
         return point
@@ -229,63 +317,52 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     return flight_point
 
 
-def _fused_axes(spec: TransportSpec, flights: bool) -> int:
-    """For how many of x, y, z the compiler for CUDA divides by the distance and subtracts in one operation, without
-    polarisation.
+@made_once
+def make_point_of(points: int) -> wp.Function:
+    """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
 
-    Found in the machine code of Warp 1.19 and CUDA 13. Where it is another number, the intensity differs in the last
-    bits from that of the run without polarisation, and a test on a GPU fails.
+    Both random numbers of a point are a part of 1 further than those of the one before, modulo 1: those of each are
+    uniform, and together they are spread evenly (systematic sampling). What a pixel's bin holds is noisy above all
+    since few flights are scored in it; the points of a flight lie in others.
     """
-    if spec.mesh or spec.varies:
-        return 0 if flights else 2
-    return 2 if flights else 3
+    step = wp.uint32((1 << 32) // points)
+
+    @wp.func
+    def point_of(request: Request, number: int) -> Request:
+        other = request
+        other.first = request.first + wp.uint32(number) * wp.static(step)
+        other.second = request.second + wp.uint32(number) * wp.static(step)
+        return other
+
+    return point_of
 
 
 @made_once
-def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(request, x, v, way, distance, medium, layers, surfaces) -> float``: density [1/sr] of what
-    the water or the face of the request scatters at x into the direction v = way/distance. In water, polarised light
-    takes the latter, rounded as without polarisation.
-    """
+def make_scattering(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
+    request scatters at x into the direction v."""
     has_mesh, specular = spec.mesh, spec.specular
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
     face_at = patch_face if spec.brute_force and not spec.public_tree else tree_face
-    divides, fused = spec.polarised and spec.port is None, _fused_axes(spec, flights)
 
     @wp.func
-    def scattering_density(
-        request: Request,
-        x: wp.vec3,
-        v: wp.vec3,
-        way: wp.vec3,
-        distance: float,
-        medium: Medium,
-        layers: Layers,
-        surfaces: Surfaces,
-    ) -> float:
+    def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
         scattering = float(0.0)
         on_surface = False
         if wp.static(has_mesh):
             on_surface = request.slot >= 0
             if on_surface:
-                face, normal = face_at(surfaces, request.slot, request.u)
+                face, normal = face_at(world.surfaces, request.slot, request.u)
                 cos_out = wp.max(wp.dot(v, normal), 0.0)
-                scattering = lambert_brdf(reflectance_at(surfaces, face, x)) * cos_out
+                scattering = lambert_brdf(reflectance_at(world.surfaces, face, x)) * cos_out
                 if wp.static(specular):
-                    scattering += (
-                        surfaces.specular[face] * ggx_brdf(request.u, v, normal, surfaces.roughness[face]) * cos_out
-                    )
+                    lobe = ggx_brdf(request.u, v, normal, world.surfaces.roughness[face])
+                    scattering += world.surfaces.specular[face] * lobe * cos_out
         if not on_surface:
-            snapped = snap_from(request.u, medium.axis_threshold)
-            if wp.static(divides):
-                quotient, to = set_apart(way) / distance, set_apart(v)
-                for axis in range(wp.static(fused)):
-                    to[axis] = quotient[axis]
-                scattering = phase_pdf(one_minus_cosine(snapped, to), water_at(medium, layers, x))
-            else:
-                scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(medium, layers, x))
+            snapped = snap_from(request.u, world.medium.axis_threshold)
+            scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(world.medium, world.layers, x))
         return scattering
 
     return scattering_density
@@ -293,53 +370,54 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
 @made_once
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored`` of next events.
+    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    confocal, reflecting, merged, polarised = spec.confocal, spec.reflecting, spec.merged, spec.polarised
+    confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
     water_extinction, collides = spec.water.extinction, flights and takes_collisions(spec)
     image_of = spec.lens.image or spec.lens.project
-    flight_point, scattering_density = make_flight_point(spec), make_scattering(spec, flights)
+    flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of = make_link(spec)
-    in_water = spec.port is None
+    rider = make_rider(spec)
+    rides, (_begin, fork, fly, event, _mirror, deliver) = rider is not NOTHING, rider
 
     @wp.func
-    def score(
-        request: Request,
-        medium: Medium,
-        layers: Layers,
-        camera: Camera,
-        gate: Gate,
-        surfaces: Surfaces,
-        scan: Scan,
-    ) -> Scored:
+    def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
+        carried = request.carried
+        fork(carried, world)
+        fly(carried, world, request.x, request.u, wp.length(found.origin - request.x))
+        event(carried, world, request.slot, found.origin, request.u, link.to_lens)
+        fly(carried, world, found.origin, link.to_lens, link.water)
+        deliver(found.contribution, carried, world, link.end, link.to_lens, wp.normalize(inside))
+
+    @wp.func
+    def score(request: Request, world: wp.ref[World]) -> Scored:
         found = Scored()
         found.contribution.rounding_sample = u01(request.rounding_sample)
         found.origin = request.x
         weight = float(request.weight)
         path = float(request.path)
         ahead = float(0.0)
-        found.lens = lens_point(camera, u01_high(request.first), u01_low(request.first))
+        lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
         if wp.static(flights):
             if wp.static(reflecting):
                 if request.interval[0] >= request.interval[1] and request.slot < 0:
                     return found  # an event in the water, for its reflections alone
             if request.interval[0] < request.interval[1]:
-                found.lens = request.lens
-                point = flight_point(request, medium, layers, camera)
+                lens = request.lens
+                point = flight_point(request, world)
                 found.origin = point.x
                 weight = point.weight
                 path = point.path
                 ahead = point.ahead
-        view = camera.view
+        view = world.camera.view
         if wp.static(confocal):
-            view = scan.view[request.target]
-        link = link_to(camera, found.origin, found.lens)
-        pixel = image_of(camera, view, request.target, link.image, found.lens)
-        scattering = scattering_density(
-            request, found.origin, link.to_lens, found.lens - found.origin, link.water, medium, layers, surfaces
-        )
+            view = world.scan.view[request.target]
+        link = link_to(world.camera, found.origin, lens)
+        found.lens = link.end
+        pixel = image_of(world.camera, view, request.target, link.image, lens)
+        scattering = scattering_density(request, found.origin, link.to_lens, world)
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
             if wp.static(collides):
@@ -349,21 +427,18 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                     begin = wp.where(ahead > 0.0, request.x, found.origin)
                     u = wp.where(ahead > 0.0, request.u, link.to_lens)
                     length = wp.where(ahead > 0.0, ahead, link.water)
-                    extinction = water_extinction(medium, layers, begin, u, length, seed)
+                    extinction = water_extinction(world.medium, world.layers, begin, u, length, seed)
                     weight *= wp.where(ahead > 0.0, wp.exp(-extinction * ahead), 1.0)
                     seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
             else:
-                extinction = water_extinction(medium, layers, found.origin, link.to_lens, link.water, seed)
+                extinction = water_extinction(world.medium, world.layers, found.origin, link.to_lens, link.water, seed)
             component = wp.where(wp.static(merged), BALLISTIC, request.component)
-            found.contribution.value = value_of(camera, extinction, weight, scattering, link)
-            found.contribution.index = tally_index(camera, gate, pixel, path + link.path, component)
-        if wp.static(polarised):
-            found.inside = set_apart(found.lens) - set_apart(link.image)
-            found.to_lens = link.to_lens
-            if wp.static(in_water):
-                found.to_lens = wp.normalize(found.inside)
-        found.lens = link.end
+            found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)
+            found.contribution.index = tally_index(world.camera, world.gate, pixel, path + link.path, component)
+            if wp.static(rides):
+                if found.contribution.value > 0.0:
+                    carry(found, request, link, world, lens - link.image)
         return found
 
     return score

@@ -42,21 +42,22 @@ class Estimator(NamedTuple):
     """What a photon adds to the histogram, as Warp functions made for a spec; None for what the estimator does without.
 
     Every function may be any mixture of physics and chance as long as the expectation of the histogram is that of the
-    analog walk. They take the state of the photon, `PhotonState`, and return a small struct; the kernel alone changes
-    the state.
+    analog walk. They take the state of the photon and the world by reference and return a small struct; the stages
+    alone change the state.
 
     Attributes:
         max_registers: Registers of a CUDA thread, without and with a BVH: fewer spill, more leave too few warps to hide
             latency.
-        cross: ``(s, camera, gate, limits) -> Contribution``, what the photon itself brings on the flight that ends in
+        cross: ``(s, world) -> Contribution``, what the photon itself brings on the flight that ends in
             its event; needs no shadow ray.
-        plan_flight: ``(s, block, medium, camera, gate, limits) -> FlightPlan``, before a flight is traced;
+        plan_flight: ``(s, block, world) -> FlightPlan``, before a flight is traced;
             `block`: random words, the third and fourth for the lens.
         request_flight: ``(s) -> Request``, the score of a flight whose planned interval is not empty.
-        request_event: ``(s, camera) -> Request``, the score of the event that the photon has come to.
-        score: ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored``; needed with either request.
-        direct: ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``, instead of
-            the phase function and the surface's law; `reflected` is the draw of a rough specular surface.
+        request_event: ``(s, world) -> Request``, the score of the event that the photon has come to.
+        score: ``(request, world) -> Scored``; needed with either request. It delivers what rides along,
+            see `Rider`.
+        direct: ``(s, reflected, lobe, world, id) -> Direction``, instead of the phase function and the surface's law;
+            `reflected` is the draw of a rough specular surface.
     """
 
     max_registers: tuple[int, int] = (64, 64)

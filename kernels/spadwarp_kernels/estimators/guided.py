@@ -8,18 +8,20 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
-from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.riders.rider import NOTHING
+from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
 from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.limits import Limits, exit_distance, exit_distance_rotated
+from spadwarp_kernels.water.limits import exit_distance, exit_distance_rotated
 from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
@@ -30,10 +32,9 @@ from spadwarp_kernels.water.phase_functions import (
     sample_henyey_greenstein,
 )
 
-from .contribution import Request, make_event_request, make_score, scores_collision, takes_collisions
+from .contribution import make_event_request, make_score, make_toward, scores_collision, takes_collisions
 from .estimator import Direction, Estimator, FlightPlan
 from .flight_sampling import make_sample_lens
-from .link import make_toward
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
@@ -70,24 +71,22 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     sample_lens = make_sample_lens(spec.port)
 
     @wp.func
-    def plan_flight(
-        s: PhotonState, block: wp.vec4ui, medium: Medium, camera: Camera, gate: Gate, limits: Limits
-    ) -> FlightPlan:
+    def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
         plan = FlightPlan()
         if wp.static(has_phase_guide):
             # The direction was drawn for this point, see `make_direct`.
-            plan.lens = lens_point(camera, u01(block[2]), u01(block[3]))
+            plan.lens = lens_point(world.camera, u01(block[2]), u01(block[3]))
             plan.lens_weight = 1.0
         else:
-            lens = sample_lens(camera, s.x, s.u, u01(block[2]), u01(block[3]))
+            lens = sample_lens(world.camera, s.x, s.u, u01(block[2]), u01(block[3]))
             plan.lens = lens.point
             plan.lens_weight = lens.weight
-        limit = limits.max_path - s.path
+        limit = world.limits.max_path - s.path
         if wp.static(bounded):
-            limit = wp.min(limit, to_exit(limits, s.x, s.u))
-        plan.interval = clip_to_view(camera, view_of(camera, s.view), s.x, s.u, plan.lens, limit)
-        plan.interval = clip_to_gate(camera, gate, s.x, s.u, s.path, plan.lens, plan.interval)
-        if not (wp.static(varies) or medium.extinction > 0.0):
+            limit = wp.min(limit, to_exit(world.limits, s.x, s.u))
+        plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), s.x, s.u, plan.lens, limit)
+        plan.interval = clip_to_gate(world.camera, world.gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        if not (wp.static(varies) or world.medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
 
@@ -107,12 +106,12 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, derives, polarised = spec.varies and not spec.random_albedo, bool(spec.derivatives), spec.polarised
+    local_albedo, rides = spec.varies and not spec.random_albedo, make_rider(spec) is not NOTHING
     collides = takes_collisions(spec)
     spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
     @wp.func
-    def request_flight(s: PhotonState) -> Request:
+    def request_flight(s: wp.ref[PhotonState]) -> Request:
         q = Request()
         q.wanted = True
         q.x = s.x
@@ -145,10 +144,8 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
         q.slot = -1
         q.target = s.target
-        if wp.static(derives):
-            q.scores = s.scores
-        if wp.static(polarised):
-            q.stokes = s.stokes
+        if wp.static(rides):
+            q.carried = s.carried
         return q
 
     return request_flight, make_event_request(spec, flights=True)
@@ -258,40 +255,31 @@ def make_direct(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def direct(
-        s: PhotonState,
-        reflected: wp.vec3,
-        lobe: float,
-        medium: Medium,
-        layers: Layers,
-        camera: Camera,
-        surfaces: Surfaces,
-        guiding: Guiding,
-        keys: RoundKeys,
-        id: wp.uint64,
+        s: wp.ref[PhotonState], reflected: wp.vec3, lobe: float, world: wp.ref[World], id: wp.uint64
     ) -> Direction:
         new = Direction()
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
-        here = water_at(medium, layers, s.x)
+        here = water_at(world.medium, world.layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
-        extinction = extinction_at(here, on_surface, medium, layers, s.x)
-        at_surface = guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
-        to_lens_chance = wp.where(on_surface, at_surface, lens_chance(s.u, guiding))
+        extinction = extinction_at(here, on_surface, world.medium, world.layers, s.x)
+        at_surface = world.guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
+        to_lens_chance = wp.where(on_surface, at_surface, lens_chance(s.u, world.guiding))
         met = s.surface_count + wp.where(on_surface, 1, 0)
-        snapped = snap_from(s.u, medium.axis_threshold)
-        v = toward_centre(camera, s.x)
+        snapped = snap_from(s.u, world.medium.axis_threshold)
+        v = toward_centre(world.camera, s.x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
             # not have a peak narrower than the lens.
-            ahead = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-            v = toward(camera, s.x, lens_point(camera, u01(ahead[2]), u01(ahead[3])))
-        view = view_of(camera, s.view)
+            ahead = random_block_keyed(world.keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
+            v = toward(world.camera, s.x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
+        view = view_of(world.camera, s.view)
         way = toward_middle(view, s.x)
         to_axis = wp.vec3()
         to_view_chance = float(0.0)
-        if wp.dot(way, way) > 0.0 and not in_view(camera, view, s.x):
-            to_view_chance = guiding.return_probability
+        if wp.dot(way, way) > 0.0 and not in_view(world.camera, view, s.x):
+            to_view_chance = world.guiding.return_probability
             way *= 1.0 / wp.length(way)
             to_axis = wp.vec3(way[0], way[1], 0.0)
         part = guided_part(s.weight.value, s.analog_weight, met, to_lens_chance + to_view_chance)
@@ -302,7 +290,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         directed = choice < to_lens_chance + to_view_chance
         axis = wp.where(on_surface, s.hit.normal, snapped)
         axis = wp.where(to_lens, v, wp.where(directed, to_axis, axis))
-        t = sample_angle(s.flight.block[1], to_lens, directed, here, medium, guiding)
+        t = sample_angle(s.flight.block[1], to_lens, directed, here, world.medium, world.guiding)
         # Selected rather than branched to, so that what is left out stays in no register.
         if wp.static(has_mesh):
             t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
@@ -315,10 +303,12 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             density = wp.where(on_surface, wp.max(wp.dot(new.u, s.hit.normal), 0.0) * 0.3183098861837907, density)
         if wp.static(specular):
             if on_surface:
-                density = reflection_pdf(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], lobe)
+                density = reflection_pdf(s.u, new.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
-        mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), medium, guiding)
-        mixture += to_view_chance * henyey_greenstein_pdf(one_minus_cosine(to_axis, new.u), guiding.return_anisotropy)
+        mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), world.medium, world.guiding)
+        mixture += to_view_chance * henyey_greenstein_pdf(
+            one_minus_cosine(to_axis, new.u), world.guiding.return_anisotropy
+        )
         new.factor = density / wp.max(mixture, 1.0e-30)
         return new
 

@@ -6,12 +6,28 @@ from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 
 from .analog import make_analog
+from .contribution import make_event_request, make_score
 from .estimator import Estimator
 from .guided import make_guided
-from .next_event import make_next_event
-from .none import make_none
 
 __all__ = ["ESTIMATORS"]
+
+
+def make_none(spec: TransportSpec) -> Estimator:
+    """Scores nothing."""
+    return Estimator(max_registers=(56, 64))
+
+
+def make_next_event(spec: TransportSpec) -> Estimator:
+    """A contribution from every collision and surface, by way of a uniform point of the lens."""
+    # In a tree, 72 keep more warps ready while others wait for nodes of a large mesh.
+    in_tree = 80 if spec.derivatives or spec.grid is not None else 72
+    return Estimator(
+        max_registers=(96, 96) if spec.polarised else (64, in_tree),
+        request_event=make_event_request(spec),
+        score=make_score(spec),
+    )
+
 
 ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
     "none": make_none,

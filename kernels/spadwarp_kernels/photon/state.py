@@ -3,12 +3,12 @@
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_device, check_integer
-from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
-from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
-from spadwarp_kernels.tally.tally import Contribution, Scores
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.tally.tally import Contribution, LogDerivatives
+
+from .sink import Account, Weight
+from .world import World
 
 __all__ = ["Records", "make_records"]
 
@@ -21,48 +21,18 @@ NO_RAY, SURFACE_RAY, SHADOW_RAY = (wp.constant(i) for i in range(3))
 
 
 @wp.struct
-class Weight:
-    """The weight of a photon, and its account.
+class Carried:
+    """What rides along with light beside its weight, see `riders`.
 
     Attributes:
-        value: Fraction of the photon that is left.
-        taken: By which the last change lowered it, in ledger units.
-        absorbed_water: Sum over the thread's photons, in ledger units: what they had, less what was left and what
-            `give` gave. It is what water took once the thread's other sums for the ledger are subtracted, at its end.
+        log_derivatives: Of what the light has met, by the parameters of the spec; 0 without them.
+        stokes: Of the light, of weight 1 when it was emitted, with respect to `orthonormal_basis` of its direction.
+        half: Of `Blocks.memory`: 0 for the history of a photon, 1 for a contribution.
     """
 
-    value: float
-    taken: wp.int64
-    absorbed_water: wp.int64
-
-
-@wp.func
-def reweigh(w: Weight, factor: float) -> Weight:
-    """The weight times a factor.
-
-    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
-    one of the thread's sums for the ledger, or to be given by `give`.
-    """
-    before = to_ledger(w.value)
-    w.value *= factor
-    w.taken = before - to_ledger(w.value)
-    return w
-
-
-@wp.func
-def give(w: Weight, ledger: wp.array(dtype=wp.int64), thread: int, entry: int) -> Weight:
-    """What the last change has taken goes to an entry of the ledger."""
-    add_to_ledger(ledger, thread, entry, w.taken)
-    w.absorbed_water -= w.taken
-    return w
-
-
-@wp.func
-def full_weight(w: Weight) -> Weight:
-    """That of a photon that has just been emitted."""
-    w.value = 1.0
-    w.absorbed_water += to_ledger(1.0)
-    return w
+    log_derivatives: LogDerivatives
+    stokes: wp.vec4
+    half: int
 
 
 @wp.struct
@@ -95,11 +65,10 @@ def is_planned(flight: Flight) -> bool:
 
 
 @wp.func
-def shorten(flight: Flight, distance: float) -> Flight:
-    """The flight up to a surface at a distance [m]."""
+def shorten(flight: wp.ref[Flight], distance: float):
+    """Ends the flight at a surface at a distance [m]."""
     flight.distance = wp.min(flight.distance, distance)
     flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
-    return flight
 
 
 @wp.struct
@@ -122,36 +91,19 @@ class Bounces:
 
 
 @wp.func
-def next_bounce(b: Bounces, face: int) -> Bounces:
+def next_bounce(b: wp.ref[Bounces], face: int):
     """After the photon has come to a face, or to another event (0)."""
     b.face = face
     b.leg = wp.where(face > 0, b.leg + 1, 0)
     b.count += wp.where(face > 0, 1, 0)
-    return b
 
 
 @wp.func
-def sum_bounces(b: Bounces) -> Bounces:
+def sum_bounces(b: wp.ref[Bounces]):
     """After the photon has ended, for the next."""
     b.total += b.count
     b.count = 0
     b.leg = 0
-    return b
-
-
-@wp.struct
-class Turn:
-    """What the lanes of a warp count in a turn of its loop; a struct for the reason of `PhotonState`.
-
-    Attributes:
-        done: Lanes for which no photons are left.
-        waiting: Lanes that wait for a ray or, where there are none, for nothing but the others.
-        enough: Requests in the queue that are to be scored: 32 or, when no photons are left, any.
-    """
-
-    done: int
-    waiting: int
-    enough: int
 
 
 @wp.struct
@@ -172,9 +124,7 @@ class PhotonState:
         collisions, surface_count: Events so far, and those at surfaces.
         reason: Ledger entry of the history's end; -1 after an event that is not the last.
         bounces: Reflections by faces of the domain, which `collisions` counts too.
-        scores: Of the flights and events so far; 0 without derivatives.
-        stokes: Of its light, of weight 1 when it was emitted, with respect to `orthonormal_basis(u)`; left alone unless
-            it is polarised.
+        carried: What rides along.
         target: Pixel that a scan scores the photon in, else -1.
         view: Tangents (left, top, right, bottom) of what it may be seen in.
         flight: To the next event.
@@ -184,7 +134,7 @@ class PhotonState:
         walk: Of the ray down the tree.
         hidden: Whether a contribution, of any photon, waits for its shadow ray.
         pending, origin, lens: That contribution, the scored point, and the point to which the ray leads [m].
-        pending_add: On the CPU the voxel and value that are still to be added, see `add_pending`.
+        account: Of the thread.
         absorbed_surface, directed: Sums for the ledger, in its units.
         water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
     """
@@ -203,8 +153,7 @@ class PhotonState:
     surface_count: int
     reason: int
     bounces: Bounces
-    scores: Scores
-    stokes: wp.vec4
+    carried: Carried
     target: int
     view: wp.vec4
     # Its next event:
@@ -218,8 +167,8 @@ class PhotonState:
     pending: Contribution
     origin: wp.vec3
     lens: wp.vec3
-    pending_add: wp.vec2l
     # Sums for the ledger, and counters:
+    account: Account
     absorbed_surface: wp.int64
     directed: wp.int64
     water_collisions: int
@@ -230,14 +179,15 @@ class PhotonState:
 
 
 @wp.func
-def first_state(medium: Medium, camera: Camera) -> PhotonState:
+def first_state(world: wp.ref[World], slot: int) -> PhotonState:
     """A thread before its first photon."""
     s = PhotonState()
     s.stage = START
+    s.account.slot = slot
     s.first = -1
     s.taken = 32
-    s.albedo = medium.albedo
-    s.view = camera.view
+    s.albedo = world.medium.albedo
+    s.view = world.camera.view
     s.target = -1
     s.walk.node = NO_NODE
     return s
@@ -257,7 +207,7 @@ class Records:
         path: Geometric path [m].
         collisions: Events, surfaces included.
         reason: Ledger entry that took the rest of the weight.
-        scores: Derivatives of the logarithm of what the history has met, [photons, derivatives]; empty without them.
+        log_derivatives: Of what the history has met, [photons, derivatives]; empty without them.
     """
 
     position: wp.array(dtype=wp.vec3)
@@ -266,11 +216,11 @@ class Records:
     path: wp.array(dtype=float)
     collisions: wp.array(dtype=int)
     reason: wp.array(dtype=int)
-    scores: wp.array2d(dtype=float)
+    log_derivatives: wp.array2d(dtype=float)
 
 
 def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int = 0) -> Records:
-    """Room for the terminal states of `count` photons, and so many scores each; raises `ArgumentError` for negative
+    """Room for the terminal states of `count` photons, with so many derivatives; raises `ArgumentError` for negative
     numbers."""
     count, derivatives = check_integer("count", count, 0), check_integer("derivatives", derivatives, 0)
     device = check_device("device", device)
@@ -281,5 +231,5 @@ def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int =
     records.path = wp.zeros(count, dtype=float, device=device)
     records.collisions = wp.zeros(count, dtype=int, device=device)
     records.reason = wp.zeros(count, dtype=int, device=device)
-    records.scores = wp.zeros((count, derivatives), dtype=float, device=device)
+    records.log_derivatives = wp.zeros((count, derivatives), dtype=float, device=device)
     return records

@@ -1,8 +1,1 @@
-"""What rides along with a photon: derivatives, those of blocks of cells, polarisation."""
-
-from typing import TYPE_CHECKING
-
-from .polarisation import *
-
-if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = polarisation.__all__
+"""What rides along with light: derivatives, those of blocks of cells, polarisation."""

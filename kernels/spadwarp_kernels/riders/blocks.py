@@ -10,34 +10,16 @@ the contribution that is scored, until it is added or, behind a surface, forgott
 that the thread keeps a list of them.
 """
 
-from typing import NamedTuple
-
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import Carried
+from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry, score_entry
-from spadwarp_kernels.tally.scores import Derivatives
-from spadwarp_kernels.tally.tally import Scores
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.medium import Medium
 
-from .derivatives import make_flight_scores
-
-
-class BlockScores(NamedTuple):
-    """What becomes of the scores of blocks, as Warp functions; `half`: 0 for the history, 1 for what is scored.
-
-    Attributes:
-        fly: ``(blocks, half, x, u, length)``, a way in the water.
-        turn: ``(blocks, half, medium, layers, x)``, a scattering in the water at x.
-        copy: ``(blocks)``, the history's to what is scored.
-    """
-
-    fly: wp.Function
-    turn: wp.Function
-    copy: wp.Function
+from .rider import NOTHING, Rider
 
 
 @wp.func
@@ -65,25 +47,32 @@ def _make_meet(kinds: int) -> wp.Function:
 
 
 @made_once
-def make_block_scores(spec: TransportSpec) -> BlockScores | None:
-    """Of a spec with blocks."""
-    if not spec.blocks:
-        return None
+def make_blocks_rider(spec: TransportSpec) -> Rider:
+    """Of the blocks of a spec."""
     kinds = len(spec.blocks)
 
     @wp.func
-    def copy(blocks: Blocks):
+    def begin(
+        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
+    ):
+        c.half = 0
+        _forget(world.derivatives.blocks, 0)
+
+    @wp.func
+    def fork(c: wp.ref[Carried], world: wp.ref[World]):
+        blocks = world.derivatives.blocks
         _forget(blocks, 1)
         count = met_count(blocks, 0)
         for i in range(count):
             block = blocks.memory[met_entry(blocks, 0, i)]
             blocks.memory[met_entry(blocks, 1, i)] = block
             for q in range(wp.static(kinds)):
-                score = blocks.memory[score_entry(blocks, 0, q, int(block))]
-                blocks.memory[score_entry(blocks, 1, q, int(block))] = score
+                value = blocks.memory[score_entry(blocks, 0, q, int(block))]
+                blocks.memory[score_entry(blocks, 1, q, int(block))] = value
         blocks.memory[met_entry(blocks, 1, blocks.count)] = float(count)
+        c.half = 1
 
-    return BlockScores(_make_fly(kinds), _make_turn(spec), copy)
+    return NOTHING._replace(begin=begin, fork=fork, fly=_make_fly(kinds), event=_make_event(spec))
 
 
 def _make_fly(kinds: int) -> wp.Function:
@@ -97,19 +86,20 @@ def _make_fly(kinds: int) -> wp.Function:
             blocks.memory[entry] = blocks.memory[entry] + value
 
     @wp.func
-    def fly(blocks: Blocks, half: int, x: wp.vec3, u: wp.vec3, length: float):
+    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+        blocks = world.derivatives.blocks
         line = grid_line(blocks.grid, x, u, length)
         if line.begin < line.end:
             place = first_place(line, blocks.grid.size)
             while place.leave < line.end:
-                add(blocks, half, place.cell, place.t - place.leave)
+                add(blocks, c.half, place.cell, place.t - place.leave)
                 place = next_place(line, place)
-            add(blocks, half, place.cell, place.t - line.end)
+            add(blocks, c.half, place.cell, place.t - line.end)
 
     return fly
 
 
-def _make_turn(spec: TransportSpec) -> wp.Function:
+def _make_event(spec: TransportSpec) -> wp.Function:
     kinds, water_at, meet = len(spec.blocks), spec.water.at, _make_meet(len(spec.blocks))
     # Bits, since a `wp.static` that reads the index of a loop does not enter the hash of Warp's kernel cache.
     by_scattering, by_extinction = (
@@ -117,11 +107,12 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
     )
 
     @wp.func
-    def turn(blocks: Blocks, half: int, medium: Medium, layers: Layers, x: wp.vec3):
+    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        blocks = world.derivatives.blocks
         block = grid_cell(blocks.grid, x)
-        if block >= 0:
-            meet(blocks, half, block)
-            water = water_at(medium, layers, x)
+        if slot < 0 and block >= 0:
+            meet(blocks, c.half, block)
+            water = water_at(world.medium, world.layers, x)
             for q in range(wp.static(kinds)):
                 coefficient = float(0.0)
                 if (wp.static(by_scattering) >> q) & 1 == 1:
@@ -129,39 +120,7 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
                 if (wp.static(by_extinction) >> q) & 1 == 1:
                     coefficient = water.extinction
                 if coefficient > 0.0:
-                    entry = score_entry(blocks, half, q, block)
+                    entry = score_entry(blocks, c.half, q, block)
                     blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
 
-    return turn
-
-
-@made_once
-def make_begin_history(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(derivatives) -> Scores`` of a photon that has met nothing; of blocks too."""
-    in_blocks = bool(spec.blocks)
-
-    @wp.func
-    def begin_history(derivatives: Derivatives) -> Scores:
-        if wp.static(in_blocks):
-            _forget(derivatives.blocks, 0)
-        return Scores()
-
-    return begin_history
-
-
-@made_once
-def make_fly_history(spec: TransportSpec) -> wp.Function:
-    """The Warp function of `make_flight_scores`, for a flight of the photon itself: of blocks too."""
-    flight_scores, by_block = make_flight_scores(spec), make_block_scores(spec)
-    if by_block is None:
-        return flight_scores
-    fly = by_block.fly
-
-    @wp.func
-    def fly_history(
-        scores: Scores, derivatives: Derivatives, layers: Layers, x: wp.vec3, u: wp.vec3, length: float
-    ) -> Scores:
-        fly(derivatives.blocks, 0, x, u, length)
-        return flight_scores(scores, derivatives, layers, x, u, length)
-
-    return fly_history
+    return event

@@ -7,27 +7,20 @@ e2 = e1 x u: Q = <E1^2> - <E2^2>, U = 2 <E1 E2>; V > 0 is right circular, clockw
 is turned by an angle a from e1 towards e2 gives Q' = Q cos 2a + U sin 2a and U' = -Q sin 2a + U cos 2a.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
-
-import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_items, check_number, check_numbers
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.laser import Laser, Scan, beam_frame
+from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port, PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.photon.state import Carried
+from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.tally.tally import Contribution
 
-__all__ = ["MATRIX_POINTS", "MOST_CHANNELS", "Polarisation", "make_polarisation", "matrix_cosines"]
+from .rider import NOTHING, Rider
 
 
 @wp.struct
@@ -188,264 +181,96 @@ def make_port_elements(port: PortKind | None) -> wp.Function | None:
     return port_elements
 
 
-# ---- What a receiver takes of the light that comes to the lens.
+# ---- The light of a photon, from the laser to the receiver.
 
 
 @made_once
-def make_leave_water(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(camera, stokes, x, u, inside) -> vec4`` of light at x in the water along u that arrives at
-    the lens along `inside`: what a port does to it."""
-    has_port = spec.port is not None
-    elements = make_port_elements(spec.port)
+def make_polarisation_rider(spec: TransportSpec) -> Rider:
+    """The Stokes vector of a polarised spec."""
+    return NOTHING._replace(
+        begin=_make_begin(spec), event=_make_event(spec), mirror=_mirror, deliver=_make_deliver(spec)
+    )
+
+
+def _make_begin(spec: TransportSpec) -> wp.Function:
+    """A beam's field on its axis is turned to the direction of each photon by the smallest rotation."""
+    confocal, has_port = spec.confocal, spec.laser_port is not None
+    elements = make_port_elements(spec.laser_port)
 
     @wp.func
-    def leave_water(camera: Camera, stokes: wp.vec4, x: wp.vec3, u: wp.vec3, inside: wp.vec3) -> wp.vec4:
+    def begin(
+        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
+    ):
+        axis = world.laser.axis
+        if wp.static(confocal):
+            axis = world.scan.axis[target]
+        axis = set_apart(axis)
+        right, _down = beam_frame(axis)
+        heading = set_apart(wp.spatial_bottom(emitted))
+        stokes = transport_stokes(stokes_from(world.polarisation.laser, right, axis), axis, heading)
         if wp.static(has_port):
-            before = set_apart(u)
-            return turn_stokes(stokes, before, set_apart(inside), elements(camera.port, set_apart(x), before))
-        return stokes
+            leaving = set_apart(u)
+            stokes = turn_stokes(stokes, heading, leaving, elements(world.laser.port, set_apart(x), leaving))
+        c.stokes = stokes
 
-    return leave_water
-
-
-@made_once
-def make_receive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(stokes, u) -> vec4`` of light that arrives at the lens along u: with respect to the image's
-    x, to which the lens turns all light by the smallest rotation to the optical axis."""
-    channels = spec.channels
-
-    @wp.func
-    def receive(stokes: wp.vec4, u: wp.vec3) -> wp.vec4:
-        if wp.static(channels == 0):
-            return stokes
-        return transport_stokes(stokes, set_apart(u), wp.vec3(0.0, 0.0, -1.0))
-
-    return receive
+    return begin
 
 
-@made_once
-def make_add_channels(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(contribution, polarisation, stokes) -> Contribution``: its value times I, and what the
-    channels take, over that, as scores."""
-    channels = spec.channels
-
-    @wp.func
-    def add_channels(c: Contribution, polarisation: Polarisation, stokes: wp.vec4) -> Contribution:
-        c.value *= stokes[0]
-        for k in range(wp.static(channels)):
-            c.scores[k] = wp.dot(polarisation.channels[k], stokes) / wp.max(stokes[0], 1.0e-30)
-        return c
-
-    return add_channels
-
-
-# ---- What polarised light depends on: the laser's state, the scattering matrix of the water, facets, and the receiver.
-
-
-# Points of the tables of a scattering matrix; an odd number.
-MATRIX_POINTS = 1025
-
-MOST_CHANNELS = 3
-
-Channels = wp.types.matrix(shape=(3, 4), dtype=float)
-
-
-@wp.struct
-class Polarisation:
-    """Parameters of a polarised spec, made by `make_polarisation`.
-
-    Attributes:
-        laser: Stokes vector of the beam on its axis, I = 1, with respect to the right of `beam_frame`.
-        first, last: Tables of m12, m22, m33, m34 and of m44 at `matrix_cosines`, see `Elements`.
-        channels: A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to
-            the image's x, so that U is light at 45 degrees from x towards y less that at 135.
-        facet_index: Index of each face's specular facets over that of the water; empty without a specular lobe.
-    """
-
-    laser: wp.vec4
-    first: wp.array(dtype=wp.vec4)
-    last: wp.array(dtype=float)
-    channels: Channels
-    facet_index: wp.array(dtype=float)
-
-
-def matrix_cosines() -> NDArray[np.float64]:
-    """Cosines of the scattering angle at which a matrix is tabulated, `[MATRIX_POINTS]`: from forward, in equal steps
-    of sin(theta/2), to 90 degrees, and on in equal steps of cos(theta/2) to backward; 0.16 degrees apart at both ends.
-    """
-    s = np.linspace(0.0, 1.0, (MATRIX_POINTS + 1) // 2)
-    return np.concatenate([1.0 - s * s, (s * s - 1.0)[-2::-1]])
-
-
-def make_polarisation(
-    *,
-    laser: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-    matrix: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
-    channels: Sequence[Sequence[float]] = (),
-    facet_index: ArrayLike = (),
-    device: wp.DeviceLike = None,
-) -> Polarisation:
-    """Parameters of polarised light, for `Model.polarisation`.
-
-    Args:
-        laser: Stokes vector of the emitted light, I = 1, see `Polarisation`.
-        matrix: Of cosines `[n]` of the scattering angle; returns `[n, 5]`: m12, m22, m33, m34 and m44 over m11, see
-            `Elements`. None: light keeps its polarisation as it is turned.
-        channels: Up to MOST_CHANNELS rows of four numbers; as many as the spec has.
-        facet_index: Of each face, > 0; one number for each, or nothing.
-
-    Raises:
-        ArgumentError: Numbers that no light and no matrix can have.
-    """
-    device = check_device("device", device)
-    polarisation = Polarisation()
-    polarisation.laser = wp.vec4(*check_stokes("laser", laser))
-    cosines = matrix_cosines()
-    table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
-    if not (matrix is None or callable(matrix)):
-        raise ArgumentError(f"matrix = {matrix!r} is not a function of cosines")
-    if matrix is not None:
-        table = check_numbers("matrix", matrix(cosines))
-    if table.shape != (cosines.size, 5):
-        raise ArgumentError(f"matrix gives {table.shape} for {cosines.size} cosines; [cosines, 5] is needed")
-    if not (np.isfinite(table).all() and np.abs(table).max() <= 1.0 + 1e-6):
-        raise ArgumentError("matrix holds elements that are not finite or beyond m11: outside [-1, 1]")
-    polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
-    polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
-    given = [check_items(f"channels[{k}]", row) for k, row in enumerate(check_items("channels", channels))]
-    if len(given) > MOST_CHANNELS or any(len(row) != 4 for row in given):
-        raise ArgumentError(f"channels are not up to {MOST_CHANNELS} rows of 4 numbers")
-    rows = np.zeros((MOST_CHANNELS, 4))
-    for k, row in enumerate(given):
-        rows[k] = [check_number(f"channels[{k}]", one, "[-1, 1]") for one in row]
-    polarisation.channels = Channels(*rows.ravel().tolist())
-    facets = np.ravel(check_numbers("facet_index", facet_index))
-    if facets.size and not (np.isfinite(facets).all() and facets.min() > 0.0):
-        raise ArgumentError("facet_index holds numbers outside (0, inf)")
-    polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)
-    return polarisation
-
-
-def check_stokes(name: str, stokes: Any) -> list[float]:
-    """Four numbers of light with I = 1 that is polarised by 1 at most; raises `ArgumentError`."""
-    found = check_numbers(name, stokes)
-    if found.shape != (4,) or not np.isfinite(found).all() or found[0] != 1.0:
-        raise ArgumentError(f"{name} = {stokes!r} is not a Stokes vector with I = 1")
-    if float(np.linalg.norm(found[1:])) > 1.0 + 1e-6:
-        raise ArgumentError(f"{name} = {stokes!r} is polarised by more than 1")
-    return [float(value) for value in found]
-
-
-# ---- What events do to a Stokes vector: scattering in the water, surfaces, faces of the domain.
-
-
-@made_once
-def make_event_stokes(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(stokes, polarisation, surfaces, slot, x, u, v) -> vec4`` of light that an event at x has
-    turned from u to v, on the face of a slot of the mesh's tree or (-1) in the water.
-
-    Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the facet
-    between u and v, over its m11; both in proportion to what they send to v.
-    """
+def _make_event(spec: TransportSpec) -> wp.Function:
+    """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
+    facet between u and v, over its m11; both in proportion to what they send to v."""
     has_mesh, specular = spec.mesh, spec.specular
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
 
     @wp.func
-    def surface_stokes(
-        stokes: wp.vec4, polarisation: Polarisation, surfaces: Surfaces, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3
-    ) -> wp.vec4:
+    def on_a_face(stokes: wp.vec4, world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
         left = wp.vec4(stokes[0], 0.0, 0.0, 0.0)
         if wp.static(specular):
-            face = face_in(surfaces.order, slot)
-            normal = face_normal(surfaces.faces, slot, u)
-            lambert = lambert_brdf(reflectance_at(surfaces, face, x))
-            lobe = surfaces.specular[face] * ggx_brdf(u, v, normal, surfaces.roughness[face])
-            turned = turn_stokes(stokes, u, v, facet_elements(u, v, polarisation.facet_index[face]))
+            face = face_in(world.surfaces.order, slot)
+            normal = face_normal(world.surfaces.faces, slot, u)
+            lambert = lambert_brdf(reflectance_at(world.surfaces, face, x))
+            lobe = world.surfaces.specular[face] * ggx_brdf(u, v, normal, world.surfaces.roughness[face])
+            turned = turn_stokes(stokes, u, v, facet_elements(u, v, world.polarisation.facet_index[face]))
             left += (lobe / wp.max(lambert + lobe, 1.0e-30)) * (turned - left)
         return left
 
     @wp.func
-    def event_stokes(
-        stokes: wp.vec4, polarisation: Polarisation, surfaces: Surfaces, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3
-    ) -> wp.vec4:
+    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         before, after = set_apart(u), set_apart(v)
         if wp.static(has_mesh):
             if slot >= 0:
-                return surface_stokes(stokes, polarisation, surfaces, slot, set_apart(x), before, after)
-        m = table_elements(polarisation.first, polarisation.last, one_minus_cosine(before, after))
-        return turn_stokes(stokes, before, after, m)
+                c.stokes = on_a_face(c.stokes, world, slot, set_apart(x), before, after)
+                return
+        m = table_elements(world.polarisation.first, world.polarisation.last, one_minus_cosine(before, after))
+        c.stokes = turn_stokes(c.stokes, before, after, m)
 
-    return event_stokes
-
-
-@made_once
-def make_reflected_stokes() -> wp.Function:
-    """The Warp function ``(stokes, u, v, index) -> vec4`` of light that a smooth boundary mirrors from u to v, for the
-    index behind it over that of the water."""
-
-    @wp.func
-    def reflected_stokes(stokes: wp.vec4, u: wp.vec3, v: wp.vec3, index: float) -> wp.vec4:
-        before, after = set_apart(u), set_apart(v)
-        cosine = wp.sqrt(0.5 * wp.max(1.0 - wp.dot(before, after), 0.0))
-        return turn_stokes(stokes, before, after, fresnel_elements(wp.min(cosine, 1.0), index))
-
-    return reflected_stokes
+    return event
 
 
-# ---- The Stokes vector of a photon that enters the water.
+@wp.func
+def _mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+    before, after = set_apart(u), set_apart(v)
+    cosine = wp.sqrt(0.5 * wp.max(1.0 - wp.dot(before, after), 0.0))
+    c.stokes = turn_stokes(c.stokes, before, after, fresnel_elements(wp.min(cosine, 1.0), index))
 
 
-@made_once
-def make_first_stokes(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(polarisation, laser, scan, target, emitted, x, u) -> vec4`` of a photon that was emitted,
-    see `make_emit`, and is in the water at x on its way along u.
-
-    A beam's field on its axis is turned to the direction of each photon by the smallest rotation.
-    """
-    polarised, confocal, has_port = spec.polarised, spec.confocal, spec.laser_port is not None
-    elements = make_port_elements(spec.laser_port)
+def _make_deliver(spec: TransportSpec) -> wp.Function:
+    """What a port does to the light, and what the receiver takes of it: with respect to the image's x, to which the
+    lens turns all light by the smallest rotation to the optical axis."""
+    channels, has_port, elements = spec.channels, spec.port is not None, make_port_elements(spec.port)
 
     @wp.func
-    def first_stokes(
-        polarisation: Polarisation,
-        laser: Laser,
-        scan: Scan,
-        target: int,
-        emitted: wp.spatial_vector,
-        x: wp.vec3,
-        u: wp.vec3,
-    ) -> wp.vec4:
-        if wp.static(not polarised):
-            return wp.vec4()
-        axis = laser.axis
-        if wp.static(confocal):
-            axis = scan.axis[target]
-        axis = set_apart(axis)
-        right, _down = beam_frame(axis)
-        heading = set_apart(wp.spatial_bottom(emitted))
-        stokes = transport_stokes(stokes_from(polarisation.laser, right, axis), axis, heading)
+    def deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+        stokes = c.stokes
         if wp.static(has_port):
-            leaving = set_apart(u)
-            stokes = turn_stokes(stokes, heading, leaving, elements(laser.port, set_apart(x), leaving))
-        return stokes
+            before = set_apart(u)
+            through = elements(world.camera.port, set_apart(end), before)
+            stokes = turn_stokes(stokes, before, set_apart(inside), through)
+        if wp.static(channels > 0):
+            stokes = transport_stokes(stokes, set_apart(inside), wp.vec3(0.0, 0.0, -1.0))
+        k.value *= stokes[0]
+        for channel in range(wp.static(channels)):
+            taken = wp.dot(world.polarisation.channels[channel], stokes)
+            k.factors[channel] = taken / wp.max(stokes[0], 1.0e-30)
 
-    return first_stokes
-
-
-# ---- The Stokes vector of a photon that enters the aperture itself.
-
-
-@made_once
-def make_crossing_stokes(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, camera) -> vec4`` of a photon whose flight leads to the lens, see `make_receive`."""
-    has_port, leave_water, receive = spec.port is not None, make_leave_water(spec), make_receive(spec)
-    leave = None if spec.port is None else spec.port.leave
-
-    @wp.func
-    def crossing_stokes(s: PhotonState, camera: Camera) -> wp.vec4:
-        inside = s.u
-        if wp.static(has_port):
-            inside = leave(camera.port, s.x, s.u).u
-        return receive(leave_water(camera, s.stokes, s.x, s.u, inside), inside)
-
-    return crossing_stokes
+    return deliver

@@ -1,7 +1,7 @@
 """Derivatives of the histogram: what they are with respect to, and their tallies in fixed point, which have signs.
 
-The derivative of a contribution is the contribution times its score, the derivative of the logarithm of what the light
-has met: flights, scatterings, bounces (the score function or likelihood ratio method; Glynn 1990).
+The derivative of a contribution is the contribution times the derivative of the logarithm of what the light has met:
+flights, scatterings, bounces (the score function or likelihood ratio method; Glynn 1990).
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,9 @@ from spadwarp_kernels.base.arguments import (
     check_numbers,
     check_struct,
 )
-from spadwarp_kernels.base.kernels import made_once
 
-from .blocks import Blocks, met_count, met_entry, score_entry
-from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
-from .tally import DEPOSIT_LIMIT, Contribution, Scores, add_to_words, deposit
+from .blocks import Blocks
+from .tally import LogDerivatives
 
 __all__ = ["DERIVATIVES", "MOST_DERIVATIVES", "Derivatives", "make_derivatives"]
 
@@ -32,7 +30,7 @@ __all__ = ["DERIVATIVES", "MOST_DERIVATIVES", "Derivatives", "make_derivatives"]
 # cosine g of Henyey and Greenstein's phase function, and a reflectance or a factor on one that varies.
 DERIVATIVES = {"absorption": "[0, inf)", "scattering": "(0, inf)", "anisotropy": "(-1, 1)", "reflectance": "(0, inf)"}
 
-MOST_DERIVATIVES = len(Scores())
+MOST_DERIVATIVES = len(LogDerivatives())
 
 
 @wp.struct
@@ -47,8 +45,8 @@ class Derivatives:
         blocks: Of a spec with blocks, from `make_blocks`.
     """
 
-    value: Scores
-    scale: Scores
+    value: LogDerivatives
+    scale: LogDerivatives
     waters: wp.array(dtype=int)
     faces: wp.array(dtype=int)
     blocks: Blocks
@@ -88,8 +86,8 @@ def make_derivatives(
     for p, one in enumerate(scale):
         check_number(f"scale[{p}]", one, "(0, inf)")
     derivatives = Derivatives()
-    derivatives.value = Scores(*value, *[0.0] * (MOST_DERIVATIVES - count))
-    derivatives.scale = Scores(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
+    derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
+    derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     derivatives.waters = _numbers_of_parts("waters", waters, device)
     derivatives.faces = _numbers_of_parts("faces", faces, device)
     if blocks is not None:
@@ -104,63 +102,3 @@ def _numbers_of_parts(name: str, values: Any, device: wp.Device) -> wp.array:
     if whole is None or not np.array_equal(whole, numbers):
         raise ArgumentError(f"{name} holds numbers that are not whole or beyond 2^31")
     return wp.array(whole, dtype=int, device=device, shape=whole.size)
-
-
-@made_once
-def make_deposit(count: int, kinds: int = 0, low_words: bool = False) -> wp.Function:
-    """The Warp function ``(tally, low, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
-    `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many
-    derivatives, and after them of so many kinds of derivatives by block; rounded down after the rounding sample is
-    added, so that the mean is kept. With `low_words`, those of the tally are in `low`."""
-
-    @wp.func
-    def deposit_scored(
-        gradients: wp.array(dtype=wp.int64),
-        ledger: wp.array(dtype=wp.int64),
-        thread: int,
-        index: int,
-        units: float,
-        rounding_sample: float,
-    ):
-        if wp.abs(units) <= DEPOSIT_LIMIT:
-            whole = wp.int64(wp.floor(units + rounding_sample))
-            if whole != wp.int64(0):
-                atomic_add_int64(gradients, index, whole)
-        else:
-            entry = wp.where(wp.abs(units) > DEPOSIT_LIMIT, CLIPPED, INVALID)
-            add_to_ledger(ledger, thread, entry, wp.int64(1))
-
-    @wp.func
-    def deposit_derived(
-        tally: wp.array(dtype=wp.int64),
-        low: wp.array(dtype=wp.uint32),
-        gradients: wp.array(dtype=wp.int64),
-        ledger: wp.array(dtype=wp.int64),
-        pending: wp.vec2l,
-        thread: int,
-        scale: float,
-        derivatives: Derivatives,
-        c: Contribution,
-    ) -> wp.vec2l:
-        if wp.static(count + kinds > 0):
-            if c.index >= 0:
-                blocks = derivatives.blocks
-                width = wp.static(count) + wp.static(kinds) * blocks.count
-                for p in range(wp.static(count)):
-                    units = c.value * c.scores[p] * derivatives.scale[p]
-                    deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
-                if wp.static(kinds > 0):
-                    for i in range(met_count(blocks, 1)):
-                        k = int(blocks.memory[met_entry(blocks, 1, i)])
-                        for q in range(wp.static(kinds)):
-                            units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
-                            p = wp.static(count) + q * blocks.count + k
-                            deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
-        if wp.static(low_words):
-            units = c.value * scale
-            if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
-                add_to_words(tally, low, c.index, wp.int64(units + c.rounding_sample))
-                return pending
-        return deposit(tally, ledger, pending, thread, scale, c)
-
-    return deposit_derived

@@ -7,9 +7,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import BEFORE, Gate, gate_bin
-
-from .ledger import AFTER_GATE, BEFORE_GATE, BELOW_UNIT, CLIPPED, INVALID, OUTSIDE_SHIFT, add_to_ledger
+from spadwarp_kernels.optics.gate import Gate, gate_bin
 
 __all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates", "to_fixed_point"]
 
@@ -18,7 +16,7 @@ COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
 BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
 
 
-Scores = wp.types.vector(length=8, dtype=float)
+LogDerivatives = wp.types.vector(length=8, dtype=float)
 """Derivatives of the logarithm of a photon's light with respect to the parameters of a spec, in its order."""
 
 
@@ -30,13 +28,13 @@ class Contribution:
         value: Fraction of the emitted light; 0 for nothing.
         index: Of the voxel, see `tally_index`.
         rounding_sample: Uniform in [0, 1), see `to_fixed_point`.
-        scores: By which the value is multiplied for its derivatives; 0 without them.
+        factors: By which the value is multiplied for the tallies that have signs: log derivatives, or channels over I.
     """
 
     value: float
     index: int
     rounding_sample: float
-    scores: Scores
+    factors: LogDerivatives
 
 
 # Index of light that has come to the lens by more reflections than count.
@@ -141,39 +139,6 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
     if k < 0:
         return k
     return (component * camera.width * camera.height + pixel) * gate.bins + k
-
-
-@wp.func
-def deposit(
-    tally: wp.array(dtype=wp.int64),
-    ledger: wp.array(dtype=wp.int64),
-    pending: wp.vec2l,
-    thread: int,
-    scale: float,
-    c: Contribution,
-) -> wp.vec2l:
-    """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit.
-
-    Returns what `add_pending` returns, which the next call takes as `pending`.
-    """
-    exact = c.value * scale
-    units = wp.int64(exact + c.rounding_sample)
-    if not exact <= DEPOSIT_LIMIT:
-        add_to_ledger(ledger, thread, wp.where(exact > DEPOSIT_LIMIT, CLIPPED, INVALID), wp.int64(1))
-    elif c.index >= 0:
-        if exact >= 1.0:
-            pending = add_pending(tally, pending, c.index, units)
-        else:
-            if units > wp.int64(0):
-                pending = add_pending(tally, pending, c.index, units)
-            voxels = tally.shape[0] // wp.static(len(COMPONENTS))
-            component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
-            add_to_ledger(ledger, thread, BELOW_UNIT + component, wp.int64(1))
-    else:
-        # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
-        entry = wp.where(c.index == BEFORE, BEFORE_GATE, AFTER_GATE)
-        add_to_ledger(ledger, thread, entry, (units + wp.int64(128)) >> OUTSIDE_SHIFT)
-    return pending
 
 
 # ---- Low words: in a large launch on CUDA the low 32 bits of a tally's voxels are added up in an array of their own.

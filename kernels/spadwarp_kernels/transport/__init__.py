@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from .kernel import *
 from .launch import *
+from .loops import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = kernel.__all__ + launch.__all__
+    __all__ = loops.__all__ + launch.__all__

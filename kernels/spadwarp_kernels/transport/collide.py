@@ -3,15 +3,17 @@
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.photon.lanes import MOST_LEFT
+from spadwarp_kernels.photon.sink import Sink
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
+from spadwarp_kernels.photon.state import END, SCATTER, PhotonState, next_bounce
+from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.riders.rider import NOTHING
+from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import offset_from_surface
 from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
+from spadwarp_kernels.tally.tally import TOO_LONG
 from spadwarp_kernels.water.boundary import face_index
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import (
-    Limits,
     exit_distance,
     exit_distance_rotated,
     exit_face,
@@ -21,7 +23,6 @@ from spadwarp_kernels.water.limits import (
     is_outside,
     is_outside_rotated,
 )
-from spadwarp_kernels.water.medium import Medium
 
 
 @wp.struct
@@ -29,27 +30,26 @@ class Collision:
     """The end of a flight.
 
     Attributes:
-        x: Where the photon is [m]; off the surface by a bound of its rounding error.
         distance: Length of the flight [m].
-        albedo: Of the water there.
         reason: Ledger entry of the limit that ended the history, or of its last event; else -1.
         mirror: Face of the domain that reflects the photon there; else 0.
     """
 
-    x: wp.vec3
     distance: float
-    albedo: float
     reason: int
     mirror: int
 
 
 @made_once
-def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
-    """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
+def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
+
+    `flies_on`: see `make_continues`.
+    """
     has_mesh, reflecting = spec.mesh, spec.reflecting
     bounded = spec.bounded and not reflecting
     local_albedo = spec.varies and not spec.random_albedo
-    water_at = spec.water.at
+    water_at, fly_carried = spec.water.at, make_rider(spec).fly
     to_exit, face_of_exit, exit_of, outside = (
         (exit_distance_rotated, exit_face_rotated, first_exit_rotated, is_outside_rotated)
         if spec.rotated_domain
@@ -57,81 +57,91 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     )
 
     @wp.func
-    def collide(s: PhotonState, medium: Medium, layers: Layers, limits: Limits) -> Collision:
+    def end_of_flight(s: wp.ref[PhotonState], world: wp.ref[World]) -> Collision:
         c = Collision()
         c.distance = s.flight.distance
-        c.albedo = s.albedo
         c.reason = -1
-        limit = limits.max_path - s.path
+        limit = world.limits.max_path - s.path
         if s.flight.distance > limit:
             c.reason = MAX_PATH
             c.distance = limit
         if wp.static(bounded):
-            if outside(limits, s.x + c.distance * s.u):
-                leaves = exit_of(limits, s.x, s.u)
+            if outside(world.limits, s.x + c.distance * s.u):
+                leaves = exit_of(world.limits, s.x, s.u)
                 c.reason = EXIT + leaves.face
                 c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflecting):
             # By distance: a photon that has been reflected may be outside by a rounding error.
-            exit = to_exit(limits, s.x, s.u)
+            exit = to_exit(world.limits, s.x, s.u)
             if exit < c.distance:
                 c.distance = exit
                 c.reason = -1
-                face = face_of_exit(limits, s.x, s.u)
-                if face_index(limits.boundary, face) > 0.0:
+                face = face_of_exit(world.limits, s.x, s.u)
+                if face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:
                     c.reason = EXIT + face
-        c.x = s.x + c.distance * s.u
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
                 if wp.static(reflecting):
                     # The light of the last event ends at the next, or with the longest leg that may be scored.
-                    c.mirror = wp.where(s.bounces.leg < limits.boundary.max_reflections, c.mirror, 0)
+                    c.mirror = wp.where(s.bounces.leg < world.limits.boundary.max_reflections, c.mirror, 0)
+        return c
+
+    @wp.func
+    def collide(s: wp.ref[PhotonState], world: wp.ref[World]):
+        c = end_of_flight(s, world)
+        fly_carried(s.carried, world, s.x, s.u, c.distance)
+        s.x = s.x + c.distance * s.u
+        s.path += c.distance
+        s.reason = c.reason
+        s.stage = END
         if c.reason < 0:
             if wp.static(local_albedo):
-                c.albedo = water_at(medium, layers, c.x).albedo
+                s.albedo = water_at(world.medium, world.layers, s.x).albedo
             if wp.static(has_mesh):
                 if s.hit.face >= 0 and c.mirror == 0:
-                    c.x = offset_from_surface(c.x, s.hit.normal, c.distance)
-        return c
+                    s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
+        if wp.static(reflecting):
+            next_bounce(s.bounces, c.mirror)
+        # A branch, since after a select a core waits for the flight before it draws the next words.
+        if c.reason < 0 or c.mirror > 0:
+            s.stage = SCATTER
+            s.collisions += 1
 
     return collide
 
 
 @made_once
-def make_arrives(flights: bool, traces: bool, queues: bool, at_once: bool) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``(s, queued) -> bool``, whether the photon's flight is to be scored, and
-    ``(s, queued, flies) -> bool``, whether, that being done, it is at the end of its flight and free to collide.
-
-    Args:
-        flights: Whether flights are scored; then collisions in the water are not.
-        traces: Whether what is scored may wait for a shadow ray.
-        queues: Whether it waits in the warp's queue before; else the thread's last one must have been traced.
-        at_once: Whether nothing is waited for: a photon that has flown arrives.
-    """
+def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
+    """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
+    estimator says so, with what rides along."""
+    crosses, reflecting, has_port = cross is not None, spec.reflecting, spec.port is not None
+    leave = spec.port.leave if spec.port is not None else None
+    rider = make_rider(spec)
+    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider is not NOTHING, rider
 
     @wp.func
-    def has_room(s: PhotonState, queued: int) -> bool:
-        room = bool(True)
-        if wp.static(traces and queues):
-            room = queued <= wp.static(MOST_LEFT)
-        if wp.static(traces and not queues):
-            room = not s.hidden
-        return room
+    def cross_aperture(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink]):
+        if wp.static(crosses):
+            c = cross(s, world)
+            if wp.static(reflecting):
+                s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
+            if wp.static(rides):
+                if c.value > 0.0:
+                    carried = s.carried
+                    to_lens = -s.x[2] / s.u[2]
+                    inside = s.u
+                    if wp.static(has_port):
+                        passage = leave(world.camera.port, s.x, s.u)
+                        to_lens = passage.water
+                        inside = passage.u
+                    fork(carried, world)
+                    fly(carried, world, s.x, s.u, to_lens)
+                    deliver(c, carried, world, s.x, s.u, inside)
+            if not c.value <= 0.0:
+                s.contributions += 1
+                deposit(s.account, sink, world, c)
 
-    @wp.func
-    def flown(s: PhotonState, queued: int) -> bool:
-        return s.stage == EVENT and is_planned(s.flight) and has_room(s, queued)
-
-    @wp.func
-    def arrives(s: PhotonState, queued: int, flies: bool) -> bool:
-        if wp.static(at_once):
-            return flies
-        room = has_room(s, queued)
-        if wp.static(flights):
-            room = (room or (wp.static(not queues) and s.hit.face < 0)) and not is_planned(s.flight)
-        return s.stage == EVENT and room
-
-    return flown, arrives
+    return cross_aperture

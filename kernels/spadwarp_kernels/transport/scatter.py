@@ -3,16 +3,14 @@
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.base.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.base.philox import STREAM_ROULETTE, STREAM_SURFACE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
-from spadwarp_kernels.optics.camera import Camera
+from spadwarp_kernels.photon.sink import Sink, Weight, book_weight, reweigh
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState, Weight, give, reweigh
-from spadwarp_kernels.riders.blocks import make_block_scores
-from spadwarp_kernels.riders.derivatives import make_event_scores
-from spadwarp_kernels.riders.polarisation import Polarisation, make_event_stokes, make_reflected_stokes
-from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.photon.state import END, FLIGHT, PhotonState
+from spadwarp_kernels.photon.world import Draws, World
+from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import (
     face_reflectance,
     pattern_reflectance,
@@ -21,13 +19,7 @@ from spadwarp_kernels.surface.reflectance import (
     unshadowed,
 )
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
-from spadwarp_kernels.tally.scores import Derivatives
-from spadwarp_kernels.tally.tally import Scores
 from spadwarp_kernels.water.boundary import face_index, flipped, fresnel_reflectance
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
-from spadwarp_kernels.water.phase_functions import Guiding
 
 
 @wp.struct
@@ -39,53 +31,39 @@ class Survival:
 
 
 @wp.struct
-class Scattering:
-    """A photon after an event.
+class Outcome:
+    """What an event makes of a photon: see `PhotonState`, which takes it over once nothing asks for the old weight."""
 
-    Attributes:
-        u: Its new unit direction.
-        weight, analog_weight: See `PhotonState`.
-        surface_count: Events at surfaces so far.
-        absorbed_surface, directed: For the ledger, in its units.
-        reason: Ledger entry that ends the history here, or after the flight of its last event's light; else -1.
-        scores, stokes: See `PhotonState`.
-    """
-
-    u: wp.vec3
     weight: Weight
     analog_weight: float
-    surface_count: int
-    absorbed_surface: wp.int64
-    directed: wp.int64
     reason: int
-    scores: Scores
-    stokes: wp.vec4
 
 
 @made_once
 def make_survive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
+    """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
 
     @wp.func
-    def survive(s: PhotonState, surfaces: Surfaces) -> Survival:
+    def survive(s: wp.ref[PhotonState], world: wp.ref[World]) -> Survival:
         survival = Survival()
         survival.part = s.albedo
         if wp.static(has_mesh):
             if s.hit.face >= 0:
-                survival.part = reflectance_at(surfaces, s.hit.face, s.x)
+                survival.part = reflectance_at(world.surfaces, s.hit.face, s.x)
                 if wp.static(specular):
-                    survival.part += surfaces.specular[s.hit.face]
-                    survival.lobe = surfaces.specular[s.hit.face] / wp.max(survival.part, 1.0e-30)
+                    specular_part = world.surfaces.specular[s.hit.face]
+                    survival.part += specular_part
+                    survival.lobe = specular_part / wp.max(survival.part, 1.0e-30)
         return survival
 
     return survive
 
 
 @made_once
-def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
-    """The Warp function ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``.
+def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
 
     Directions follow the phase function and the surface's law, unless an estimator has a way of its own.
     """
@@ -96,24 +74,15 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     water_at = spec.water.at
 
     @wp.func
-    def turn(
-        s: PhotonState,
-        reflected: wp.vec3,
-        lobe: float,
-        medium: Medium,
-        layers: Layers,
-        camera: Camera,
-        surfaces: Surfaces,
-        guiding: Guiding,
-        keys: RoundKeys,
-        id: wp.uint64,
+    def sample_direction(
+        s: wp.ref[PhotonState], reflected: wp.vec3, lobe: float, world: wp.ref[World], id: wp.uint64
     ) -> Direction:
         new = Direction()
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
-        axis = snap_from(s.u, medium.axis_threshold)
-        t = phase_sample(u01_fine(s.flight.block[1]), water_at(medium, layers, s.x))
+        axis = snap_from(s.u, world.medium.axis_threshold)
+        t = phase_sample(u01_fine(s.flight.block[1]), water_at(world.medium, world.layers, s.x))
         if on_surface:
             axis = s.hit.normal
             t = sample_cosine_law(u01(s.flight.block[1]))
@@ -123,214 +92,170 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
                 new.u = reflected
         return new
 
-    return turn
+    return sample_direction
 
 
 @made_once
-def make_flies(flies_on: bool) -> wp.Function:
+def make_continues(flies_on: bool) -> wp.Function:
     """The Warp function ``reason -> bool``: whether there is a flight after an event.
 
     `flies_on`: the light of a history's last event is scored as it flies, to where the next event would be.
     """
 
     @wp.func
-    def flies(reason: int) -> bool:
+    def continues(reason: int) -> bool:
         return reason < 0 or (wp.static(flies_on) and reason != ROULETTE)
 
-    return flies
-
-
-@made_once
-def make_leave(flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, new)`` that takes what an event has made of a photon into its state.
-
-    `flies_on`: see `make_flies`.
-    """
-    flies = make_flies(flies_on)
-
-    @wp.func
-    def leave(s: wp.ref[PhotonState], new: Scattering):
-        s.u = new.u
-        s.weight = new.weight
-        s.analog_weight = new.analog_weight
-        s.surface_count = new.surface_count
-        s.scores = new.scores
-        s.stokes = new.stokes
-        s.absorbed_surface += new.absorbed_surface
-        s.directed += new.directed
-        s.reason = new.reason
-        s.stage = wp.where(flies(s.reason), FLIGHT, END)
-
-    return leave
+    return continues
 
 
 @made_once
 def make_terminate(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(new, collisions, limits, keys, id, ledger, thread) -> Scattering``: the end of a history for
-    its analog weight or its events."""
+    """The Warp function ``(new, s, world, sink, id)``: the end of a history for its analog weight or its events."""
     roulette = spec.roulette
 
     @wp.func
     def terminate(
-        new: Scattering,
-        collisions: int,
-        limits: Limits,
-        keys: RoundKeys,
-        id: wp.uint64,
-        ledger: wp.array(dtype=wp.int64),
-        thread: int,
-    ) -> Scattering:
-        if new.analog_weight < limits.weight_cutoff:
+        new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64
+    ):
+        if new.analog_weight < world.limits.weight_cutoff:
             new.reason = WEIGHT_CUTOFF
             if wp.static(roulette):
-                chance = u01(random_block_keyed(keys, id, wp.uint32(collisions), STREAM_ROULETTE)[0])
+                chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
                 new.reason = ROULETTE
                 if chance < 0.1 and new.analog_weight > 0.0:
                     new.reason = -1
-                    new.weight = reweigh(new.weight, 10.0)
+                    reweigh(new.weight, 10.0)
                     new.analog_weight *= 10.0
-                    new.weight = give(new.weight, ledger, thread, ROULETTE)
-        if new.reason < 0 and collisions >= limits.max_collisions:
+                    book_weight(new.weight, s.account, sink, ROULETTE)
+        if new.reason < 0 and s.collisions >= world.limits.max_collisions:
             new.reason = MAX_COLLISIONS
-        return new
 
     return terminate
 
 
 @made_once
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, limits, keys, id, ledger, thread) -> Scattering`` of a photon that a face of the domain
-    reflects; what is not reflected leaves by the face.
+    """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
+    leaves by the face.
 
-    `directed`: weight and analog weight differ; `flies_on`: see `make_flies`.
+    `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
-    rotated, terminate, flies = spec.rotated_domain, make_terminate(spec), make_flies(flies_on)
-    polarised, reflected_stokes = spec.polarised, make_reflected_stokes()
+    rotated, terminate, continues = spec.rotated_domain, make_terminate(spec), make_continues(flies_on)
+    mirror_carried = make_rider(spec).mirror
 
     @wp.func
-    def bounce(
-        s: PhotonState, limits: Limits, keys: RoundKeys, id: wp.uint64, ledger: wp.array(dtype=wp.int64), thread: int
-    ) -> Scattering:
+    def bounce(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
         face = s.bounces.face
         axis = (face - 1) // 2
+        index = face_index(world.limits.boundary, face)
         u = s.u
         if wp.static(rotated):
-            u = limits.rotation * u
-        part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), face_index(limits.boundary, face))
+            u = world.limits.rotation * u
+        part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
         u = flipped(u, axis)
         if wp.static(rotated):
-            u = wp.normalize(wp.transpose(limits.rotation) * u)
-        new = Scattering()
-        new.u = s.u
-        new.weight = reweigh(s.weight, part)
-        new.surface_count = s.surface_count
-        new.scores = s.scores
-        if wp.static(polarised):
-            new.stokes = reflected_stokes(s.stokes, s.u, u, face_index(limits.boundary, face))
+            u = wp.normalize(wp.transpose(world.limits.rotation) * u)
+        new = Outcome()
         new.reason = s.reason
+        new.weight = s.weight
+        reweigh(new.weight, part)
+        mirror_carried(s.carried, s.u, u, index)
         # The light of an event that was the last is accounted for by what has ended the history.
-        new.weight = give(new.weight, ledger, thread, wp.where(s.reason < 0, EXIT + face, s.reason))
+        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, EXIT + face, s.reason))
         if s.reason < 0:
             new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
-            new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
-        if flies(new.reason):
-            new.u = u
-        return new
+            terminate(new, s, world, sink, id)
+        if continues(new.reason):
+            s.u = u
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
 
     return bounce
 
 
 @made_once
-def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
-    """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation, keys,
-    id, ledger, thread) -> Scattering``.
+def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
 
-    `flies_on`: see `make_flies`.
+    `flies_on`: see `make_continues`.
     """
     has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
-    survive, turn, flies = make_survive(spec), make_turn(spec, direct), make_flies(flies_on)
+    survive, sample_direction = make_survive(spec), make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
-    derives, event_scores = bool(spec.derivatives), make_event_scores(spec)
-    by_block = make_block_scores(spec)
-    in_blocks = by_block is not None
-    if by_block is not None:
-        turn_in_block = by_block.turn
-    polarised, event_stokes = spec.polarised, make_event_stokes(spec)
+    continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
     @wp.func
-    def scatter(
-        s: PhotonState,
-        medium: Medium,
-        layers: Layers,
-        camera: Camera,
-        limits: Limits,
-        surfaces: Surfaces,
-        guiding: Guiding,
-        derivatives: Derivatives,
-        polarisation: Polarisation,
-        keys: RoundKeys,
+    def turn(
+        new: wp.ref[Outcome],
+        s: wp.ref[PhotonState],
+        world: wp.ref[World],
+        sink: wp.ref[Sink],
         id: wp.uint64,
-        ledger: wp.array(dtype=wp.int64),
-        thread: int,
-    ) -> Scattering:
-        if wp.static(reflecting):
-            if s.bounces.face > 0:
-                return bounce(s, limits, keys, id, ledger, thread)
-        new = Scattering()
-        new.u = s.u
-        new.weight = s.weight
-        new.surface_count = s.surface_count
-        new.scores = s.scores
-        new.reason = -1
-        on_surface = False
-        survival = survive(s, surfaces)
-        if wp.static(has_mesh):
-            on_surface = s.hit.face >= 0
-        if on_surface:
-            new.weight = reweigh(s.weight, survival.part)
-            new.absorbed_surface = new.weight.taken
-            new.surface_count += 1
-        else:
-            new.weight.value *= survival.part
-        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
-        new = terminate(new, s.collisions, limits, keys, id, ledger, thread)
-        if not flies(new.reason):
-            return new
+        on_surface: bool,
+        lobe: float,
+    ):
         reflected = s.u
         if wp.static(specular):
             if on_surface:
-                draw = random_block_keyed(keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
-                roughness = surfaces.roughness[s.hit.face]
-                reflected = sample_reflection(s.u, s.hit.normal, roughness, survival.lobe, draw)
-        heading = turn(s, reflected, survival.lobe, medium, layers, camera, surfaces, guiding, keys, id)
-        new.u = heading.u
-        if wp.static(derives):
-            new.scores = event_scores(
-                s.scores, derivatives, medium, layers, surfaces, s.hit.face, s.hit.normal, s.x, s.u, new.u
-            )
-        if wp.static(in_blocks):
-            if not on_surface:
-                turn_in_block(derivatives.blocks, 0, medium, layers, s.x)
-        if wp.static(polarised):
-            slot = wp.where(on_surface, s.hit.slot, -1)
-            new.stokes = event_stokes(s.stokes, polarisation, surfaces, slot, s.x, s.u, new.u)
+                draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                roughness = world.surfaces.roughness[s.hit.face]
+                reflected = sample_reflection(s.u, s.hit.normal, roughness, lobe, draw)
+        heading = sample_direction(s, reflected, lobe, world, id)
+        turn_carried(s.carried, world, wp.where(on_surface, s.hit.slot, -1), s.x, s.u, heading.u)
         if wp.static(directed):
-            new.weight = reweigh(new.weight, heading.factor)
-            new.directed = new.weight.taken
+            reweigh(new.weight, heading.factor)
+            s.directed += new.weight.taken
             if new.weight.value <= 0.0:
                 new.reason = DIRECTED
         if wp.static(specular):
             if on_surface:
                 # What one facet takes of another's light stays in the surface.
-                leaving = unshadowed(s.u, new.u, s.hit.normal, surfaces.roughness[s.hit.face], survival.lobe)
-                new.weight = reweigh(new.weight, leaving)
+                leaving = unshadowed(s.u, heading.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
+                reweigh(new.weight, leaving)
                 new.analog_weight *= leaving
                 if new.reason < 0:
-                    new.absorbed_surface += new.weight.taken
+                    s.absorbed_surface += new.weight.taken
                 else:
-                    new.weight = give(new.weight, ledger, thread, new.reason)
+                    book_weight(new.weight, s.account, sink, new.reason)
                 if new.weight.value <= 0.0 and new.reason < 0:
                     new.reason = WEIGHT_CUTOFF
-        return new
+        s.u = heading.u
+
+    @wp.func
+    def collision(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
+        new = Outcome()
+        new.reason = -1
+        new.weight = s.weight
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        survival = survive(s, world)
+        if on_surface:
+            reweigh(new.weight, survival.part)
+            s.absorbed_surface += new.weight.taken
+        else:
+            new.weight.value *= survival.part
+        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
+        terminate(new, s, world, sink, id)
+        if continues(new.reason):
+            turn(new, s, world, sink, id, on_surface, survival.lobe)
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
+        s.surface_count += wp.where(on_surface, 1, 0)
+
+    @wp.func
+    def scatter(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], draws: wp.ref[Draws]):
+        id = draws.base + wp.uint64(s.photon)
+        bounced = False
+        if wp.static(reflecting):
+            bounced = s.bounces.face > 0
+            if bounced:
+                bounce(s, world, sink, id)
+        if not bounced:
+            collision(s, world, sink, id)
+        s.stage = wp.where(continues(s.reason), FLIGHT, END)
 
     return scatter

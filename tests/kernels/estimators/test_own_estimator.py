@@ -6,9 +6,10 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.estimators.contribution import Request
-from spadwarp_kernels.estimators.next_event import make_next_event
+from spadwarp_kernels.estimators.registry import make_next_event
+from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.state import PhotonState
+from spadwarp_kernels.photon.world import World
 
 
 def make_half(spec: sk.TransportSpec) -> sk.Estimator:
@@ -17,8 +18,8 @@ def make_half(spec: sk.TransportSpec) -> sk.Estimator:
     whole = next_event.request_event
 
     @wp.func
-    def request_event(s: PhotonState, camera: sk.Camera) -> Request:
-        request = whole(s, camera)
+    def request_event(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
+        request = whole(s, world)
         request.weight *= 0.5
         return request
 

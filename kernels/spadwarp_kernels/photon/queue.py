@@ -1,10 +1,12 @@
-"""A warp's queue of requests, so that its 32 lanes score together what each of them asks for; CUDA alone."""
+"""Requests for contributions, and on CUDA a warp's queue of them, which its 32 lanes serve together."""
 
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.native import bits_of, from_bits
-from spadwarp_kernels.photon.lanes import (
+from spadwarp_kernels.tally.tally import BACKSCATTER
+
+from .lanes import (
     ADD_ENTRY,
     MOST_LEFT,
     count_lanes_before,
@@ -14,10 +16,48 @@ from spadwarp_kernels.photon.lanes import (
     queue_size,
     queue_vector,
 )
-from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.tally.tally import BACKSCATTER
+from .spec import TransportSpec
+from .state import Carried
 
-from .contribution import Request
+
+@wp.struct
+class Request:
+    """What is to be scored; plain enough for another thread to do it.
+
+    Attributes:
+        wanted: Whether there is anything.
+        x: Where the photon scatters, or where the flight begins [m].
+        u: Its direction until there, or of the flight.
+        weight: Of the photon; in water times the albedo, but for flights through water that varies, whose albedo is
+            that of the sampled point.
+        path: Geometric path up to x [m].
+        lens: The point of the lens by which a flight is scored; others draw one from `first`.
+        interval: The part of the flight to take a point from [m]; empty for a scattering.
+        first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
+            tracking through a grid. With `takes_collisions` the second has the bits of the distance to the collision
+            [m] where that is scored.
+        rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
+        component: Index into COMPONENTS.
+        slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
+        target: The pixel of a scan, else -1.
+        carried: What rides along with the photon up to x.
+    """
+
+    wanted: bool
+    x: wp.vec3
+    u: wp.vec3
+    weight: float
+    path: float
+    lens: wp.vec3
+    interval: wp.vec2
+    first: wp.uint32
+    second: wp.uint32
+    rounding_sample: wp.uint32
+    component: int
+    slot: int
+    target: int
+    carried: Carried
+
 
 # A request's 24 bits for the tally share a word with its component.
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
@@ -128,14 +168,14 @@ def make_queue(
         long: Whether a lane may add two requests, a flight and an event, before the queue is read.
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
         confocal: Whether they have a target.
-        derivatives: How many scores requests have.
+        derivatives: How many log derivatives requests carry.
         polarised: Whether they have a Stokes vector.
         points: Requests that a flight adds, one for each of its points.
         short: Whether requests are of scatterings in water alone, and need one random word beside that of the tally.
     """
     more, rank_of = flights or confocal, _among_takers if traces else _lane
-    score_vectors = -(-derivatives // 4)
-    first_score = 4 if more else 3
+    derivative_vectors = -(-derivatives // 4)
+    first_carried = 4 if more else 3
     entries = queue_entries(points, long)
     write_words, read_words = _make_words(confocal, short, 2 * entries)
     warp_memory = make_warp_memory(
@@ -159,13 +199,13 @@ def make_queue(
                 entry + 3 * wp.static(entries),
                 wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1]),
             )
-        for i in range(wp.static(score_vectors)):
-            a = request.scores
+        for i in range(wp.static(derivative_vectors)):
+            a = request.carried.log_derivatives
             part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
-            queue_vector(memory, True, entry + (wp.static(first_score) + i) * wp.static(entries), part)
+            queue_vector(memory, True, entry + (wp.static(first_carried) + i) * wp.static(entries), part)
         if wp.static(polarised):
-            # Which goes without derivatives.
-            queue_vector(memory, True, entry + wp.static(first_score) * wp.static(entries), request.stokes)
+            # Which cannot be combined with derivatives.
+            queue_vector(memory, True, entry + wp.static(first_carried) * wp.static(entries), request.carried.stokes)
 
     @wp.func
     def push(memory: int, request: Request):
@@ -192,12 +232,14 @@ def make_queue(
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
-        for i in range(wp.static(score_vectors)):
-            part = queue_vector(memory, False, entry + (wp.static(first_score) + i) * wp.static(entries), wp.vec4())
+        for i in range(wp.static(derivative_vectors)):
+            part = queue_vector(memory, False, entry + (wp.static(first_carried) + i) * wp.static(entries), wp.vec4())
             for k in range(4):
-                request.scores[4 * i + k] = part[k]
+                request.carried.log_derivatives[4 * i + k] = part[k]
         if wp.static(polarised):
-            request.stokes = queue_vector(memory, False, entry + wp.static(first_score) * wp.static(entries), wp.vec4())
+            request.carried.stokes = queue_vector(
+                memory, False, entry + wp.static(first_carried) * wp.static(entries), wp.vec4()
+            )
         return request
 
     return warp_memory, push, pop

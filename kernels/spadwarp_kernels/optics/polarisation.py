@@ -1,0 +1,105 @@
+"""What polarised light depends on: the laser's state, the scattering matrix of the water, facets, and the receiver."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_items, check_number, check_numbers
+
+__all__ = ["MATRIX_POINTS", "MOST_CHANNELS", "Polarisation", "make_polarisation", "matrix_cosines"]
+
+# Points of the tables of a scattering matrix; an odd number.
+MATRIX_POINTS = 1025
+
+MOST_CHANNELS = 3
+
+Channels = wp.types.matrix(shape=(3, 4), dtype=float)
+
+
+@wp.struct
+class Polarisation:
+    """Parameters of a polarised spec, made by `make_polarisation`.
+
+    Attributes:
+        laser: Stokes vector of the beam on its axis, I = 1, with respect to the right of `beam_frame`.
+        first, last: Tables of m12, m22, m33, m34 and of m44 at `matrix_cosines`, see `Elements`.
+        channels: A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to
+            the image's x, so that U is light at 45 degrees from x towards y less that at 135.
+        facet_index: Index of each face's specular facets over that of the water; empty without a specular lobe.
+    """
+
+    laser: wp.vec4
+    first: wp.array(dtype=wp.vec4)
+    last: wp.array(dtype=float)
+    channels: Channels
+    facet_index: wp.array(dtype=float)
+
+
+def matrix_cosines() -> NDArray[np.float64]:
+    """Cosines of the scattering angle at which a matrix is tabulated, `[MATRIX_POINTS]`: from forward, in equal steps
+    of sin(theta/2), to 90 degrees, and on in equal steps of cos(theta/2) to backward; 0.16 degrees apart at both ends.
+    """
+    s = np.linspace(0.0, 1.0, (MATRIX_POINTS + 1) // 2)
+    return np.concatenate([1.0 - s * s, (s * s - 1.0)[-2::-1]])
+
+
+def make_polarisation(
+    *,
+    laser: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+    matrix: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    channels: Sequence[Sequence[float]] = (),
+    facet_index: ArrayLike = (),
+    device: wp.DeviceLike = None,
+) -> Polarisation:
+    """Parameters of polarised light, for `Model.polarisation`.
+
+    Args:
+        laser: Stokes vector of the emitted light, I = 1, see `Polarisation`.
+        matrix: Of cosines `[n]` of the scattering angle; returns `[n, 5]`: m12, m22, m33, m34 and m44 over m11, see
+            `Elements`. None: light keeps its polarisation as it is turned.
+        channels: Up to MOST_CHANNELS rows of four numbers; as many as the spec has.
+        facet_index: Of each face, > 0; one number for each, or nothing.
+
+    Raises:
+        ArgumentError: Numbers that no light and no matrix can have.
+    """
+    device = check_device("device", device)
+    polarisation = Polarisation()
+    polarisation.laser = wp.vec4(*check_stokes("laser", laser))
+    cosines = matrix_cosines()
+    table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
+    if not (matrix is None or callable(matrix)):
+        raise ArgumentError(f"matrix = {matrix!r} is not a function of cosines")
+    if matrix is not None:
+        table = check_numbers("matrix", matrix(cosines))
+    if table.shape != (cosines.size, 5):
+        raise ArgumentError(f"matrix gives {table.shape} for {cosines.size} cosines; [cosines, 5] is needed")
+    if not (np.isfinite(table).all() and np.abs(table).max() <= 1.0 + 1e-6):
+        raise ArgumentError("matrix holds elements that are not finite or beyond m11: outside [-1, 1]")
+    polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
+    polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
+    given = [check_items(f"channels[{k}]", row) for k, row in enumerate(check_items("channels", channels))]
+    if len(given) > MOST_CHANNELS or any(len(row) != 4 for row in given):
+        raise ArgumentError(f"channels are not up to {MOST_CHANNELS} rows of 4 numbers")
+    rows = np.zeros((MOST_CHANNELS, 4))
+    for k, row in enumerate(given):
+        rows[k] = [check_number(f"channels[{k}]", one, "[-1, 1]") for one in row]
+    polarisation.channels = Channels(*rows.ravel().tolist())
+    facets = np.ravel(check_numbers("facet_index", facet_index))
+    if facets.size and not (np.isfinite(facets).all() and facets.min() > 0.0):
+        raise ArgumentError("facet_index holds numbers outside (0, inf)")
+    polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)
+    return polarisation
+
+
+def check_stokes(name: str, stokes: Any) -> list[float]:
+    """Four numbers of light with I = 1 that is polarised by 1 at most; raises `ArgumentError`."""
+    found = check_numbers(name, stokes)
+    if found.shape != (4,) or not np.isfinite(found).all() or found[0] != 1.0:
+        raise ArgumentError(f"{name} = {stokes!r} is not a Stokes vector with I = 1")
+    if float(np.linalg.norm(found[1:])) > 1.0 + 1e-6:
+        raise ArgumentError(f"{name} = {stokes!r} is polarised by more than 1")
+    return [float(value) for value in found]

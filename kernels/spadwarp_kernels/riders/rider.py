@@ -1,0 +1,112 @@
+"""What may ride along with light: derivatives, those by block of cells, polarisation; one interface for all.
+
+The stages of a photon and the contributions that it makes call the same functions, on the photon's `Carried` or on a
+copy of it. So a rider need not know which estimator scores, nor an estimator what rides along.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.photon.state import Carried
+from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.tally.tally import Contribution
+
+
+@wp.func
+def _begin(c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+    pass
+
+
+@wp.func
+def _fork(c: wp.ref[Carried], world: wp.ref[World]):
+    pass
+
+
+@wp.func
+def _fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+    pass
+
+
+@wp.func
+def _event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    pass
+
+
+@wp.func
+def _mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+    pass
+
+
+@wp.func
+def _deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+    pass
+
+
+class Rider(NamedTuple):
+    """What becomes of what rides along, as Warp functions.
+
+    Attributes:
+        begin: ``(carried, world, target, emitted, x, u)``, for a photon that was emitted, see `make_emit`, and is in
+            the water at x on its way along u.
+        fork: ``(carried, world)``: what follows is of a contribution, no longer of the photon.
+        fly: ``(carried, world, x, u, length)``, a way in the water.
+        event: ``(carried, world, slot, x, u, v)``, an event at x that turns light from u to v, on the face of a slot of
+            the mesh's tree or (-1) in the water.
+        mirror: ``(carried, u, v, index)``, a smooth boundary that mirrors light from u to v, for the index behind it
+            over that of the water.
+        deliver: ``(contribution, carried, world, end, u, inside)``: light along u that leaves the water at `end` for
+            the lens, where it arrives along the unit vector `inside`.
+    """
+
+    begin: wp.Function = _begin
+    fork: wp.Function = _fork
+    fly: wp.Function = _fly
+    event: wp.Function = _event
+    mirror: wp.Function = _mirror
+    deliver: wp.Function = _deliver
+
+
+NOTHING = Rider()
+
+
+@made_once
+def join(first: Rider, second: Rider) -> Rider:
+    """Both, one after the other."""
+    begin_first, fork_first, fly_first, event_first, mirror_first, deliver_first = first
+    begin_second, fork_second, fly_second, event_second, mirror_second, deliver_second = second
+
+    @wp.func
+    def begin(
+        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
+    ):
+        begin_first(c, world, target, emitted, x, u)
+        begin_second(c, world, target, emitted, x, u)
+
+    @wp.func
+    def fork(c: wp.ref[Carried], world: wp.ref[World]):
+        fork_first(c, world)
+        fork_second(c, world)
+
+    @wp.func
+    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+        fly_first(c, world, x, u, length)
+        fly_second(c, world, x, u, length)
+
+    @wp.func
+    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        event_first(c, world, slot, x, u, v)
+        event_second(c, world, slot, x, u, v)
+
+    @wp.func
+    def mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+        mirror_first(c, u, v, index)
+        mirror_second(c, u, v, index)
+
+    @wp.func
+    def deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+        deliver_first(k, c, world, end, u, inside)
+        deliver_second(k, c, world, end, u, inside)
+
+    return Rider(begin, fork, fly, event, mirror, deliver)
