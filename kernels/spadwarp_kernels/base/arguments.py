@@ -143,6 +143,13 @@ def check_array(
     return array
 
 
+def check_arrays(name: str, struct: Any, device: wp.Device, **shapes: tuple[int | None, ...]) -> None:
+    """Arrays of a Warp struct, each with the dtype of its attribute and of such a shape, see `check_array`."""
+    for attribute, shape in shapes.items():
+        dtype = struct._cls.vars[attribute].type.dtype
+        check_array(f"{name}.{attribute}", getattr(struct, attribute), dtype, shape, device)
+
+
 def _fits(sizes: Sequence[int], shape: Sequence[int | None]) -> bool:
     return len(sizes) == len(shape) and all(b is None or a == b for a, b in zip(sizes, shape, strict=True))
 

@@ -186,7 +186,7 @@ class Scored:
 @wp.struct
 class ScoredPoint:
     """The point of a request: where it is [m], the photon's weight there, and the path up to it [m]; with
-    `takes_collisions` the length of the flight up to there that the weight does not account for yet [m]."""
+    `scores_collisions` the length of the flight up to there that the weight does not account for yet [m]."""
 
     x: wp.vec3
     weight: float
@@ -247,11 +247,6 @@ def scores_collision(word: wp.uint32) -> bool:
     return (word >> wp.uint32(31)) > wp.uint32(0)
 
 
-def takes_collisions(spec: TransportSpec) -> bool:
-    """Whether half the points of flights are where the photon collides, if it does so in their interval."""
-    return spec.water.profile is not None and spec.water.profile.draw is None
-
-
 @made_once
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
@@ -259,7 +254,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
-    has_profile, collides = profile is not None, takes_collisions(spec)
+    has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
     apparent_lens = make_apparent_lens(spec)
 
@@ -375,7 +370,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     `flights`: whether requests may ask for a point of a flight.
     """
     confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
-    water_extinction, collides = spec.water.extinction, flights and takes_collisions(spec)
+    water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
     image_of = spec.lens.image or spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of = make_link(spec)

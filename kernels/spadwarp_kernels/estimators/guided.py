@@ -32,7 +32,7 @@ from spadwarp_kernels.water.phase_functions import (
     sample_henyey_greenstein,
 )
 
-from .contribution import make_event_request, make_score, make_toward, scores_collision, takes_collisions
+from .contribution import make_event_request, make_score, make_toward, scores_collision
 from .estimator import Direction, Estimator, FlightPlan
 from .flight_sampling import make_sample_lens
 
@@ -51,7 +51,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
     if spec.polarised:
         registers = (128, 128)
     elif spec.grid is not None:
-        registers = (72 if takes_collisions(spec) else 80, 72)
+        registers = (72 if spec.scores_collisions else 80, 72)
     return Estimator(
         max_registers=registers,
         plan_flight=make_plan_flight(spec),
@@ -107,7 +107,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
     local_albedo, rides = spec.varies and not spec.random_albedo, make_rider(spec) is not NOTHING
-    collides = takes_collisions(spec)
+    collides = spec.scores_collisions
     spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
     @wp.func
@@ -229,7 +229,7 @@ def _make_lens_chance(spec: TransportSpec) -> wp.Function:
     turned in several steps, and such histories are few and heavy. Other water has one: a grid that repeats layers has
     their histories.
     """
-    twice = takes_collisions(spec)
+    twice = spec.scores_collisions
 
     @wp.func
     def lens_chance(u: wp.vec3, guiding: Guiding) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from spadwarp_kernels.base.arguments import check_choice
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.photon.spec import TransportSpec
 
@@ -41,4 +42,5 @@ ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
 @made_once
 def make_estimator(spec: TransportSpec) -> Estimator:
     """The estimator of a spec, made once: each launch asks for it, and its Warp functions take milliseconds to make."""
+    check_choice("estimator", spec.estimator, ESTIMATORS)
     return ESTIMATORS[spec.estimator](spec)

@@ -34,8 +34,8 @@ class Request:
         lens: The point of the lens by which a flight is scored; others draw one from `first`.
         interval: The part of the flight to take a point from [m]; empty for a scattering.
         first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
-            tracking through a grid. With `takes_collisions` the second has the bits of the distance to the collision
-            [m] where that is scored.
+            tracking through a grid. Of a spec that `scores_collisions` the second has the bits of the distance to the
+            collision [m] where that is scored.
         rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
         component: Index into COMPONENTS.
         slot: Of the face that scatters, see `SurfaceHit`; -1 for water.

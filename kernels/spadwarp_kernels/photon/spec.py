@@ -1,9 +1,13 @@
 """What a transport kernel is compiled for."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
+from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.optics.projection import PLAIN, Lens
+from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES
+from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES
 from spadwarp_kernels.water.layers import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
@@ -96,3 +100,78 @@ class TransportSpec(NamedTuple):
     def varies(self) -> bool:
         """Whether the water differs from place to place."""
         return self.layered or self.grid is not None
+
+    @property
+    def scores_collisions(self) -> bool:
+        """Whether `guided` scores half the points of flights where the photon collides: where that is by chance."""
+        return self.water.profile is not None and self.water.profile.draw is None
+
+
+def check_spec(spec: Any) -> None:
+    """A `TransportSpec` whose choices exist and can be combined; raises `ArgumentError`."""
+    if not isinstance(spec, TransportSpec):
+        raise ArgumentError(f"spec = {spec!r} is not a TransportSpec")
+    kinds = {"phase": PhaseFunction, "lens": Lens, "port": PortKind | None, "laser_port": PortKind | None}
+    kinds |= {"grid": Water | None, "derivatives": tuple, "blocks": tuple}
+    kinds |= {name: bool for name, kind in TransportSpec.__annotations__.items() if kind is bool}
+    for name, kind in kinds.items():
+        if not isinstance(getattr(spec, name), kind):
+            needed = getattr(kind, "__name__", None) or "PortKind or None"
+            needed = {"grid": "REGULAR_TRACKING, DELTA_TRACKING or None", "bool": "True or False"}.get(
+                name if name == "grid" else needed, f"a {needed}"
+            )
+            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not {needed}")
+    for name, choices, most in (
+        ("derivatives", DERIVATIVES, MOST_DERIVATIVES),
+        ("blocks", BLOCK_DERIVATIVES, len(BLOCK_DERIVATIVES)),
+    ):
+        check_integer(f"length of spec.{name}", len(getattr(spec, name)), 0, most)
+        for index, kind in enumerate(getattr(spec, name)):
+            check_choice(f"spec.{name}[{index}]", kind, choices)
+    # A block has 48 KiB of shared memory for queues.
+    check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
+    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
+    alone = spec.estimator == "guided" and not (spec.reflecting or spec.blocks or spec.scores_collisions)
+    one_water = not {*spec.derivatives} - {"reflectance"}
+    for wrong, text in (
+        (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
+        (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
+        (
+            spec.grid is not None and (spec.layered or spec.random_albedo),
+            "grid cannot be combined with spec.layered and spec.random_albedo",
+        ),
+        (
+            spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.signed),
+            "merged needs guided or next_event, and cannot be combined with spec.reflecting, spec.derivatives and "
+            "spec.channels",
+        ),
+        (len(set(spec.blocks)) < len(spec.blocks), f"blocks = {spec.blocks!r} names one twice"),
+        (
+            spec.blocks and (spec.grid is None or spec.reflecting or spec.merged),
+            "blocks need spec.grid, and cannot be combined with spec.reflecting and spec.merged",
+        ),
+        (
+            spec.derivatives and spec.random_albedo,
+            "derivatives cannot be combined with spec.random_albedo, which has no scattering coefficient",
+        ),
+        (
+            spec.grid is not None and not one_water,
+            "derivatives: with spec.grid, whose water has no one value, they are of reflectance",
+        ),
+        (
+            "anisotropy" in spec.derivatives and spec.phase.name != HENYEY_GREENSTEIN.name,
+            "derivatives: anisotropy needs spec.phase = HENYEY_GREENSTEIN",
+        ),
+        ("reflectance" in spec.derivatives and not spec.mesh, "derivatives: reflectance needs spec.mesh = True"),
+        (
+            spec.points > 1 and not alone,
+            f"points = {spec.points}: more than 1 needs spec.estimator = 'guided', and cannot be combined with "
+            "spec.reflecting, spec.blocks and DELTA_TRACKING",
+        ),
+        (
+            spec.polarised and (spec.derivatives or spec.blocks),
+            "polarised cannot be combined with spec.derivatives and spec.blocks",
+        ),
+    ):
+        if wrong:
+            raise ArgumentError(f"spec.{text}")

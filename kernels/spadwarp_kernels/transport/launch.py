@@ -11,7 +11,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
-    check_choice,
+    check_arrays,
     check_device,
     check_fields,
     check_integer,
@@ -24,24 +24,22 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.native import zeros
 from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
-from spadwarp_kernels.estimators.contribution import takes_collisions
 from spadwarp_kernels.estimators.estimator import Estimator
-from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
+from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.optics.camera import Camera, check_camera, with_field
 from spadwarp_kernels.optics.gate import Gate
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
-from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, MOST_CHANNELS, Polarisation
-from spadwarp_kernels.optics.port import PortKind, check_port
-from spadwarp_kernels.optics.projection import PLAIN, Lens
+from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
+from spadwarp_kernels.optics.port import check_port
+from spadwarp_kernels.optics.projection import PLAIN
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.sink import Sink
-from spadwarp_kernels.photon.spec import MOST_POINTS, TransportSpec
+from spadwarp_kernels.photon.spec import TransportSpec, check_spec
 from spadwarp_kernels.photon.state import Records, make_records
 from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
 from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.tally.blocks import (
-    BLOCK_DERIVATIVES,
     MOST_BLOCK_DERIVATIVES,
     blocks_with_memory,
     threads_of_blocks,
@@ -58,10 +56,10 @@ from spadwarp_kernels.tally.ledger import (
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel, fold_kernel, fold_low_words, low_words_pay
 from spadwarp_kernels.water.grid import Grid
-from spadwarp_kernels.water.layers import Layers, Water
+from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits, ready_limits
 from spadwarp_kernels.water.medium import Medium, ready_medium
-from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, TABULATED, Guiding, PhaseFunction
+from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel
 
@@ -178,7 +176,6 @@ def make_data(
 # ---- What a launch checks before it: a kernel trusts what it is given.
 
 
-_CHOICES = tuple(name for name, kind in TransportSpec.__annotations__.items() if kind is bool)
 _STRUCTS = {
     "medium": Medium,
     "laser": Laser,
@@ -202,72 +199,6 @@ _GUIDING = {
 }
 # What each laser profile reads.
 _BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
-
-
-def check_spec(spec: Any) -> None:
-    """A `TransportSpec` of an estimator that exists, with a phase function and a lens that go with it."""
-    if not isinstance(spec, TransportSpec):
-        raise ArgumentError(f"spec = {spec!r} is not a TransportSpec")
-    check_choice("estimator", spec.estimator, ESTIMATORS)
-    for name, kind in (("phase", PhaseFunction), ("lens", Lens)):
-        if not isinstance(getattr(spec, name), kind):
-            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a {kind.__name__}")
-    for name in ("port", "laser_port"):
-        if not isinstance(getattr(spec, name), PortKind | None):
-            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not a PortKind or None")
-    if not isinstance(spec.grid, Water | None):
-        raise ArgumentError(f"spec.grid = {spec.grid!r} is not REGULAR_TRACKING, DELTA_TRACKING or None")
-    if spec.grid is not None and (spec.layered or spec.random_albedo):
-        raise ArgumentError("spec.grid cannot be combined with spec.layered and spec.random_albedo")
-    for name in _CHOICES:
-        if not isinstance(getattr(spec, name), bool):
-            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not True or False")
-    if spec.confocal and spec.lens.name == PLAIN.name:
-        raise ArgumentError("spec.confocal = True needs spec.lens = CALIBRATED")
-    if spec.reflecting and not spec.bounded:
-        raise ArgumentError("spec.reflecting = True needs spec.bounded = True")
-    if spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.signed):
-        raise ArgumentError(
-            "spec.merged needs guided or next_event, and cannot be combined with spec.reflecting, spec.derivatives and "
-            "spec.channels"
-        )
-    _check_kinds(spec)
-    # A block has 48 KiB of shared memory for queues.
-    check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    if spec.points > 1 and (spec.estimator != "guided" or spec.reflecting or spec.blocks or takes_collisions(spec)):
-        raise ArgumentError(
-            f"spec.points = {spec.points}: more than 1 goes with spec.estimator = 'guided', without spec.reflecting, "
-            "spec.blocks and DELTA_TRACKING"
-        )
-    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
-    if spec.polarised and (spec.derivatives or spec.blocks):
-        raise ArgumentError("spec.polarised cannot be combined with spec.derivatives and spec.blocks")
-
-
-def _check_kinds(spec: TransportSpec) -> None:
-    """Of the derivatives, which exist for the spec's water and surfaces."""
-    if not isinstance(spec.derivatives, tuple) or len(spec.derivatives) > MOST_DERIVATIVES:
-        raise ArgumentError(
-            f"spec.derivatives = {spec.derivatives!r} is not a tuple of at most {MOST_DERIVATIVES} names"
-        )
-    for p, kind in enumerate(spec.derivatives):
-        check_choice(f"spec.derivatives[{p}]", kind, DERIVATIVES)
-    if not isinstance(spec.blocks, tuple) or len(set(spec.blocks)) < len(spec.blocks):
-        raise ArgumentError(f"spec.blocks = {spec.blocks!r} is not a tuple of different names")
-    for q, kind in enumerate(spec.blocks):
-        check_choice(f"spec.blocks[{q}]", kind, BLOCK_DERIVATIVES)
-    if spec.blocks and (spec.grid is None or spec.reflecting or spec.merged):
-        raise ArgumentError("spec.blocks need spec.grid, and cannot be combined with spec.reflecting and spec.merged")
-    if spec.derivatives and spec.random_albedo:
-        raise ArgumentError(
-            "spec.derivatives cannot be combined with spec.random_albedo, which has no scattering coefficient"
-        )
-    if spec.grid is not None and {*spec.derivatives} - {"reflectance"}:
-        raise ArgumentError("spec.derivatives: with spec.grid, whose water has no one value, they are of reflectance")
-    if "anisotropy" in spec.derivatives and spec.phase.name != HENYEY_GREENSTEIN.name:
-        raise ArgumentError("spec.derivatives: anisotropy needs spec.phase = HENYEY_GREENSTEIN")
-    if "reflectance" in spec.derivatives and not spec.mesh:
-        raise ArgumentError("spec.derivatives: reflectance needs spec.mesh = True")
 
 
 def check_model(model: Any) -> None:
@@ -315,15 +246,14 @@ def _check_water(spec: TransportSpec, model: Model) -> None:
     medium, device = model.medium, model.device
     check_fields("model.medium", medium, _MEDIUM)
     if spec.phase.name == TABULATED.name:
-        for name, kind in (("cells", wp.vec4), ("guide", wp.int32)):
-            check_array(f"model.medium.phase.{name}", getattr(medium.phase, name), kind, (3, TABLE_CELLS), device)
+        check_arrays("model.medium.phase", medium.phase, device, cells=(3, TABLE_CELLS), guide=(3, TABLE_CELLS))
     if spec.layered:
         layers = model.layers
-        start = check_array("model.layers.start", layers.start, wp.float32, (None,), device)
-        check_integer("number of model.layers", start.size, 1)
+        check_arrays("model.layers", layers, device, start=(None,))
+        check_integer("number of model.layers", layers.start.size, 1)
         check_vector("model.layers.axis", layers.axis, unit=True)
-        for name in ("extinction", "albedo", "anisotropy"):
-            check_array(f"model.layers.{name}", getattr(layers, name), wp.float32, start.shape, device)
+        shape = layers.start.shape
+        check_arrays("model.layers", layers, device, extinction=shape, albedo=shape, anisotropy=shape)
     if spec.grid is not None:
         _check_grid(model.layers.grid, device)
 
@@ -334,16 +264,14 @@ def _check_grid(grid: Grid, device: wp.Device) -> None:
         for count in size:
             check_integer(f"model.layers.grid.{name}", count, 1)
     cells, blocks = (math.prod(size) for size in sizes.values())
-    for name in ("extinction", "albedo", "residual"):
-        check_array(f"model.layers.grid.{name}", getattr(grid, name), wp.float32, (cells,), device)
-    anisotropy = check_array("model.layers.grid.anisotropy", grid.anisotropy, wp.float32, (None,), device)
-    if anisotropy.size:
-        check_array("model.layers.grid.anisotropy", anisotropy, wp.float32, (cells,), device)
+    check_arrays("model.layers.grid", grid, device, extinction=(cells,), albedo=(cells,), residual=(cells,))
+    check_arrays("model.layers.grid", grid, device, anisotropy=(None,))
+    if grid.anisotropy.size:
+        check_arrays("model.layers.grid", grid, device, anisotropy=(cells,))
     edge = check_integer("model.layers.grid.block_edge", grid.block_edge, 1)
     if sizes["block_size"] != [-(-count // edge) for count in sizes["size"]]:
         raise ArgumentError(f"model.layers.grid: {sizes['block_size']} blocks of {edge} cells; see make_grid")
-    for name, kind in (("block_majorant", wp.float32), ("block_control", wp.vec2)):
-        check_array(f"model.layers.grid.{name}", getattr(grid, name), kind, (blocks,), device)
+    check_arrays("model.layers.grid", grid, device, block_majorant=(blocks,), block_control=(blocks,))
 
 
 def _check_laser(spec: TransportSpec, model: Model) -> None:
@@ -352,10 +280,10 @@ def _check_laser(spec: TransportSpec, model: Model) -> None:
     if not spec.confocal:
         check_vector("model.laser.axis", laser.axis, unit=True)
     if spec.measured_beam:
-        rows = check_array("model.laser.rows", laser.rows, wp.float32, (None,), device)
-        check_integer("rows of the laser's profile", rows.size, 1)
-        columns = check_array("model.laser.columns", laser.columns, wp.float32, (rows.size, None), device)
-        check_integer("columns of the laser's profile", columns.shape[1], 1)
+        check_arrays("model.laser", laser, device, rows=(None,))
+        check_integer("rows of the laser's profile", laser.rows.size, 1)
+        check_arrays("model.laser", laser, device, columns=(laser.rows.size, None))
+        check_integer("columns of the laser's profile", laser.columns.shape[1], 1)
         for extent in laser.extent:
             check_number("model.laser.extent", extent, "(0, inf)")
     else:
@@ -378,7 +306,7 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
             for axis in range(3):
                 check_number(f"model.limits.boundary.{name}[{axis}]", indices[axis], "[0, 1e9]")
         check_integer("model.limits.boundary.max_reflections", boundary.max_reflections, 0)
-        check_array("model.limits.boundary.images", boundary.images, wp.vec3i, (None,), model.device)
+        check_arrays("model.limits.boundary", boundary, model.device, images=(None,))
     if spec.rotated_domain:
         check_vector("model.limits.origin", limits.origin)
         rows = [[limits.rotation[i, j] for j in range(3)] for i in range(3)]
@@ -388,7 +316,8 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
 
 def _check_surfaces(spec: TransportSpec, model: Model) -> None:
     surfaces, device = model.surfaces, model.device
-    faces = check_array("model.surfaces.reflectance", surfaces.reflectance, wp.float32, (None,), device).size
+    check_arrays("model.surfaces", surfaces, device, reflectance=(None,), nodes=(None,), near_depth=(None, None))
+    faces = surfaces.reflectance.size
     if faces == 0:
         raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
     if spec.brute_force and faces > BRUTE_FORCE_FACES:
@@ -408,19 +337,14 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
         )
     if spec.brute_force and device.is_cuda:
         check_patches("model.surfaces", surfaces, faces, device)
-    check_array("model.surfaces.nodes", surfaces.nodes, wp.vec4, (None,), device)
-    check_array("model.surfaces.near_depth", surfaces.near_depth, wp.float32, (None, None), device)
     if spec.pattern:
-        check_array("model.surfaces.corner_reflectance", surfaces.corner_reflectance, wp.vec3, (faces,), device)
-        textured = check_array("model.surfaces.textures.face", surfaces.textures.face, wp.int32, (None,), device).size
-        if textured:
-            check_array("model.surfaces.textures.face", surfaces.textures.face, wp.int32, (faces,), device)
-            check_array(
-                "model.surfaces.textures.coordinates", surfaces.textures.coordinates, wp.vec2, (faces, 3), device
-            )
+        textures = surfaces.textures
+        check_arrays("model.surfaces", surfaces, device, corner_reflectance=(faces,))
+        check_arrays("model.surfaces.textures", textures, device, face=(None,))
+        if textures.face.size:
+            check_arrays("model.surfaces.textures", textures, device, face=(faces,), coordinates=(faces, 3))
     if spec.specular:
-        check_array("model.surfaces.specular", surfaces.specular, wp.float32, (faces,), device)
-        check_array("model.surfaces.roughness", surfaces.roughness, wp.float32, (faces,), device)
+        check_arrays("model.surfaces", surfaces, device, specular=(faces,), roughness=(faces,))
 
 
 def _check_derivatives(spec: TransportSpec, model: Model) -> None:
@@ -438,11 +362,9 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
         for q in range(len(spec.blocks)):
             check_number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
     if spec.layered:
-        count = model.layers.start.size
-        check_array("model.derivatives.waters", derivatives.waters, wp.int32, (count,), device)
+        check_arrays("model.derivatives", derivatives, device, waters=(model.layers.start.size,))
     if "reflectance" in spec.derivatives:
-        count = model.surfaces.reflectance.size
-        check_array("model.derivatives.faces", derivatives.faces, wp.int32, (count,), device)
+        check_arrays("model.derivatives", derivatives, device, faces=(model.surfaces.reflectance.size,))
 
 
 def _check_polarisation(spec: TransportSpec, model: Model) -> None:
@@ -452,23 +374,20 @@ def _check_polarisation(spec: TransportSpec, model: Model) -> None:
             f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without the "
             "near-axis rule, which has no plane of scattering"
         )
-    points = check_array("model.polarisation.first", polarisation.first, wp.vec4, (None,), device).size
-    check_integer("points of model.polarisation.first", points, MATRIX_POINTS, MATRIX_POINTS)
-    check_array("model.polarisation.last", polarisation.last, wp.float32, (points,), device)
+    check_arrays("model.polarisation", polarisation, device, first=(MATRIX_POINTS,), last=(MATRIX_POINTS,))
     for k in range(spec.channels):
         check_number(f"model.derivatives.scale[{k}]", model.derivatives.scale[k], "(0, inf)")
     if spec.specular:
-        count = model.surfaces.reflectance.size
-        check_array("model.polarisation.facet_index", polarisation.facet_index, wp.float32, (count,), device)
+        check_arrays("model.polarisation", polarisation, device, facet_index=(model.surfaces.reflectance.size,))
 
 
 def _check_scan(model: Model, estimator: Estimator) -> None:
     scan, camera = model.scan, model.camera
     most = camera.width * camera.height if estimator.scores else 2**31 - 1
     count = check_integer("model.scan.count", scan.count, 1, most)
-    for name, kind in (("axis", wp.vec3), ("view", wp.vec4)):
-        array = check_array(f"model.scan.{name}", getattr(scan, name), kind, (None,), model.device)
-        check_integer(f"entries of model.scan.{name}", array.size, count)
+    check_arrays("model.scan", scan, model.device, axis=(None,), view=(None,))
+    for name in ("axis", "view"):
+        check_integer(f"entries of model.scan.{name}", getattr(scan, name).size, count)
 
 
 def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estimator, photon_count: int) -> None:

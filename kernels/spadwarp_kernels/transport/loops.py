@@ -20,7 +20,7 @@ from spadwarp_kernels.photon.lanes import (
     vote,
 )
 from spadwarp_kernels.photon.sink import Sink
-from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.spec import TransportSpec, check_spec
 from spadwarp_kernels.photon.state import (
     DONE,
     END,
@@ -60,6 +60,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
     """
+    check_spec(spec)
     if alone(spec, cuda):
         return make_loop_alone(spec, cuda)
     if spec.mesh and not tries_every_face(spec, cuda):
