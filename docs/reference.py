@@ -245,7 +245,7 @@ def _short(value: Any) -> str:
 def dataset() -> str:
     """Datasets in the files of a dataset."""
     from spadwarp.dataset import Plan
-    from spadwarp.dataset.schema import FRAME_COLUMNS, HISTOGRAM_COLUMNS, scene_columns
+    from spadwarp.dataset.shards import FRAME_COLUMNS, HISTOGRAM_COLUMNS, scene_columns
 
     def table(rows: Mapping[str, tuple[str, str]]) -> str:
         lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]

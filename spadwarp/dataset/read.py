@@ -13,10 +13,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.histograms import HISTOGRAM_FIELDS, HistogramFile
-from spadwarp.dataset.manifest import read_manifest
+from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.shard_file import ShardFile, frame_count
+from spadwarp.dataset.shards import HISTOGRAM_FIELDS, HistogramFile, ShardFile, frame_count
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.limits import SEED, check_choice, check_integer
 from spadwarp.scene import Scene

@@ -1,49 +1,209 @@
-"""Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
-
-A recipe holds a scene, given as in a scene file, and distributions of what changes from scene to scene. A distribution
-is a number (a constant), a list (each value equally likely), or a table `{low = , high = }` (uniform; with `log = true`
-uniform in the logarithm).
-"""
+"""Distributions of a recipe, and what all its tables have in common."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
+    AfterValidator,
+    BaseModel,
     BeforeValidator,
+    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
     model_validator,
 )
 
-from spadwarp.dataset.distributions import (
-    Angle,
-    Distribution,
-    Names,
-    NotNegative,
-    Positive,
-    PulseCount,
-    Real,
-    Share,
-    Table,
-    constant,
-    distribution,
-)
-from spadwarp.dataset.plumes import Plume
-from spadwarp.errors import ConfigError
+from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
+from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
 from spadwarp.scene.renamed import current_fields, current_path
-from spadwarp.scene.sections import Whole
+from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
+
+Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
+
+
+class Table(BaseModel):
+    """One table of a recipe: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as TOML has them, without those that are None: `Recipe.from_dict` makes an equal recipe of them."""
+        return {name: plain(value) for name, value in self if value is not None}
+
+
+class Distribution(Table):
+    """One of `choices`, equally likely, or uniform between `low` and `high`."""
+
+    choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
+    low: float | None = Field(None, ge=-1e19, le=1e19, description="lowest value")
+    high: float | None = Field(None, ge=-1e19, le=1e19, description="highest value")
+    log: bool = Field(False, description="whether uniform in the logarithm")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if bool(self.choices) == (self.low is not None and self.high is not None):
+            raise ValueError("needs a number, a list of choices, or low and high")
+        if self.low is not None and self.high is not None:
+            if not self.low <= self.high:
+                raise ValueError(f"low = {self.low} is outside (-inf, {self.high}], {self.high} being high")
+            if self.log and not self.low > 0:
+                raise ValueError(f"low = {self.low} is outside (0, inf), the range of a logarithm")
+            if not math.isfinite(self.high / self.low if self.log else self.high - self.low):
+                raise ValueError(f"low = {self.low} and high = {self.high} are too far apart")
+        if not all(map(_is_finite, self.choices)):
+            raise ValueError(f"holds {shown(self.choices)}, not all of which are finite")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value that can be drawn."""
+        if self.choices:
+            return min(self.choices), max(self.choices)
+        assert self.low is not None and self.high is not None
+        return self.low, self.high
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """One value."""
+        if self.choices:
+            return self.choices[int(generator.integers(len(self.choices)))]
+        low, high = self.limits
+        u = float(generator.random())
+        return low * (high / low) ** u if self.log else low + (high - low) * u
+
+    def to_dict(self) -> Any:
+        """As TOML has it: a number, a list or a table."""
+        if self.choices:
+            single = len(self.choices) == 1 and not isinstance(self.choices[0], (list, tuple))
+            return self.choices[0] if single else list(self.choices)
+        return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
+
+
+def _is_finite(value: Any, depth: int = 0) -> bool:
+    """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
+    if isinstance(value, list | tuple):
+        return depth < 9 and all(_is_finite(one, depth + 1) for one in value)
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def distribution(value: Any) -> Any:
+    """A number or a list as the table of a distribution."""
+    if isinstance(value, (Mapping, Distribution)):
+        return value
+    return {"choices": list(value) if isinstance(value, (list, tuple)) else [value]}
+
+
+def within(interval: str) -> AfterValidator:
+    """A distribution of numbers in a range."""
+
+    def check(value: Distribution) -> Distribution:
+        values = value.choices or value.limits
+        for one in values:
+            try:
+                check_real("value", one, interval)
+            except ArgumentError:
+                problem = f"is no number in {interval}"
+                raise ValueError(problem if len(values) == 1 else f"holds {shown(one)}, which {problem}") from None
+        return value
+
+    return AfterValidator(check)
+
+
+Positive = Annotated[Distribution, BeforeValidator(distribution), within("[1e-9, 1e9]")]
+NotNegative = Annotated[Distribution, BeforeValidator(distribution), within("[0, 1e9]")]
+PulseCount = Annotated[Distribution, BeforeValidator(distribution), within("[0.5, 9e18]")]
+Share = Annotated[Distribution, BeforeValidator(distribution), within("[0, 1]")]
+Angle = Annotated[Distribution, BeforeValidator(distribution), within("[-360, 360]")]
+Real = Annotated[Distribution, BeforeValidator(distribution), within("[-1e9, 1e9]")]
+
+
+def constant(value: float) -> Distribution:
+    """The distribution of one value."""
+    return Distribution(choices=(value,))
+
+
+def plain(value: Any) -> Any:
+    """A table, or what is in one, as TOML has it."""
+    if isinstance(value, Table):
+        return value.to_dict()
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+# ---- Random plumes between camera and target, as augmentation.
+
+
+Shape = Literal["cloud", "plume", "sediment"]
+
+_SEEDS = Distribution(low=0.0, high=1.0)
+
+
+class Plume(Table):
+    """Suspended matter between camera and target in part of the scenes."""
+
+    probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
+    shape: Annotated[tuple[Shape, ...], BeforeValidator(listed), Field(min_length=1)] = Field(
+        ("cloud", "plume", "sediment"), description="shapes of medium.grid, equally likely"
+    )
+    optical_depth: Positive = Field(constant(1.0), description="that it adds on the optical axis, one way")
+    place: Share = Field(
+        Distribution(low=0.3, high=0.8), description="of its middle, as part of the distance of the target's centre"
+    )
+    shift: Real = Field(constant(0.0), description="sideways, drawn for x and for y [m]")
+    size: Positive = Field(constant(1.0), description="edge of its box [m]")
+    albedo: Share = Field(constant(0.8), description="single-scattering albedo of its matter")
+    turbulence: NotNegative = Field(
+        constant(0.5), description="standard deviation of the logarithm of its density, up to 3"
+    )
+    cells: Whole = Field(32, ge=1, le=256, description="cells along the edges of its box")
+
+
+def with_plume(scene: Scene, plume: Plume, draw: Callable[[str, Distribution | None], Any], distance: float) -> Scene:
+    """The scene, in part of the draws with a plume before what is at a distance on the axis [m].
+
+    The optical depth is that of the cells on the axis; a box that does not meet it keeps an extinction of 1/m.
+    """
+    if draw("plume.probability", _SEEDS) >= plume.probability:
+        return scene
+    grid = {
+        "shape": draw("plume.shape", Distribution(choices=plume.shape)),
+        "size": [draw("plume.size", plume.size)],
+        "cells": [plume.cells],
+        "albedo": draw("plume.albedo", plume.albedo),
+        "turbulence": min(draw("plume.turbulence", plume.turbulence), 3.0),
+        "seed": int(draw("plume.seed", _SEEDS) * 2**53),
+        "translation": [
+            draw("plume.shift.x", plume.shift),
+            draw("plume.shift.y", plume.shift),
+            draw("plume.place", plume.place) * distance,
+        ],
+        "extinction": 1.0,
+    }
+    unit = scene.with_overrides({"medium.grid": grid})
+    end = (0.0, 0.0, distance)
+    added = unit.optical_depth((0.0, 0.0, 0.0), end) - scene.medium.extinction * distance
+    if added < 1e-3:
+        return unit
+    wanted = draw("plume.optical_depth", plume.optical_depth)
+    return unit.with_overrides({"medium.grid.extinction": min(wanted / added, 1e6)})
+
+
+# ---- Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
+
 
 _MOST_TRIED = 1000  # values of a field that varies
 

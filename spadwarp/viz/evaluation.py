@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from spadwarp.viz.panels import mark_pixels
 from spadwarp.viz.style import (
     BLUE,
     DEPTH_MAP,
@@ -29,15 +28,13 @@ from spadwarp.viz.style import (
     colour_map,
     columns_that_fit,
     log_axis,
+    mark_pixels,
     new_figure,
     paper,
     plain_axis,
     save,
     wrapped,
 )
-
-__all__ = ["METHODS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_reliability", "draw_samples"]
-__all__ += ["draw_scores"]
 
 METHODS = {
     "input": ("noisy input", "0.5", "x", "--"),

@@ -16,17 +16,36 @@ from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, first_photon_probabilities
 from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
+from spadwarp.units import rounded
 from spadwarp.viz.result import channel_text
-from spadwarp.viz.style import BLUE, GREEN, INTENSITY_MAP, PAGE, PROBABILITY_MAP, paper, save, spaced
+from spadwarp.viz.style import (
+    BLUE,
+    ERROR_MAP,
+    GREEN,
+    INTENSITY_MAP,
+    PAGE,
+    PROBABILITY_MAP,
+    RED,
+    TEXT,
+    Panels,
+    arrival_line,
+    log_axis,
+    mark_pixels,
+    paper,
+    percent,
+    save,
+    shown_limits,
+    spaced,
+    target_limits,
+)
+
+__all__ = ["draw_analytic", "draw_denoised", "draw_depth", "draw_fit", "draw_recording"]
 
 if TYPE_CHECKING:
     from spadwarp.analytic import AnalyticResult
     from spadwarp.frames import Frames, FramesFile, Recording
     from spadwarp.result import Result
     from spadwarp.scene import Scene
-
-__all__ = ["analytic_figure", "draw_analytic", "draw_recording", "frame_figure", "stored_frame_figure"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -180,4 +199,119 @@ def analytic_figure(result: AnalyticResult, width: float = PAGE) -> Figure:
         f"analytic, {analytic.form} form; water c = {result.scene.medium.extinction:.3g} 1/m; "
         f"backscatter {analytic.backscatter.replace('_', ' ')}; seed {result.seed}"
     )
+    return panels.figure
+
+
+# ---- Depth frames: beside their intensity, or before and after denoising.
+
+
+@paper()
+def draw_depth(
+    image: NDArray[np.float64],
+    intensity: NDArray[Any],
+    path: str | Path,
+    *,
+    label: str,
+    title: str,
+    width: float = PAGE,
+) -> Path:
+    """A depth or range image `[H, W]` [m] beside the intensity; returns the path. `width`: of the picture [inch]."""
+    panels = Panels(image.shape, 2, width=width)
+    panels.show_depth(image, title, shown_limits(image, beyond=1.0, weights=intensity), label)
+    panels.show_intensity(intensity, "Intensity", "sum over bins")
+    return save(panels.figure, path)
+
+
+@paper()
+def draw_denoised(
+    noisy: NDArray[np.float32],
+    denoised: NDArray[np.float32],
+    path: str | Path,
+    *,
+    gate: tuple[float, float],
+    title: str,
+    truth: NDArray[np.float32] | None = None,
+    width: float = PAGE,
+) -> Path:
+    """A frame before and after, depth `[H, W]` [m] each; returns the path.
+
+    With the truth also that, the error, and in colours of their own the pixels in which a target was missed or
+    invented, and their parts of the target and of the water: NaN stands for no target. `width`: of the picture [inch].
+    """
+    known = truth is not None and np.isfinite(truth).any()
+    scale = truth if truth is not None and known else denoised if np.isfinite(denoised).any() else noisy
+    low, high = shown_limits(scale, beyond=1.0, margin=0.05 * known)
+    limits = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
+    panels = Panels(noisy.shape, 2 if truth is None else 4, width=width)
+    panels.show_depth(noisy, "Input", limits)
+    if truth is None:
+        panels.show_depth(denoised, "Denoised", limits)
+    else:
+        target, found = np.isfinite(truth), np.isfinite(denoised)
+        missed, invented = target & ~found, found & ~target
+        parts = (100 * some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
+        of_target, of_water = map(percent, parts)
+        label = f"depth z [m]\nblack: missed, {of_target}\nred: invented, {of_water}"
+        mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
+        panels.show_depth(truth, "Truth", limits)
+        panels.show_error(denoised - truth, "Denoised − truth")
+    panels.caption(title)
+    return save(panels.figure, path)
+
+
+# ---- A fit: counts beside what the model expects, and what is left over.
+
+
+if TYPE_CHECKING:
+    from spadwarp.inverse import Fit
+
+
+_MOST_POINTS = 160  # bins are added up to at most so many
+
+
+def draw_fit(fit: Fit, path: str | Path, *, width: float = PAGE) -> Path:
+    """Counts, fit and residuals of a fit: over the image and over time; `width` [inch]; returns the path."""
+    return save(fit_figure(fit, width), path)
+
+
+@paper()
+def fit_figure(fit: Fit, width: float = PAGE) -> Figure:
+    """The figure of `draw_fit`."""
+    counts, expected = fit.counts.sum(axis=2), fit.expected.sum(axis=2, dtype=np.float64)
+    images = 2 if fit.depth is None else 3
+    panels = Panels(counts.shape, images, width=width, below=2.6)
+    panels.show_intensity(counts, "Counts", "counts in the exposure")
+    residual = (counts - expected) / np.sqrt(np.maximum(expected, 1e-12))
+    panels.show(np.where(expected > 0, residual, np.nan), "Residual", "(counts − fit) / √fit", ERROR_MAP, (-3.0, 3.0))
+    if fit.depth is not None:
+        panels.show_depth(fit.depth, "Depth", shown_limits(fit.depth))
+    below = panels.below()
+    below.set_axis_off()
+    top = below.inset_axes((0.0, 0.42, 1.0, 0.58))
+    bottom = below.inset_axes((0.0, 0.0, 1.0, 0.32), sharex=top)
+    bins = fit.counts.shape[2]
+    factor = max(1, -(-bins // _MOST_POINTS))
+    starts = np.arange(0, bins, factor)
+    measured = np.add.reduceat(fit.counts.sum(axis=(0, 1)).astype(np.float64), starts)
+    mean = np.add.reduceat(fit.expected.sum(axis=(0, 1), dtype=np.float64), starts)
+    edges = 1e9 * np.append(fit.edges[starts], fit.edges[-1])
+    top.stairs(measured, edges, fill=True, color="0.72", label="counts, all pixels")
+    top.stairs(mean, edges, baseline=None, color=BLUE, linewidth=1.0, label="fit")
+    seen = mean[mean > 0]
+    low = max(0.5, float(seen.min()) if seen.size else 0.5)
+    top.set_ylim(0.5 * low, 3.0 * max(float(measured.max()), 2.0 * low))
+    log_axis(top, "y", most=5)
+    top.set(xlim=edges[[0, -1]], ylabel="counts")
+    top.tick_params(labelbottom=False)
+    top.legend(loc="upper right", ncols=2)
+    left = (measured - mean) / np.sqrt(np.maximum(mean, 1.0))
+    bottom.axhline(0.0, color=TEXT, linewidth=0.6)
+    bottom.plot(0.5 * (edges[:-1] + edges[1:]), left, ".", color=RED, markersize=2.5)
+    reach = max(3.5, 1.1 * float(np.abs(left).max()))
+    bottom.set(ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
+    values = "; ".join(
+        f"{one.name} = {rounded(one.value, one.standard_error)} ± {one.standard_error:.2g} {one.unit}".rstrip()
+        for one in fit.estimates.values()
+    )
+    panels.caption(f"{values}; {spaced(fit.pulses)} pulses" if values else f"{spaced(fit.pulses)} pulses")
     return panels.figure

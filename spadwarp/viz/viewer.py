@@ -1,4 +1,4 @@
-"""A run as one HTML file that any browser shows without a network: `view`."""
+"""HTML pages from the templates beside this module."""
 
 from __future__ import annotations
 
@@ -17,16 +17,31 @@ from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
 from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.frames.sequence_file import SequenceFile
+from spadwarp.io.atomic import atomic_path
 from spadwarp.io.paths import check_apart
 from spadwarp.result import Channel, Result, received
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 from spadwarp.viz import style
-from spadwarp.viz.pages import write_page
-from spadwarp.viz.panels import median_pixel
 from spadwarp.viz.result import channel_text
+from spadwarp.viz.style import median_pixel
 
-__all__ = ["HISTOGRAM_BYTES", "reported_depths", "view"]
+__all__ = ["view"]
+
+
+def write_page(path: str | Path, template: str, **values: Any) -> None:
+    """Writes a page of its own: values are escaped except where the template says `safe`. Raises `FileError`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined)
+    pages.policies["json.dumps_kwargs"] = {}  # keys stay in their order
+    text = pages.get_template(template).render(values)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+# ---- A run as one HTML file that any browser shows without a network: `view`.
+
 
 HISTOGRAM_BYTES = 5_000_000
 """Largest size of the packed histograms [bytes]; with plotly and the images a page stays below 15 MB."""

@@ -17,7 +17,7 @@ from spadwarp.scene.grid_cells import grid_cells
 from spadwarp.scene.pose import to_camera, to_world
 from spadwarp.viz.style import BLUE, BOUND_MAP, GREEN, PAGE, new_figure, paper, save
 
-__all__ = ["draw_slice", "draw_water"]
+__all__ = ["draw_water"]
 
 Floats = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from spadwarp.dataset import (
     load_recipe,
     verify_dataset,
 )
-from spadwarp.dataset.histograms import HISTOGRAM_FIELDS
+from spadwarp.dataset.shards import HISTOGRAM_FIELDS
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT

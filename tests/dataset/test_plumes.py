@@ -4,7 +4,7 @@ import pytest
 
 import spadwarp
 from spadwarp.dataset import Recipe, load_recipe
-from spadwarp.dataset.sampling import Plan
+from spadwarp.dataset.plan import Plan
 
 PLUME = {"probability": 0.5, "optical_depth": {"low": 0.5, "high": 2.0}, "cells": 12, "size": 1.5}
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from spadwarp.mesh import make_builtin
+from spadwarp.mesh import solids as so
 from spadwarp.mesh.shapes import SHAPES
-from spadwarp.mesh.shapes import solids as so
 
 
 def front_depth(mesh, cells=64):

@@ -17,7 +17,7 @@ from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
 from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
-from spadwarp.mesh.colours import srgb_to_linear
+from spadwarp.mesh.files import srgb_to_linear
 from spadwarp.scene import Target
 
 pytestmark = pytest.mark.physics

@@ -17,10 +17,9 @@ from helpers.picture_texts import cut, overlapping, texts
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import record_frames
 from spadwarp.mesh import describe_mesh
-from spadwarp.viz import evaluation, style, transient_video, validation
-from spadwarp.viz import learning_curves as curves
-from spadwarp.viz.depth import draw_denoised, draw_depth
-from spadwarp.viz.panels import shown_limits, target_limits
+from spadwarp.viz import curves, evaluation, style, transient_video
+from spadwarp.viz.frames import draw_denoised, draw_depth
+from spadwarp.viz.style import shown_limits, target_limits
 
 FOLDER = os.environ.get("SPADWARP_TEST_PICTURES")  # where the pictures stay, to be looked at
 METHODS = ("input", "median", "gating", "bm3d", "usdn", "dncnn", "pyramid")
@@ -153,7 +152,7 @@ def draw_narrow(path, width, **_):
 
 
 def draw_case(path, width, **_):
-    validation.draw_validation(rows(), path, title="moments: where photons are after n collisions", width=width)
+    curves.draw_validation(rows(), path, title="moments: where photons are after n collisions", width=width)
 
 
 PICTURES = {
