@@ -21,7 +21,6 @@ from spadwarp.mesh.targets import placement
 from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Scene, Target, Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_angles
-from spadwarp.scene.renamed import former_path
 from spadwarp.scene.sight import port_advance
 from spadwarp.units import time_from_range
 
@@ -314,7 +313,7 @@ class Plan:
             distance = float(draw("pose.distance", recipe.pose.distance))
         else:
             distance = self._export_distance(source)
-        changes = {name: draw(f"vary.{former_path(name)}", values) for name, values in recipe.vary.items()}
+        changes = {name: draw(f"vary.{name}", values) for name, values in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
         if lengths is None:
