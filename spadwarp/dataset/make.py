@@ -1,4 +1,10 @@
-"""What a dataset consists of: its manifest, its splits and the checksums of its files, written and verified."""
+"""Making a dataset: shards that are missing or broken, the manifest, the splits, the card.
+
+A shard is two or three files and a small record of their checksums, written in this order, each renamed into place when
+it is whole. When a process is killed only its unfinished shard is lost; a later call makes what has no record or does
+not match it. A process that makes a shard holds a lock on it: of two calls for one folder, each makes what the other
+has not begun.
+"""
 
 from __future__ import annotations
 
@@ -93,11 +99,8 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
         raise FileError(f"{path}: cannot be read: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != "spadwarp dataset":
         raise FileError(f"{path}: not the manifest of a spadwarp dataset")
-    version = manifest.get("format_version")
-    if not isinstance(version, int):
-        raise FileError(f"{path}: not a whole manifest: format_version = {shown(version)} is no integer")
-    if version > FORMAT_VERSION:
-        raise FileError(f"{path}: format version {version} is newer than {FORMAT_VERSION}")
+    if (version := manifest.get("format_version")) != FORMAT_VERSION:
+        raise FileError(f"{path}: format_version = {shown(version)} is not {FORMAT_VERSION}")
     try:
         _Manifest.model_validate(manifest)
     except ValidationError as error:
@@ -143,10 +146,9 @@ def _read_record(path: Path) -> dict[str, Any]:
     try:
         record = parse_json(read_text(path))
         _RECORD.validate_python(record)
-    except ValidationError as error:
-        raise FileError(f"{path}: cannot be read: {_first_problem(error)}") from error
     except ValueError as error:
-        raise FileError(f"{path}: cannot be read: {error}") from error
+        problem = _first_problem(error) if isinstance(error, ValidationError) else error
+        raise FileError(f"{path}: cannot be read: {problem}") from error
     return record
 
 
@@ -200,7 +202,7 @@ def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
     if not missing:
         files["scenes.h5"] = checksum(folder / "scenes.h5")
         manifest = _manifest(plan, files)
-        write_text(card(plan, manifest), folder / "README.md")
+        write_text(card(manifest), folder / "README.md")
         described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
         write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
         write_json(manifest, folder / "manifest.json", indent=1)
@@ -241,9 +243,6 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
         },
         "files": dict(sorted(files.items())),
     }
-
-
-# ---- Making a dataset: shards that are missing or broken, the manifest, the splits, the card.
 
 
 Progress = Callable[[str, int, int], None]

@@ -1,4 +1,9 @@
-"""The targets of a dataset: built-in shapes, mesh files, or depth maps that a game engine rendered."""
+"""The plan of a dataset: its targets and splits, scenes, samples and shards, and how each value is drawn.
+
+Numbers follow from the recipe alone. Scene `j` of target `t` has the index t · scenes_per_target + j, and its frame `k`
+the sample id index · frames.per_scene + k. Every value is drawn by Philox with a key of (seed of the split, name of the
+value, id): no draw depends on another, on the order, or on which machine makes the shard.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe, Targets, with_plume
+from spadwarp.dataset.recipe import SPLITS, UNIFORM, Distribution, Plume, Recipe, Targets
 from spadwarp.errors import ConfigError, FileError, MeshError
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.files import USD_ENDINGS
@@ -123,26 +128,6 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
     return tuple(TargetSource(name, splits[name], **source) for name, source in sources.items())
 
 
-def check_extents(recipe: Recipe, targets: tuple[TargetSource, ...], camera: Camera) -> None:
-    """Raises `ConfigError` that names each mesh file, and its extent, that is too large or too small to be seen where
-    the recipe puts it."""
-    if recipe.pose.fill is not None:
-        return
-    (nearest, farthest), (smallest, largest) = recipe.pose.distance.limits, recipe.pose.size.limits
-    problems = []
-    for target in (target for target in targets if target.mesh is not None):
-        lower, upper = _bounds(target)
-        sides = (upper - lower) * target.metres_per_unit(recipe.targets)
-        extent = f"targets.meshes: {target.mesh}: " + " x ".join(f"{side:.4g}" for side in sides) + " m"
-        advice = "in another unit? targets.mesh_scale is metres per unit, targets.mesh_size the longest side"
-        if 0.5 * largest * float(np.linalg.norm(sides)) >= nearest:
-            problems.append(f"{extent}: reaches the camera from pose.distance = {nearest:g} m; {advice}")
-        elif smallest * float(sides.max()) < farthest * camera.pixel_tangent:
-            problems.append(f"{extent}: less than a pixel at pose.distance = {farthest:g} m; {advice}")
-    if problems:
-        raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
-
-
 def _builtins(recipe: Recipe, problems: list[str]) -> list[str]:
     known, chosen = builtin_names(), recipe.targets
     if chosen.builtin == "all":
@@ -199,11 +184,7 @@ def _exported(source: TargetSource, camera: Camera) -> Truth:
     )
 
 
-# ---- What is in a dataset: its targets and splits, scenes, samples and shards, and how each value is drawn.
-
-
 _SHORTEST_RANGE = 0.05  # [m], the nearest at which a gate opens
-_UNIFORM = Distribution(low=0.0, high=1.0)
 
 _Draw = Callable[[str, Distribution | None], Any]
 
@@ -274,7 +255,10 @@ class Plan:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.targets = find_targets(recipe)
-        self.split_seeds = {split: _split_seed(recipe.seed, split) for split in SPLITS}
+        self.split_seeds = {
+            split: int(np.random.SeedSequence([recipe.seed, _word(split)]).generate_state(1, np.uint64)[0])
+            for split in SPLITS
+        }
         self.frames_per_scene = recipe.frames.per_scene
         self.scene_count = len(self.targets) * recipe.scenes_per_target
         self.sample_count = self.scene_count * self.frames_per_scene
@@ -288,8 +272,24 @@ class Plan:
         self.depth_offset, self.depth_step = self._depth_code()
 
     def check_targets(self) -> None:
-        """Raises `ConfigError` for mesh files that cannot be seen where the recipe puts them."""
-        check_extents(self.recipe, self.targets, self._template.camera)
+        """Raises `ConfigError` that names each mesh file, and its extent, that is too large or too small to be seen
+        where the recipe puts it."""
+        recipe, camera = self.recipe, self._template.camera
+        (nearest, farthest), (smallest, largest) = recipe.pose.distance.limits, recipe.pose.size.limits
+        problems = []
+        for target in self.targets if recipe.pose.fill is None else ():
+            if target.mesh is None:
+                continue
+            lower, upper = _bounds(target)
+            sides = (upper - lower) * target.metres_per_unit(recipe.targets)
+            extent = f"targets.meshes: {target.mesh}: " + " x ".join(f"{side:.4g}" for side in sides) + " m"
+            advice = "in another unit? targets.mesh_scale is metres per unit, targets.mesh_size the longest side"
+            if 0.5 * largest * float(np.linalg.norm(sides)) >= nearest:
+                problems.append(f"{extent}: reaches the camera from pose.distance = {nearest:g} m; {advice}")
+            elif smallest * float(sides.max()) < farthest * camera.pixel_tangent:
+                problems.append(f"{extent}: less than a pixel at pose.distance = {farthest:g} m; {advice}")
+        if problems:
+            raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
 
     def split_of(self, scene_index: int) -> str:
         """The split of a scene."""
@@ -321,7 +321,7 @@ class Plan:
         else:
             scene = scene.with_overrides({"medium.extinction": lengths / distance})
         if recipe.plume.probability > 0.0:
-            scene = with_plume(scene, recipe.plume, draw, distance)
+            scene = _with_plume(scene, recipe.plume, draw, distance)
         analytic = scene.analytic.to_dict()
         if (pulses := draw("exposure.pulses", recipe.exposure.pulses_per_depth_frame)) is not None:
             analytic["pulses_per_depth_frame"] = max(1, round(pulses))
@@ -372,7 +372,7 @@ class Plan:
         }
         fill = draw("pose.fill", pose.fill)
         targets = [source.placed(placed, chosen=self.recipe.targets, fill=fill, camera=camera)]
-        if draw("backdrop.probability", _UNIFORM) < wall.probability:
+        if draw("backdrop.probability", UNIFORM) < wall.probability:
             behind = distance + draw("backdrop.behind", wall.behind)
             side = 4.0 * behind * camera.pixel_tangent * max(camera.width, camera.height)
             tilt = [draw("backdrop.tilt.x", wall.tilt_deg), draw("backdrop.tilt.y", wall.tilt_deg), 0.0]
@@ -443,9 +443,35 @@ class Plan:
         return math.floor(near / step - 1.0) * step, step
 
 
+def _with_plume(scene: Scene, plume: Plume, draw: _Draw, distance: float) -> Scene:
+    """The scene, in part of the draws with a plume before what is at a distance on the axis [m].
+
+    The optical depth is that of the cells on the axis; a box that does not meet it keeps an extinction of 1/m.
+    """
+    if draw("plume.probability", UNIFORM) >= plume.probability:
+        return scene
+    grid = {
+        "shape": draw("plume.shape", Distribution(choices=plume.shape)),
+        "size": [draw("plume.size", plume.size)],
+        "cells": [plume.cells],
+        "albedo": draw("plume.albedo", plume.albedo),
+        "turbulence": min(draw("plume.turbulence", plume.turbulence), 3.0),
+        "seed": int(draw("plume.seed", UNIFORM) * 2**53),
+        "translation": [
+            draw("plume.shift.x", plume.shift),
+            draw("plume.shift.y", plume.shift),
+            draw("plume.place", plume.place) * distance,
+        ],
+        "extinction": 1.0,
+    }
+    unit = scene.with_overrides({"medium.grid": grid})
+    end = (0.0, 0.0, distance)
+    added = unit.optical_depth((0.0, 0.0, 0.0), end) - scene.medium.extinction * distance
+    if added < 1e-3:
+        return unit
+    wanted = draw("plume.optical_depth", plume.optical_depth)
+    return unit.with_overrides({"medium.grid.extinction": min(wanted / added, 1e6)})
+
+
 def _word(text: str) -> int:
     return zlib.crc32(text.encode())
-
-
-def _split_seed(seed: int, split: str) -> int:
-    return int(np.random.SeedSequence([seed, _word(split)]).generate_state(1, np.uint64)[0])

@@ -1,10 +1,15 @@
-"""Distributions of a recipe, and what all its tables have in common."""
+"""Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
+
+A recipe holds a scene, given as in a scene file, and distributions of what changes from scene to scene. A distribution
+is a number (a constant), a list (each value equally likely), or a table `{low = , high = }` (uniform; with `log = true`
+uniform in the logarithm).
+"""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -27,7 +32,6 @@ from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
-from spadwarp.scene.renamed import current_fields, current_path
 from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
@@ -144,12 +148,9 @@ def plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-# ---- Random plumes between camera and target, as augmentation.
-
-
 Shape = Literal["cloud", "plume", "sediment"]
 
-_SEEDS = Distribution(low=0.0, high=1.0)
+UNIFORM = Distribution(low=0.0, high=1.0)
 
 
 class Plume(Table):
@@ -170,39 +171,6 @@ class Plume(Table):
         constant(0.5), description="standard deviation of the logarithm of its density, up to 3"
     )
     cells: Whole = Field(32, ge=1, le=256, description="cells along the edges of its box")
-
-
-def with_plume(scene: Scene, plume: Plume, draw: Callable[[str, Distribution | None], Any], distance: float) -> Scene:
-    """The scene, in part of the draws with a plume before what is at a distance on the axis [m].
-
-    The optical depth is that of the cells on the axis; a box that does not meet it keeps an extinction of 1/m.
-    """
-    if draw("plume.probability", _SEEDS) >= plume.probability:
-        return scene
-    grid = {
-        "shape": draw("plume.shape", Distribution(choices=plume.shape)),
-        "size": [draw("plume.size", plume.size)],
-        "cells": [plume.cells],
-        "albedo": draw("plume.albedo", plume.albedo),
-        "turbulence": min(draw("plume.turbulence", plume.turbulence), 3.0),
-        "seed": int(draw("plume.seed", _SEEDS) * 2**53),
-        "translation": [
-            draw("plume.shift.x", plume.shift),
-            draw("plume.shift.y", plume.shift),
-            draw("plume.place", plume.place) * distance,
-        ],
-        "extinction": 1.0,
-    }
-    unit = scene.with_overrides({"medium.grid": grid})
-    end = (0.0, 0.0, distance)
-    added = unit.optical_depth((0.0, 0.0, 0.0), end) - scene.medium.extinction * distance
-    if added < 1e-3:
-        return unit
-    wanted = draw("plume.optical_depth", plume.optical_depth)
-    return unit.with_overrides({"medium.grid.extinction": min(wanted / added, 1e6)})
-
-
-# ---- Recipes: what a dataset is drawn from. TOML in, frozen and validated models out.
 
 
 _MOST_TRIED = 1000  # values of a field that varies
@@ -386,18 +354,17 @@ class Recipe(Table):
         """
         name = None if source is None else str(source)
         try:
-            recipe = cls.model_validate(_with_paths(_current(tables), source))
+            recipe = cls.model_validate(_with_paths(tables, source))
         except ValidationError as error:
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
+        part = "scene"
         try:
             template = recipe.template()
-        except ConfigError as error:
-            raise ConfigError([f"scene: {line}" for line in error.problems], source=name) from None
-        try:
+            part = "vary"
             recipe._check_vary(template)
         except ConfigError as error:
-            raise ConfigError([f"vary: {line}" for line in error.problems], source=name) from None
+            raise ConfigError([f"{part}: {line}" for line in error.problems], source=name) from None
         return recipe
 
     def _check_vary(self, template: Scene) -> None:
@@ -428,7 +395,7 @@ class Recipe(Table):
         pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
         tables = self.to_dict()
         for key, value in pairs:
-            parts = current_path(key if isinstance(key, str) else ".".join(map(str, key))).split(".")
+            parts = (key if isinstance(key, str) else ".".join(map(str, key))).split(".")
             inner = tables
             for part in parts[:-1]:
                 inner = inner.setdefault(part, {})
@@ -452,26 +419,18 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     return Recipe.from_dict(tables, source=path)
 
 
-def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's own tables with former names replaced; a scene replaces its own."""
-    exposure = tables.get("exposure")
-    return {**tables, "exposure": current_fields("exposure", exposure)} if isinstance(exposure, Mapping) else {**tables}
-
-
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """The tables with the paths of targets made absolute."""
+    """The tables with the paths of targets and of the trajectory made absolute."""
+    changed = dict(tables)
     if source is None:
-        return dict(tables)
-    folder = Path(source).absolute().parent
-    if isinstance(moves := tables.get("trajectory"), str) and moves:
-        tables = {**tables, "trajectory": str(folder / os.path.expanduser(moves))}
-    targets = tables.get("targets")
-    if not isinstance(targets, Mapping):
-        return dict(tables)
-    changed = dict(targets)
-    for name in ("meshes", "exports"):
-        if isinstance(given := targets.get(name), (list, tuple)):
-            changed[name] = [
-                str(folder / os.path.expanduser(path)) if isinstance(path, str) else path for path in given
-            ]
-    return {**tables, "targets": changed}
+        return changed
+
+    def placed(path: Any) -> Any:
+        return str(Path(source).absolute().parent / os.path.expanduser(path)) if isinstance(path, str) else path
+
+    if tables.get("trajectory"):
+        changed["trajectory"] = placed(tables["trajectory"])
+    if isinstance(targets := tables.get("targets"), Mapping):
+        lists = {name: targets[name] for name in ("meshes", "exports") if isinstance(targets.get(name), (list, tuple))}
+        changed["targets"] = {**targets, **{name: list(map(placed, paths)) for name, paths in lists.items()}}
+    return changed

@@ -1,4 +1,5 @@
-"""A rendered scene of a dataset and its frames, and what both ways to render it share."""
+"""One scene of a dataset rendered by the analytic model or by photon transport: its maps, and its frames as they are
+stored."""
 
 from __future__ import annotations
 
@@ -34,29 +35,16 @@ class StoredFrames:
 
     Attributes:
         depth, intensity: Codes, uint16 and uint8 `[K, H, W]`.
-        labels: uint8 `[K, H, ceil(W/8)]`.
+        label: Packed bits, uint8 `[K, H, ceil(W/8)]`.
         intensity_step: Recorded photons per unit of intensity.
+        counts: Of a traced scene, int32 `[K, H, W, T]`.
     """
 
     depth: NDArray[np.uint16]
     intensity: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
+    label: NDArray[np.uint8]
     intensity_step: float
-
-
-@dataclass(frozen=True, eq=False)
-class Histograms:
-    """Histograms of a scene that was traced.
-
-    Attributes:
-        expected: Expected counts of a frame before pile-up, float16 `[H, W, T]`.
-        counts: Of the frames, int32 `[K, H, W, T]`.
-        polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
-    """
-
-    expected: NDArray[np.float16]
-    counts: NDArray[np.int32]
-    polarisation: NDArray[np.float16] | None = None
+    counts: NDArray[np.int32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +59,9 @@ class RenderedScene:
         profile: Density of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`, and the edges of its
             bins [m].
         signal, backscatter: Expected detections per pulse, median over the target's pixels and over all.
-        frames: Codes of depth and intensity, labels.
-        histograms: Of a scene that was traced photon by photon, else None.
+        frames: Codes of depth and intensity, labels, counts.
+        expected: Expected counts of a frame before pile-up, float16 `[H, W, T]`; None for a scene that was not traced.
+        polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
     """
 
     draw: SceneDraw
@@ -83,7 +72,8 @@ class RenderedScene:
     signal: float
     backscatter: float
     frames: StoredFrames
-    histograms: Histograms | None = None
+    expected: NDArray[np.float16] | None = None
+    polarisation: NDArray[np.float16] | None = None
 
 
 def intensity_step(brightest: float) -> float:
@@ -115,9 +105,6 @@ def with_exposure(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64]
         )
     pulses = min(max(1, round(draw.signal_photons / float(np.median(detections)))), most)
     return scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
-
-
-# ---- One scene of a dataset by the analytic model: truth, maps, and the frames drawn from them.
 
 
 _MOST_PULSES = 2**40
@@ -215,7 +202,7 @@ def _draw_frames(
     return StoredFrames(
         depth=depth.numpy().reshape(count, *shape),
         intensity=intensity.numpy().reshape(count, *shape),
-        labels=labels.numpy().reshape(count, shape[0], -1),
+        label=labels.numpy().reshape(count, shape[0], -1),
         intensity_step=coding.intensity_step,
     )
 
@@ -236,9 +223,6 @@ def _background(
     probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
     flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
     return probability, flat, np.ones(len(draw.fractions))
-
-
-# ---- One scene of a dataset by photon transport: expected histograms, counts of the camera, depth frames from counts.
 
 
 _MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
@@ -272,11 +256,8 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
         frames=_stored(plan, scene, frames, device=device),
-        histograms=Histograms(
-            expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
-            counts=frames.counts,
-            polarisation=polarisation,
-        ),
+        expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
+        polarisation=polarisation,
     )
 
 
@@ -292,8 +273,9 @@ def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> 
     return StoredFrames(
         depth=codes,
         intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
-        labels=np.packbits(_reports_background(frames, time), axis=-1),
+        label=np.packbits(_reports_background(frames, time), axis=-1),
         intensity_step=step,
+        counts=frames.counts,
     )
 
 

@@ -1,4 +1,9 @@
-"""The columns of a dataset's files: name, unit, meaning, and where a scene's values come from."""
+"""The files of one shard: frames, the scenes that they are of, and histograms; their columns, written and read.
+
+The same recipe gives the same bytes. Counts are stored as a cube for each frame, or event by event: the index
+y · W · T + x · T + k of each bin that holds counts, and their number. Frame n's events are those from `event_start[n]`
+to `event_start[n + 1]`.
+"""
 
 from __future__ import annotations
 
@@ -29,38 +34,79 @@ from spadwarp.units import range_from_time
 
 FORMAT_VERSION = 1
 
-PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-"""How HDF5 packs arrays."""
+HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
+"""Cubes of a frame."""
 
-FRAME_COLUMNS: dict[str, tuple[str, str]] = {
-    "depth": ("m", "noisy planar depth = offset + step * code; code 0: no return"),
-    "label": ("1", "the pixel reports backscatter or other background: np.packbits along rows, first pixel highest"),
-    "intensity": ("1", "recorded photons = intensity_step of the frame * code, cut at 255"),
-    "scene": ("1", "index into scenes.h5"),
-    "sample": ("1", "id of the frame in the whole dataset"),
-    "seed": ("1", "key of the frame's random numbers, together with its sample id"),
-    "target": ("1", "index into the targets of manifest.json"),
-    "backscatter_fraction": ("1", "requested part of the pixels that report backscatter; NaN: the photon rates decide"),
-    "attenuation_lengths": ("1", "extinction times distance, one way"),
-    "distance": ("m", "of the target's centre along the optical axis"),
-    "pulses": ("1", "laser pulses of the frame"),
-    "intensity_step": ("1", "recorded photons per unit of intensity"),
-}
-"""Datasets of a frames file, all with one first dimension: unit and meaning."""
+_LIBRARY = ("v110", "v110")  # one version of the file format, whichever HDF5 writes it
+_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+_READ_OFTEN = ("depth", "bound")
+_COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
+_READ_COLUMNS = (
+    "scene",
+    "sample",
+    "target",
+    "backscatter_fraction",
+    "attenuation_lengths",
+    "distance",
+    "intensity_step",
+)
+_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
 
-HISTOGRAM_COLUMNS: dict[str, tuple[str, str]] = {
-    "scene": ("1", "index into scenes.h5"),
-    "expected": ("1", "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"),
-    "polarisation": ("1", "degree of polarisation of each bin's light, by both channels; NaN where none arrives"),
-    "gate_start": ("s", "start of bin 0 after the pulse left the laser"),
-    "bin_width": ("s", "width of a bin"),
-    "sample": ("1", "id of the frame in the whole dataset"),
-    "counts": ("1", "counts of the frame"),
-    "event_start": ("1", "first event of each frame; one entry more than frames"),
-    "event_index": ("1", "y * W * T + x * T + bin"),
-    "event_count": ("1", "counts in that bin"),
+
+@dataclass(frozen=True)
+class Column:
+    """A dataset of a file, or a field of an exported frame: type (`object`: text; a tuple: one of them), unit, meaning,
+    and the shape of a row."""
+
+    kind: Any
+    unit: str
+    meaning: str
+    shape: tuple[int, ...] = ()
+
+    @property
+    def is_text(self) -> bool:
+        return self.kind is object
+
+
+FRAME_COLUMNS: dict[str, Column] = {
+    "depth": Column(np.uint16, "m", "noisy planar depth = offset + step * code; code 0: no return"),
+    "label": Column(
+        np.uint8, "1", "the pixel reports backscatter or other background: np.packbits along rows, first pixel highest"
+    ),
+    "intensity": Column(np.uint8, "1", "recorded photons = intensity_step of the frame * code, cut at 255"),
+    "scene": Column(np.int32, "1", "index into scenes.h5"),
+    "sample": Column(np.int64, "1", "id of the frame in the whole dataset"),
+    "seed": Column(np.uint64, "1", "key of the frame's random numbers, together with its sample id"),
+    "target": Column(np.int32, "1", "index into the targets of manifest.json"),
+    "backscatter_fraction": Column(
+        np.float32, "1", "requested part of the pixels that report backscatter; NaN: the photon rates decide"
+    ),
+    "attenuation_lengths": Column(np.float32, "1", "extinction times distance, one way"),
+    "distance": Column(np.float32, "m", "of the target's centre along the optical axis"),
+    "pulses": Column(np.int64, "1", "laser pulses of the frame"),
+    "intensity_step": Column(np.float32, "1", "recorded photons per unit of intensity"),
 }
-"""Datasets of a histograms file: unit and meaning."""
+"""Datasets of a frames file, all with one first dimension."""
+
+HISTOGRAM_COLUMNS: dict[str, Column] = {
+    "scene": FRAME_COLUMNS["scene"],
+    "expected": Column(
+        np.float16,
+        "1",
+        "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light",
+    ),
+    "polarisation": Column(
+        np.float16, "1", "degree of polarisation of each bin's light, by both channels; NaN where none arrives"
+    ),
+    "gate_start": Column(np.float64, "s", "start of bin 0 after the pulse left the laser"),
+    "bin_width": Column(np.float64, "s", "width of a bin"),
+    "sample": FRAME_COLUMNS["sample"],
+    "counts": Column(_COUNTS, "1", "counts of the frame"),
+    "event_start": Column(np.int64, "1", "first event of each frame; one entry more than frames"),
+    "event_index": Column(np.uint32, "1", "y * W * T + x * T + bin"),
+    "event_count": Column(_COUNTS, "1", "counts in that bin"),
+}
+"""Datasets of a histograms file."""
 
 _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
     "distance": ("m", "of the target's centre along the optical axis"),
@@ -85,226 +131,35 @@ _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Column:
-    """A field of an exported frame: shape, type (`object`: text), unit and meaning."""
-
-    shape: tuple[int, ...]
-    kind: np.dtype[Any]
-    unit: str
-    meaning: str
-
-    @property
-    def is_text(self) -> bool:
-        return self.kind.kind == "O"
-
-
-def describe(file: Any, columns: Mapping[str, tuple[str, str]]) -> None:
-    """Writes unit and meaning to the datasets that an open HDF5 file holds."""
-    for name, stored in file.items():
-        unit, text = columns[name]
-        stored.attrs.update({"unit": unit, "description": text})
-
-
-def scene_columns(shape: tuple[int, int]) -> dict[str, tuple[tuple[int, ...], Any, str, str]]:
-    """Datasets of `scenes.h5`, all with one first dimension: shape of a row, type, unit, meaning.
-
-    `shape`: height and width of the images.
-    """
-    height, width = shape
-    real: Any = np.float32
+def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
+    """Datasets of `scenes.h5`, all with one first dimension; `shape`: height and width of the images."""
+    real, bins = np.float32, PROFILE_BINS
     return {
-        "depth": ((height, width), real, "m", "true planar depth; NaN where nothing is hit"),
-        "bound": ((height, width), real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate"),
-        "normal": ((height, width, 3), np.float16, "1", "unit normals towards the camera"),
-        "albedo": ((height, width), np.float16, "1", "Lambertian reflectance"),
-        "backscatter_profile": ((PROFILE_BINS,), real, "1/m", "density of the water's backscatter over depth, on axis"),
-        "profile_edges": ((PROFILE_BINS + 1,), real, "m", "edges of the profile's bins"),
-        "target": ((), np.int32, "1", "index into the targets of manifest.json"),
-        "target_name": ((), "S64", "1", "its name"),
-        "translation": ((3,), real, "m", "of the target"),
-        "rotation_deg": ((3,), real, "deg", "of the target about its own x, y, z"),
-        "scale": ((3,), real, "1", "of the target"),
-        "laser_position": ((3,), real, "m", "in the camera frame"),
-        **{name: ((), np.float64, unit, text) for name, (unit, text) in _SCENE_NUMBERS.items()},
-        "config": ((), "S8192", "1", "the scene as TOML"),
+        "depth": Column(real, "m", "true planar depth; NaN where nothing is hit", shape),
+        "bound": Column(real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate", shape),
+        "normal": Column(np.float16, "1", "unit normals towards the camera", (*shape, 3)),
+        "albedo": Column(np.float16, "1", "Lambertian reflectance", shape),
+        "backscatter_profile": Column(real, "1/m", "density of the water's backscatter over depth, on axis", (bins,)),
+        "profile_edges": Column(real, "m", "edges of the profile's bins", (bins + 1,)),
+        "target": FRAME_COLUMNS["target"],
+        "target_name": Column("S64", "1", "its name"),
+        "translation": Column(real, "m", "of the target", (3,)),
+        "rotation_deg": Column(real, "deg", "of the target about its own x, y, z", (3,)),
+        "scale": Column(real, "1", "of the target", (3,)),
+        "laser_position": Column(real, "m", "in the camera frame", (3,)),
+        **{name: Column(np.float64, unit, text) for name, (unit, text) in _SCENE_NUMBERS.items()},
+        "config": Column("S8192", "1", "the scene as TOML"),
     }
 
 
-def scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
-    """A scene's values of `scene_columns`."""
-    scene, draw = rendered.scene, rendered.draw
-    medium, source, advance = scene.medium, plan.targets[draw.target], port_advance(scene)
-    placed: Any = scene.targets[0] if scene.targets else None
-    vectors = {name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")}
-    config = scene.to_toml()
-    if source.mesh is not None:
-        config = config.replace(str(source.mesh), source.mesh.name)  # without the folders of this machine
-    return {
-        "depth": rendered.truth.depth,
-        "bound": rendered.bound,
-        "normal": rendered.truth.normal,
-        "albedo": rendered.truth.reflectance,
-        "backscatter_profile": rendered.profile[0],
-        "profile_edges": rendered.profile[1],
-        "target": draw.target,
-        "target_name": source.name,
-        **vectors,
-        "laser_position": scene.beam.position,
-        "distance": draw.distance,
-        "attenuation_lengths": draw.attenuation_lengths,
-        **{name: getattr(medium, name) for name in ("absorption", "scattering", "extinction", "group_index")},
-        "anisotropy": phase_function(medium).mean_cosine,
-        "gate_near": range_from_time(scene.gate.start, medium.group_index) + advance,
-        "gate_far": range_from_time(scene.gate.stop, medium.group_index) + advance,
-        "reflectance": getattr(placed, "reflectance", np.nan),
-        "pulses": scene.pulses_per_depth_frame,
-        "photons": draw.photons or 0,
-        "signal": rendered.signal,
-        "backscatter": rendered.backscatter,
-        "pulse_energy": scene.laser.pulse_energy,
-        "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
-        "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
-        "pde": scene.detections_per_photon,
-        "dark_count_rate": scene.detector.dark_count_rate,
-        "config": config.encode(),
-    }
+def checksum(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a file."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"bytes": path.stat().st_size, "sha256": digest}
 
 
-# ---- Histograms of traced scenes in one file a shard: expected counts of the scenes, counts of the frames.
-
-
-HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
-"""Cubes of a frame; methods of `HistogramFile` have these names."""
-
-_COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
-_KINDS = {"scene": np.int32, "gate_start": np.float64, "bin_width": np.float64, "sample": np.int64}
-
-
-class HistogramWriter:
-    """Takes the traced scenes of a shard one by one into an open file; `close` writes the rest."""
-
-    def __init__(self, file: Any, scenes: int, *, counts: str) -> None:
-        self._file, self._scenes, self._counts = file, scenes, counts
-        self._expected: Any = None
-        self._polarisation: Any = None
-        self._numbers: dict[str, list[Any]] = {name: [] for name in _KINDS}
-        self._events: list[tuple[NDArray[np.uint32], NDArray[np.int32]]] = []
-
-    def add(self, rendered: RenderedScene, samples: NDArray[np.int64]) -> None:
-        """The next scene, and the ids of its frames."""
-        histograms, gate = rendered.histograms, rendered.scene.gate
-        assert histograms is not None
-        height, width, bins = histograms.expected.shape
-        if self._expected is None:
-            rows = max(1, min(height, (1 << 20) // (2 * width * bins)))  # chunks of 1 MiB
-            self._chunk = (1, rows, width, bins)
-            self._expected = self._create("expected", (self._scenes, height, width, bins), np.float16)
-        self._expected[len(self._numbers["scene"])] = histograms.expected
-        if histograms.polarisation is not None:
-            if self._polarisation is None:  # NaN in scenes without
-                self._polarisation = self._create("polarisation", self._expected.shape, np.float16, fillvalue=np.nan)
-            self._polarisation[len(self._numbers["scene"])] = histograms.polarisation
-        for name, value in (("scene", rendered.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
-            self._numbers[name].append(value)
-        self._numbers["sample"].extend(samples)
-        if self._counts != "none":
-            for frame in histograms.counts.reshape(len(histograms.counts), -1):
-                filled = np.flatnonzero(frame)
-                self._events.append((filled.astype(np.uint32), frame[filled]))
-
-    def close(self) -> None:
-        """Writes what is only known at the end."""
-        for name, kind in _KINDS.items():
-            self._file.create_dataset(name, data=np.array(self._numbers[name], kind), track_times=False)
-        if self._events:
-            self._write_counts()
-        describe(self._file, HISTOGRAM_COLUMNS)
-
-    def _create(self, name: str, shape: tuple[int, ...], kind: Any, **choices: Any) -> Any:
-        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **PACKED, **choices)
-
-    def _write_counts(self) -> None:
-        indices, counts = zip(*self._events, strict=True)
-        sizes = [part.size for part in counts]
-        kind = np.min_scalar_type(max((int(part.max(initial=0)) for part in counts), default=0))
-        shape = self._expected.shape[1:]
-        dense_bytes = len(counts) * math.prod(shape) * kind.itemsize
-        if self._counts == "dense" or (self._counts == "smaller" and dense_bytes <= (4 + kind.itemsize) * sum(sizes)):
-            stored = self._create("counts", (len(counts), *shape), kind)
-            for row, (index, count) in enumerate(self._events):
-                stored[row] = _cube(index, count, shape, kind)
-            return
-        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        self._file.create_dataset("event_start", data=starts, track_times=False)
-        events = {"event_index": np.concatenate(indices), "event_count": np.concatenate(counts).astype(kind)}
-        for name, values in events.items():
-            packed = {"chunks": (min(values.size, 1 << 18),), **PACKED} if values.size else {}
-            self._file.create_dataset(name, data=values, track_times=False, **packed)
-
-
-class HistogramFile:
-    """The histograms of an open file, by scene index and by sample id; `fields`: which of `HISTOGRAM_FIELDS` it may
-    hold."""
-
-    def __init__(self, file: Hdf5File, shape: tuple[int, int]) -> None:
-        self._scenes, self._samples = (
-            {int(number): row for row, number in enumerate(file.array(name, _KINDS[name], (None,)))}
-            for name in ("scene", "sample")
-        )
-        scenes, samples = len(file.stored("scene", np.int32, (None,))), len(file.stored("sample", np.int64, (None,)))
-        self._expected = file.stored("expected", np.float16, (scenes, *shape, None))
-        self.shape: tuple[int, ...] = self._expected.shape[1:]
-        self._polarisation = None
-        self.fields = HISTOGRAM_FIELDS if "polarisation" in file else HISTOGRAM_FIELDS[:-1]
-        if "polarisation" in file:
-            self._polarisation = file.stored("polarisation", np.float16, self._expected.shape)
-        self._counts = file.stored("counts", _COUNTS, (samples, *self.shape)) if "counts" in file else None
-        self._starts: NDArray[np.int64] | None = None
-        if "event_start" in file:
-            self._starts = file.array("event_start", np.int64, (samples + 1,))
-            self._index = file.stored("event_index", np.uint32, (None,))
-            self._events = file.stored("event_count", _COUNTS, (len(self._index),))
-            if self._starts[0] != 0 or self._starts[-1] != len(self._index) or (np.diff(self._starts) < 0).any():
-                file.refuse("event_start", f"does not divide {len(self._index)} events")
-        self.path = file.path
-
-    def expected(self, scene: int) -> NDArray[np.float32] | None:
-        """Expected counts of a frame `[H, W, T]`; None for a scene that was not traced."""
-        row = self._scenes.get(scene)
-        return None if row is None else self._expected[row].astype(np.float32)
-
-    def polarisation(self, scene: int) -> NDArray[np.float32] | None:
-        """Degree of polarisation `[H, W, T]`; None for a scene that was not traced, or without polarised light."""
-        row = self._scenes.get(scene)
-        return None if row is None or self._polarisation is None else self._polarisation[row].astype(np.float32)
-
-    def counts(self, sample: int) -> NDArray[np.float32] | None:
-        """Counts `[H, W, T]` of a frame; None where there are none."""
-        row = self._samples.get(sample)
-        if row is None or (self._starts is None and self._counts is None):
-            return None
-        if self._starts is None:
-            assert self._counts is not None
-            return self._counts[row].astype(np.float32)
-        part = slice(int(self._starts[row]), int(self._starts[row + 1]))
-        index = self._index[part]
-        if index.size and index.max() >= math.prod(self.shape):
-            raise FileError(f"{self.path}: event_index is outside the histograms {self.shape} in row {row}")
-        return _cube(index, self._events[part], self.shape, np.float32)
-
-
-def _cube(index: NDArray[Any], counts: NDArray[Any], shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
-    cube = np.zeros(int(np.prod(shape)), kind)
-    cube[index] = counts
-    return cube.reshape(shape)
-
-
-# ---- The files of one shard, put together in memory; the same recipe gives the same bytes.
-
-
-_LIBRARY = ("v110", "v110")  # one version of the file format, whichever HDF5 writes it
-_READ_OFTEN = ("depth", "bound")
+# Writing
 
 
 def write_shard(
@@ -331,29 +186,23 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
 
     with write_hdf5(folder / "scenes.h5", libver=_LIBRARY) as file:
         file.attrs.update({"format": "spadwarp scenes", "format_version": FORMAT_VERSION, "name": plan.recipe.name})
-        for name, (shape, kind, unit, text) in scene_columns(plan.shape).items():
+        columns = scene_columns(plan.shape)
+        for name, column in columns.items():
             # The low-level interface, since h5py's own virtual datasets hold the time of day.
             layout = h5p.create(h5p.DATASET_CREATE)
             layout.set_layout(h5d.VIRTUAL)
             layout.set_obj_track_times(False)
-            whole, rest = (plan.scene_count, *shape), (0,) * len(shape)
+            whole, rest = (plan.scene_count, *column.shape), (0,) * len(column.shape)
             for shard in plan.shards:
-                part = (shard.scenes, *shape)
+                part = (shard.scenes, *column.shape)
                 space = h5s.create_simple(whole)
                 space.select_hyperslab((shard.first_scene, *rest), part)
                 layout.set_virtual(space, shard.scenes_file.encode(), name.encode(), h5s.create_simple(part))
-            dtype = np.dtype(kind)
+            dtype = np.dtype(column.kind)
             if dtype.kind == "f":
                 layout.set_fill_value(np.array([np.nan], dtype))
             h5d.create(file.id, name.encode(), h5t.py_create(dtype, logical=True), h5s.create_simple(whole), layout)
-            file[name].attrs.update({"unit": unit, "description": text})
-
-
-def checksum(path: Path) -> dict[str, Any]:
-    """Size and SHA-256 of a file."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"bytes": path.stat().st_size, "sha256": digest}
+        _describe(file, columns)
 
 
 def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
@@ -374,75 +223,175 @@ def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
     }
 
 
+def _describe(file: Any, columns: Mapping[str, Column]) -> None:
+    """Writes unit and meaning to the datasets that an open file holds."""
+    for name, stored in file.items():
+        stored.attrs.update({"unit": columns[name].unit, "description": columns[name].meaning})
+
+
+def _image_widths(width: int) -> dict[str, int]:
+    """Columns of the stored images of a frame."""
+    return {"depth": width, "label": (width + 7) // 8, "intensity": width}
+
+
 def _fill(plan: Plan, shard: Shard, files: list[Any], *, device: str | None, threads: int | None) -> None:
     frames_file, scenes_file = files[:2]
     each, (height, width) = plan.frames_per_scene, plan.shape
     packed = plan.recipe.frames.compression == "gzip"
-    stored, count = {}, shard.scenes * each
-    for name, columns, kind in (
-        ("depth", width, np.uint16),
-        ("label", (width + 7) // 8, np.uint8),
-        ("intensity", width, np.uint8),
-    ):
-        how: dict[str, Any] = {"chunks": (1, height, columns), **PACKED} if packed else {}
-        stored[name] = frames_file.create_dataset(name, (count, height, columns), kind, track_times=False, **how)
-    stored["depth"].attrs.update({"step": plan.depth_step, "offset": plan.depth_offset})
-    stored["intensity"].attrs["step"] = 1.0
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_COLUMNS if name not in stored}
-    table = scene_columns(plan.shape)
-    records: dict[str, list[Any]] = {name: [] for name in table}
-    histograms = None
-    if len(files) > 2:
-        traced = sum(plan.is_traced(index) for index in shard.indices)
-        histograms = HistogramWriter(files[2], traced, counts=plan.recipe.monte_carlo.counts)
+    images = {}
+    for name, across in _image_widths(width).items():
+        how: dict[str, Any] = {"chunks": (1, height, across), **_PACKED} if packed else {}
+        shape = (shard.scenes * each, height, across)
+        images[name] = frames_file.create_dataset(name, shape, FRAME_COLUMNS[name].kind, track_times=False, **how)
+    images["depth"].attrs.update({"step": plan.depth_step, "offset": plan.depth_offset})
+    images["intensity"].attrs["step"] = 1.0
+    columns = scene_columns(plan.shape)
+    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_COLUMNS if name not in images}
+    records: dict[str, list[Any]] = {name: [] for name in columns}
+    histograms = _HistogramWriter(files[2], plan, shard) if len(files) > 2 else None
 
     for number, rendered in enumerate(_rendered(plan, shard, device, threads)):
-        part, frames = slice(number * each, (number + 1) * each), rendered.frames
-        for name, codes in (("depth", frames.depth), ("label", frames.labels), ("intensity", frames.intensity)):
-            stored[name][part] = codes
+        for name, stored in images.items():
+            stored[number * each : (number + 1) * each] = getattr(rendered.frames, name)
         for name, value in _frame_rows(plan, shard, rendered).items():
-            rows[name].append(value)
-        for name, value in scene_row(plan, rendered).items():
+            rows[name].append(np.broadcast_to(np.asarray(value, FRAME_COLUMNS[name].kind), each))
+        for name, value in _scene_row(plan, rendered).items():
             records[name].append(value)
-        if histograms is not None and rendered.histograms is not None:
+        if histograms is not None and rendered.expected is not None:
             histograms.add(rendered, rows["sample"][-1])
 
     if histograms is not None:
         histograms.close()
     for name, parts in rows.items():
         frames_file.create_dataset(name, data=np.concatenate(parts), track_times=False)
-    describe(frames_file, FRAME_COLUMNS)
-    for name, (shape, kind, _, _) in table.items():
-        pack = name == "config" or (len(shape) > 1 and (packed or name not in _READ_OFTEN))
-        how = {"chunks": (1, *shape), **PACKED} if pack else {}
-        scenes_file.create_dataset(name, data=np.array(records[name], dtype=kind), track_times=False, **how)
-    describe(scenes_file, {name: column[2:] for name, column in table.items()})
+    _describe(frames_file, FRAME_COLUMNS)
+    for name, column in columns.items():
+        pack = name == "config" or (len(column.shape) > 1 and (packed or name not in _READ_OFTEN))
+        how = {"chunks": (1, *column.shape), **_PACKED} if pack else {}
+        scenes_file.create_dataset(name, data=np.array(records[name], dtype=column.kind), track_times=False, **how)
+    _describe(scenes_file, columns)
 
 
-def _frame_rows(plan: Plan, shard: Shard, rendered: RenderedScene) -> dict[str, NDArray[Any]]:
-    draw, count = rendered.draw, plan.frames_per_scene
-    first = draw.index * count
-    same = {
-        "scene": np.int32(draw.index),
-        "seed": np.uint64(plan.split_seeds[shard.split] if draw.photons is None else draw.seed),
-        "target": np.int32(draw.target),
-        "attenuation_lengths": np.float32(draw.attenuation_lengths),
-        "distance": np.float32(draw.distance),
-        "pulses": np.int64(rendered.scene.pulses_per_depth_frame),
-        "intensity_step": np.float32(rendered.frames.intensity_step),
-    }
+def _frame_rows(plan: Plan, shard: Shard, rendered: RenderedScene) -> dict[str, Any]:
+    """Values of `FRAME_COLUMNS` but images, for each frame or for all."""
+    draw, first = rendered.draw, rendered.draw.index * plan.frames_per_scene
     return {
-        **{name: np.full(count, value) for name, value in same.items()},
-        "sample": np.arange(first, first + count, dtype=np.int64),
-        "backscatter_fraction": np.array(draw.fractions, np.float32),
+        "scene": draw.index,
+        "sample": np.arange(first, first + plan.frames_per_scene),
+        "seed": plan.split_seeds[shard.split] if draw.photons is None else draw.seed,
+        "target": draw.target,
+        "backscatter_fraction": draw.fractions,
+        "attenuation_lengths": draw.attenuation_lengths,
+        "distance": draw.distance,
+        "pulses": rendered.scene.pulses_per_depth_frame,
+        "intensity_step": rendered.frames.intensity_step,
     }
 
 
-def render_scene(plan: Plan, index: int, *, device: str | None = None, threads: int | None = None) -> RenderedScene:
-    """Draws the scene `index` and renders it on a device.
+def _scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
+    """A scene's values of `scene_columns`."""
+    scene, draw = rendered.scene, rendered.draw
+    medium, source, advance = scene.medium, plan.targets[draw.target], port_advance(scene)
+    placed: Any = scene.targets[0] if scene.targets else None
+    config = scene.to_toml()
+    if source.mesh is not None:
+        config = config.replace(str(source.mesh), source.mesh.name)  # without the folders of this machine
+    return {
+        "depth": rendered.truth.depth,
+        "bound": rendered.bound,
+        "normal": rendered.truth.normal,
+        "albedo": rendered.truth.reflectance,
+        "backscatter_profile": rendered.profile[0],
+        "profile_edges": rendered.profile[1],
+        "target": draw.target,
+        "target_name": source.name,
+        **{name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")},
+        "laser_position": scene.beam.position,
+        **{name: getattr(draw, name) for name in ("distance", "attenuation_lengths")},
+        **{name: getattr(medium, name) for name in ("absorption", "scattering", "extinction", "group_index")},
+        "anisotropy": phase_function(medium).mean_cosine,
+        "gate_near": range_from_time(scene.gate.start, medium.group_index) + advance,
+        "gate_far": range_from_time(scene.gate.stop, medium.group_index) + advance,
+        "reflectance": getattr(placed, "reflectance", np.nan),
+        "pulses": scene.pulses_per_depth_frame,
+        "photons": draw.photons or 0,
+        **{name: getattr(rendered, name) for name in ("signal", "backscatter")},
+        "pulse_energy": scene.laser.pulse_energy,
+        "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
+        "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
+        "pde": scene.detections_per_photon,
+        "dark_count_rate": scene.detector.dark_count_rate,
+        "config": config.encode(),
+    }
 
-    Raises `ConfigError` for one that shows nothing, `DeviceError` where the device fails.
-    """
+
+class _HistogramWriter:
+    """Takes the traced scenes of a shard one by one into an open file; `close` writes the rest."""
+
+    def __init__(self, file: Any, plan: Plan, shard: Shard) -> None:
+        self._file, self._counts = file, plan.recipe.monte_carlo.counts
+        (height, width), bins = plan.shape, plan.recipe.gate.bins
+        self._chunk = (1, max(1, min(height, (1 << 20) // (2 * width * bins))), width, bins)  # of 1 MiB
+        self._shape = (sum(map(plan.is_traced, shard.indices)), height, width, bins)
+        self._cubes = {"expected": self._create("expected", self._shape, np.float16)}
+        self._numbers: dict[str, list[Any]] = {"scene": [], "gate_start": [], "bin_width": [], "sample": []}
+        self._events: list[tuple[NDArray[np.uint32], NDArray[np.int32]]] = []
+
+    def add(self, rendered: RenderedScene, samples: NDArray[np.int64]) -> None:
+        """The next scene, and the ids of its frames."""
+        counts, gate, row = rendered.frames.counts, rendered.scene.gate, len(self._numbers["scene"])
+        assert counts is not None
+        self._cubes["expected"][row] = rendered.expected
+        if rendered.polarisation is not None:
+            if "polarisation" not in self._cubes:  # NaN in scenes without
+                self._cubes["polarisation"] = self._create("polarisation", self._shape, np.float16, fillvalue=np.nan)
+            self._cubes["polarisation"][row] = rendered.polarisation
+        for name, value in (("scene", rendered.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
+            self._numbers[name].append(value)
+        self._numbers["sample"].extend(samples)
+        if self._counts != "none":
+            for frame in counts.reshape(len(counts), -1):
+                filled = np.flatnonzero(frame)
+                self._events.append((filled.astype(np.uint32), frame[filled]))
+
+    def close(self) -> None:
+        """Writes what is only known at the end."""
+        for name, values in self._numbers.items():
+            data = np.array(values, HISTOGRAM_COLUMNS[name].kind)
+            self._file.create_dataset(name, data=data, track_times=False)
+        if self._events:
+            self._write_counts()
+        _describe(self._file, HISTOGRAM_COLUMNS)
+
+    def _create(self, name: str, shape: tuple[int, ...], kind: Any, **choices: Any) -> Any:
+        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **_PACKED, **choices)
+
+    def _write_counts(self) -> None:
+        indices, counts = zip(*self._events, strict=True)
+        sizes = [part.size for part in counts]
+        kind = np.min_scalar_type(max((int(part.max(initial=0)) for part in counts), default=0))
+        shape = self._shape[1:]
+        dense_bytes = len(counts) * math.prod(shape) * kind.itemsize
+        if self._counts == "dense" or (self._counts == "smaller" and dense_bytes <= (4 + kind.itemsize) * sum(sizes)):
+            stored = self._create("counts", (len(counts), *shape), kind)
+            for row, (index, count) in enumerate(self._events):
+                stored[row] = _cube(index, count, shape, kind)
+            return
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self._file.create_dataset("event_start", data=starts, track_times=False)
+        events = {"event_index": np.concatenate(indices), "event_count": np.concatenate(counts).astype(kind)}
+        for name, values in events.items():
+            packed = {"chunks": (min(values.size, 1 << 18),), **_PACKED} if values.size else {}
+            self._file.create_dataset(name, data=values, track_times=False, **packed)
+
+
+def _cube(index: NDArray[Any], counts: NDArray[Any], shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
+    cube = np.zeros(math.prod(shape), kind)
+    cube[index] = counts
+    return cube.reshape(shape)
+
+
+def _render(plan: Plan, index: int, *, device: str | None, threads: int | None) -> RenderedScene:
     draw = plan.scene(index)
     try:
         if draw.photons is None:
@@ -461,7 +410,7 @@ def _rendered(plan: Plan, shard: Shard, device: str | None, threads: int | None)
     with ThreadPoolExecutor(workers) as pool:
         try:
             for index in shard.indices:
-                waiting.append(pool.submit(render_scene, plan, index, device=device, threads=threads))
+                waiting.append(pool.submit(_render, plan, index, device=device, threads=threads))
                 if len(waiting) > workers + 1:
                     yield waiting.popleft().result()
             while waiting:
@@ -471,19 +420,7 @@ def _rendered(plan: Plan, shard: Shard, device: str | None, threads: int | None)
                 future.cancel()
 
 
-# ---- A shard's files open for reading, compared with the dataset's manifest before anything is read.
-
-
-_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
-_COLUMNS = {
-    "scene": np.int32,
-    "sample": np.int64,
-    "target": np.int32,
-    "backscatter_fraction": np.float32,
-    "attenuation_lengths": np.float32,
-    "distance": np.float32,
-    "intensity_step": np.float32,
-}
+# Reading, compared with the dataset's manifest before anything is read
 
 
 class SceneFile:
@@ -505,9 +442,9 @@ class SceneFile:
             raise
 
     def stored(self, name: str) -> Any:
-        """A column of `spadwarp.dataset.shards.scene_columns`, its first dimension the scenes."""
-        shape, kind, _, _ = self._columns[name]
-        return self.file.stored(name, "S" if np.dtype(kind).kind == "S" else kind, (self.count, *shape))
+        """A column of `scene_columns`, its first dimension the scenes."""
+        column = self._columns[name]
+        return self.file.stored(name, "S" if isinstance(column.kind, str) else column.kind, (self.count, *column.shape))
 
     def array(self, name: str) -> NDArray[Any]:
         """The same, read."""
@@ -524,6 +461,54 @@ class SceneFile:
             return Scene.from_toml(text.decode())
         except (ValueError, SpadwarpError) as error:
             return self.file.refuse("config", f"is no scene in row {row}: {error}")
+
+
+class HistogramFile:
+    """The histograms of an open file, by scene index and by sample id; `fields`: which of `HISTOGRAM_FIELDS` it may
+    hold."""
+
+    def __init__(self, file: Hdf5File, shape: tuple[int, int]) -> None:
+        self.path = file.path
+        self._rows = {
+            name: {int(number): row for row, number in enumerate(file.array(name, FRAME_COLUMNS[name].kind, (None,)))}
+            for name in ("scene", "sample")
+        }
+        scenes, samples = (len(file.stored(name, FRAME_COLUMNS[name].kind, (None,))) for name in self._rows)
+        expected = file.stored("expected", np.float16, (scenes, *shape, None))
+        self.shape: tuple[int, ...] = expected.shape[1:]
+        self._of_scenes = {"expected": expected}
+        self.fields = HISTOGRAM_FIELDS if "polarisation" in file else HISTOGRAM_FIELDS[:-1]
+        if "polarisation" in file:
+            self._of_scenes["polarisation"] = file.stored("polarisation", np.float16, expected.shape)
+        self._counts = file.stored("counts", _COUNTS, (samples, *self.shape)) if "counts" in file else None
+        self._starts: NDArray[np.int64] | None = None
+        if "event_start" in file:
+            self._starts = file.array("event_start", np.int64, (samples + 1,))
+            self._index = file.stored("event_index", np.uint32, (None,))
+            self._events = file.stored("event_count", _COUNTS, (len(self._index),))
+            if self._starts[0] != 0 or self._starts[-1] != len(self._index) or (np.diff(self._starts) < 0).any():
+                file.refuse("event_start", f"does not divide {len(self._index)} events")
+
+    def cube(self, name: str, *, scene: int, sample: int) -> NDArray[np.float32] | None:
+        """Counts of a frame, or of a scene the expected counts of a frame or the degree of polarisation, `[H, W, T]`;
+        None where there are none."""
+        if name == "counts":
+            return self._counts_of(sample)
+        row, stored = self._rows["scene"].get(scene), self._of_scenes.get(name)
+        return None if row is None or stored is None else stored[row].astype(np.float32)
+
+    def _counts_of(self, sample: int) -> NDArray[np.float32] | None:
+        row = self._rows["sample"].get(sample)
+        if row is None or (self._starts is None and self._counts is None):
+            return None
+        if self._starts is None:
+            assert self._counts is not None
+            return self._counts[row].astype(np.float32)
+        part = slice(int(self._starts[row]), int(self._starts[row + 1]))
+        index = self._index[part]
+        if index.size and index.max() >= math.prod(self.shape):
+            raise FileError(f"{self.path}: event_index is outside the histograms {self.shape} in row {row}")
+        return _cube(index, self._events[part], self.shape, np.float32)
 
 
 class ShardFile:
@@ -546,7 +531,9 @@ class ShardFile:
         self.scenes = SceneFile(folder, name, shape)
         opened.enter_context(closing(self.scenes.file))
         count = len(self.frames.stored("sample", np.int64, (None,)))
-        self.columns = {column: self.frames.array(column, kind, (count,)) for column, kind in _COLUMNS.items()}
+        self.columns = {
+            column: self.frames.array(column, FRAME_COLUMNS[column].kind, (count,)) for column in _READ_COLUMNS
+        }
         self.first_scene = int(self.columns["scene"][0]) if count else 0
         last = self.first_scene + self.scenes.count
         if not 0 <= self.first_scene <= last <= manifest["scenes"] or not _within(
@@ -556,14 +543,9 @@ class ShardFile:
         if not _within(self.columns["target"], range(targets)):
             self.frames.refuse("target", f"names targets that are not among the {targets} of the dataset")
         self.width = shape[1]
-        sides: dict[str, tuple[Any, int]] = {
-            "depth": (np.uint16, shape[1]),
-            "label": (np.uint8, (shape[1] + 7) // 8),
-            "intensity": (np.uint8, shape[1]),
-        }
         self.stored = {
-            field: self.frames.stored(field, kind, (count, shape[0], columns)).mapped()
-            for field, (kind, columns) in sides.items()
+            field: self.frames.stored(field, FRAME_COLUMNS[field].kind, (count, shape[0], across)).mapped()
+            for field, across in _image_widths(shape[1]).items()
         }
         self.step = np.float32(self.frames.real("step", "(0, inf)", of="depth"))
         self.offset = np.float32(self.frames.real("offset", of="depth"))
@@ -614,13 +596,13 @@ class ShardFile:
 
     def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
         cube, path = None, self.frames.path
+        scene, sample = (int(self.columns[column][row]) for column in ("scene", "sample"))
         if self.histograms is not None:
-            number = int(self.columns["sample" if name == "counts" else "scene"][row])
-            cube = getattr(self.histograms, name)(number)
+            cube = self.histograms.cube(name, scene=scene, sample=sample)
             if name not in self.histograms.fields:
                 path = self.histograms.path
         if cube is None:
-            raise FileError(f"{path}: frame {int(self.columns['sample'][row])} has no {name!r}")
+            raise FileError(f"{path}: frame {sample} has no {name!r}")
         return cube
 
     def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
