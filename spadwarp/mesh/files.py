@@ -1,4 +1,4 @@
-"""What trimesh passes over in mesh files, checked: indices, shapes, sizes that a file declares."""
+"""Mesh files: checks of what trimesh passes over, reflectance from colours, and OpenUSD."""
 
 from __future__ import annotations
 
@@ -50,11 +50,7 @@ def check_sizes(path: Path, name: str) -> None:
         raise MeshError(f"{name}: declares {max(counts)} numbers in a file of {size} bytes")
 
 
-# ---- Reflectance from a mesh file's colours: of vertices, of faces, of materials and their images.
-
-
-if TYPE_CHECKING:
-    import trimesh
+# Colours
 
 Array = NDArray[np.float64]
 Images = tuple[NDArray[np.float32], ...]
@@ -310,11 +306,7 @@ def _what_it_has(visual: Any) -> str:
     return "the file has a material without a colour"
 
 
-# ---- Meshes of OpenUSD files: their transforms, units and instances applied.
-
-
-if TYPE_CHECKING:
-    import trimesh
+# OpenUSD
 
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -373,17 +365,14 @@ def _usd_parts(root: Any, cache: Any, time: Any, within: Any = None) -> Iterator
         ):
             prims.PruneChildren()
             continue
-        placed = cache.GetLocalToWorldTransform(prim) if within is None else _relative(cache, prim, within)
+        world = cache.GetLocalToWorldTransform
+        placed = world(prim) if within is None else cache.ComputeRelativeTransform(prim, within)[0]
         if prim.IsA(UsdGeom.PointInstancer):
             prims.PruneChildren()
             yield from _instances(UsdGeom.PointInstancer(prim), placed, cache, time)
         elif (part := _mesh(prim, time)) is not None:
             matrix = np.array(placed)  # of row vectors
             yield part[0] @ matrix[:3, :3] + matrix[3, :3], part[1]
-
-
-def _relative(cache: Any, prim: Any, within: Any) -> Any:
-    return cache.ComputeRelativeTransform(prim, within)[0]
 
 
 def _instances(instancer: Any, placed: Any, cache: Any, time: Any) -> Iterator[Part]:

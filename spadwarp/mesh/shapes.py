@@ -129,7 +129,7 @@ def pipe_valve() -> Manifold:
     return view(body, 3.9, yaw=14, pitch=8)
 
 
-# ---- Targets from ships, navies and wrecks.
+# Targets from ships, navies and wrecks.
 
 
 def submarine() -> Manifold:
@@ -324,7 +324,7 @@ def _blade(tip: float, root: float, *, chord: float, pitch: float, skew: float) 
     return loft(rings)
 
 
-# ---- Organic targets: a fish, a starfish, mushrooms, a bust.
+# Organic targets: a fish, a starfish, mushrooms, a bust.
 
 
 def fish() -> Manifold:
@@ -485,7 +485,7 @@ def _toadstool(size: float) -> Manifold:
     return union(cap, gills, stem, skirt, *warts).scale((size,) * 3)
 
 
-# ---- Targets from land: furniture, a car, a jar.
+# Targets from land: furniture, a car, a jar.
 
 
 def amphora() -> Manifold:

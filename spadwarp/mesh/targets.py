@@ -1,4 +1,4 @@
-"""Built-in targets by name: the geometric ones, which stand here, and the objects of `spadwarp.mesh.shapes`."""
+"""Targets: built-in shapes and mesh files, placed in the world and seen from the camera, and where it is focused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spadwarp.errors import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
 from spadwarp.limits import suggestion
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
-from spadwarp.scene import Target
+from spadwarp.scene import Scene, Target
 from spadwarp.scene.frustum import points_inside, view_planes
 from spadwarp.scene.port_rays import PortGeometry, camera_port
 from spadwarp.scene.pose import rotation_matrix, to_camera
@@ -124,15 +124,6 @@ BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "sphere": _sphere,
 }
 """The geometric built-ins: functions without arguments that make a new mesh in its own frame [m]."""
-
-
-# ---- Targets: mesh files and built-in shapes, placed in the world and seen from the camera.
-
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from spadwarp.scene import Scene, Target
 
 
 # What trimesh says about a damaged file, with a stack, is for those who have set up logging; an error says the rest.
@@ -283,12 +274,14 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
 
 def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[trimesh.Trimesh, Images]:
     """`load_target`, and the images of a file that gives the reflectance."""
+    import trimesh
+
     images: Images = ()
     if target.mesh is not None:
         name, path = f"{field}.mesh = {target.mesh!r}" if field else target.mesh, Path(target.mesh)
         if (problem := file_problem(path)) is not None:
             raise MeshError(f"{name}: {problem}{similar(path) if problem == 'no such file' else ''}")
-        if path.suffix.lower() not in MESH_ENDINGS and path.suffix[1:].lower() not in _other_endings():
+        if path.suffix.lower() not in MESH_ENDINGS and path.suffix[1:].lower() not in trimesh.available_formats():
             raise MeshError(f"{name}: {path.suffix!r} is no ending of a mesh file; {', '.join(MESH_ENDINGS)} are read")
         if target.reflectance == "from_file":
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
@@ -350,13 +343,6 @@ def placement(
     return matrix
 
 
-def _other_endings() -> set[str]:
-    """Endings, without the dot, of the formats that trimesh reads."""
-    import trimesh
-
-    return trimesh.available_formats()
-
-
 def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     """A mesh file in the file's own axes, several objects in it as one; in metres where the format has units."""
     import trimesh
@@ -377,12 +363,7 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     return mesh
 
 
-# ---- What a mesh file holds, before it stands in a scene: size, unit, orientation, and whether it is closed.
-
-
-if TYPE_CHECKING:
-    import trimesh
-
+# What a mesh file holds, before it stands in a scene
 
 # Units of mesh files in the order of likelihood, and the longest sides of things under water [m].
 _UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "µm": 1e-6}
@@ -473,13 +454,7 @@ def _bodies(mesh: trimesh.Trimesh) -> int:
     return int(labels.max()) + 1 if len(labels) else 0
 
 
-# ---- The depth at which a camera is focused.
-
-
-if TYPE_CHECKING:
-    from spadwarp.mesh import TriangleMesh
-    from spadwarp.scene import Scene
-
+# Focus
 
 # Stands for infinity behind a port [m].
 _FAR = 1e6
@@ -508,33 +483,32 @@ def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
         return math.inf
     triangles = mesh.vertices[mesh.faces].astype(np.float64)
     nearest = max(camera.focal_length or 0.0, camera.aperture_radius)
-    depth = _axis_depths(triangles)
-    if (depth > nearest).any():
-        return float(depth[depth > nearest].min())
-    points = points_inside(triangles, view_planes(camera))
-    points = points[points[:, 2] > nearest]
-    if not len(points):
-        return math.inf
-    return float(points[np.argmin(np.hypot(points[:, 0], points[:, 1]) / points[:, 2]), 2])
+    return _first_depth(triangles, lambda: points_inside(triangles, view_planes(camera)), nearest) or math.inf
 
 
 def _apparent_distance(scene: Scene, port: PortGeometry, mesh: TriangleMesh | None) -> float:
     """Depth in air at which the lens sees the first target on its axis, or what is seen closest to that."""
     start, axis, _, _ = port.enter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    if mesh is None:
-        return port.apparent_distance(start + _FAR * axis)
-    frame = np.linalg.svd(axis[None])[2]
-    frame = np.stack([frame[1], frame[2], axis])
-    triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
-    met = _axis_depths(triangles)
-    if (met > 0.0).any():
-        return port.apparent_distance(start + met[met > 0.0].min() * axis)
-    points = triangles.reshape(-1, 3)
-    points = points[points[:, 2] > 0.0]
-    if not len(points):
-        return port.apparent_distance(start + _FAR * axis)
-    closest = points[np.argmin(np.hypot(points[:, 0], points[:, 1]) / points[:, 2])]
-    return port.apparent_distance(start + closest[2] * axis)
+    depth = None
+    if mesh is not None:
+        frame = np.linalg.svd(axis[None])[2]
+        frame = np.stack([frame[1], frame[2], axis])
+        triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
+        depth = _first_depth(triangles, lambda: triangles.reshape(-1, 3), 0.0)
+    return port.apparent_distance(start + (depth or _FAR) * axis)
+
+
+def _first_depth(
+    triangles: NDArray[np.float64], points: Callable[[], NDArray[np.float64]], nearest: float
+) -> float | None:
+    """Depth beyond `nearest` of the first of the triangles `[F, 3, 3]` on the z axis, else that of the point which is
+    seen closest to the axis; None without any."""
+    depth = _axis_depths(triangles)
+    if (depth > nearest).any():
+        return float(depth[depth > nearest].min())
+    seen = points()
+    seen = seen[seen[:, 2] > nearest]
+    return float(seen[np.argmin(np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]), 2]) if len(seen) else None
 
 
 def _axis_depths(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Pictures of photon budgets and sweeps."""
+"""Curves and points: photon budgets, sweeps, learning curves, and cases of the validation."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from spadwarp.viz.style import (
     columns_that_fit,
     log_axis,
     new_figure,
+    panel_grid,
     paper,
     plain_axis,
     save,
@@ -63,7 +64,7 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
     figure of this width [inch], and writes it where `path` is given.
     """
     waters = list(dict.fromkeys(row.medium for row in rows))
-    figure, axes = _grid(len(_PANELS), width)
+    figure, axes = panel_grid(len(_PANELS), width, least=2.3, height=2.1, more=0.5)
     for number, name in enumerate(waters):
         own = [row for row in rows if row.medium == name]
         x = np.array([row.range for row in own])
@@ -116,7 +117,7 @@ def draw_sweep(
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
     names = list(columns or (_PANELS if budgets else _ERROR_PANELS))
-    figure, axes = _grid(len(names), width)
+    figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.5)
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
     x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
     for number, (axis, name) in enumerate(zip(axes, names, strict=False)):
@@ -176,19 +177,6 @@ def _unit(field: str) -> str:
     return found.group(0) if found else ""
 
 
-def _grid(panels: int, width: float) -> tuple[Figure, list[Axes]]:
-    columns = columns_that_fit(panels, width, 2.3)
-    lines = math.ceil(panels / columns)
-    columns = math.ceil(panels / lines)
-    figure = new_figure(width, 2.1 * lines + 0.5)
-    axes = list(np.ravel(figure.subplots(lines, columns)))
-    for axis in axes[panels:]:
-        axis.remove()
-    for axis in axes[:panels]:
-        plain_axis(axis)
-    return figure, axes[:panels]
-
-
 def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
     """The ranges themselves where they are few, else 1, 2 and 5 times the powers of ten."""
     low, high = min(ranges), max(ranges)
@@ -202,9 +190,6 @@ def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
-# ---- Learning curves of a training.
-
-
 @paper()
 def draw_learning_curves(
     log: Sequence[Mapping[str, Any]], path: str | Path, *, title: str, width: float = PAGE
@@ -216,12 +201,11 @@ def draw_learning_curves(
     """
     steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
     style: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
-    columns = columns_that_fit(2, width, 3.0)
     levels = list(log[-1]["psnr"])
     counted = all(float(level) >= 1 for level in levels)
     in_line = columns_that_fit(len(levels) + 1, width, 0.8)
-    figure = new_figure(width, 4.9 - 2.1 * (columns - 1) + 0.14 * (len(levels) // in_line))
-    loss, psnr = figure.subplots(2 // columns, columns)
+    more = 0.7 + 0.14 * (len(levels) // in_line)
+    figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1, more=more)
     loss.plot(steps, losses, color=BLUE, **style)
     loss.set(xlabel="step", ylabel="loss")
     if min(losses) > 0:  # "psnr" is a logarithm
@@ -234,13 +218,9 @@ def draw_learning_curves(
     title_of_levels = "signal photons per pixel" if counted else "backscatter fraction"
     figure.legend(title=title_of_levels, loc="outside lower center", ncols=in_line)
     for axis in (loss, psnr):
-        plain_axis(axis)
         axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     figure.suptitle(wrapped(title, width - 0.3), color=TEXT)
     return save(figure, path)
-
-
-# ---- A case of the validation: values over references, and their z values.
 
 
 @paper()

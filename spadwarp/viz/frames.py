@@ -1,4 +1,4 @@
-"""Depth frames: of a camera's counts, and of the analytic model."""
+"""Depth frames: of a camera's counts, of the analytic model, of a fit, before and after denoising."""
 
 from __future__ import annotations
 
@@ -202,9 +202,6 @@ def analytic_figure(result: AnalyticResult, width: float = PAGE) -> Figure:
     return panels.figure
 
 
-# ---- Depth frames: beside their intensity, or before and after denoising.
-
-
 @paper()
 def draw_depth(
     image: NDArray[np.float64],
@@ -257,9 +254,6 @@ def draw_denoised(
         panels.show_error(denoised - truth, "Denoised − truth")
     panels.caption(title)
     return save(panels.figure, path)
-
-
-# ---- A fit: counts beside what the model expects, and what is left over.
 
 
 if TYPE_CHECKING:

@@ -96,9 +96,6 @@ def _in_notebook() -> bool:
     return shell is not None and hasattr(shell, "kernel")
 
 
-# ---- Results, frames and scenes in notebooks: a figure by `plot`, a picture with numbers by `html`.
-
-
 _HTML_DPI = 100
 
 

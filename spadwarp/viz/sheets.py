@@ -158,9 +158,6 @@ def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return image.reshape(image.shape[0] // 2, 2, image.shape[1] // 2, 2, 3).mean(axis=(1, 3))
 
 
-# ---- A contact sheet of a dataset: what is true and what is measured, side by side.
-
-
 @paper()
 def draw_dataset(
     folder: str | os.PathLike[str],

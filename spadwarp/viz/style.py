@@ -1,4 +1,5 @@
-"""How all pictures look: the style file, colours, colour maps, sizes; figures without pyplot, which need no display."""
+"""How all pictures look: the style file, colours, sizes, images with their colour bars; figures without pyplot, which
+need no display."""
 
 from __future__ import annotations
 
@@ -99,6 +100,28 @@ def columns_that_fit(count: int, width: float, least: float) -> int:
     return max(1, min(count, int(width / least + 1e-6)))
 
 
+def panel_grid(
+    count: int, width: float, *, least: float, height: float, more: float, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of `count` axes over light grids, as many in a line as fit, in lines of equal length.
+
+    `least`: width of an axis, `height`: of a line, `more`: of titles and legends [inch]; `shared`: for `subplots`.
+    """
+    lines = math.ceil(count / columns_that_fit(count, width, least))
+    figure = new_figure(width, height * lines + more)
+    axes = list(figure.subplots(lines, math.ceil(count / lines), squeeze=False, **shared).ravel())
+    for axis in axes[count:]:
+        axis.remove()
+    for axis in axes[:count]:
+        plain_axis(axis)
+    return figure, axes[:count]
+
+
+def middle_text(axis: Axes, text: str, **style: Any) -> None:
+    """Text in place of curves or of an image."""
+    axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes, **style)
+
+
 def wrapped(text: str, width: float, *, size: float = 8.0) -> str:
     """The text in lines of this width [inch] at a size [pt]."""
     return "\n".join(
@@ -174,9 +197,6 @@ def _without_a_date() -> Iterator[None]:
 def spaced(number: int) -> str:
     """A whole number with a thin space between thousands."""
     return f"{number:,}".replace(",", "\u2009")
-
-
-# ---- Images with their colour bars, side by side, and strips of images under one colour bar.
 
 
 _LEAST = 1.7  # width of a panel with its numbers [inch]

@@ -1,10 +1,10 @@
-"""Light in flight as a moving picture: `video`."""
+"""Light in flight, or a scene in motion, as a moving picture: `video`."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,7 +70,7 @@ def video(
     check_apart(path, source)
     source = source if isinstance(source, Held) else load(source)
     if isinstance(source, SequenceFile):
-        _write(moving_pictures(source, pictures), path, fps)
+        _write(_of_sequence(source, pictures), path, fps)
         return path
     cube, edges, label, metres_per_ns = _light(source, frame)
     kept = _window(cube, edges, window_ns)
@@ -80,7 +80,7 @@ def video(
     cube = np.add.reduceat(cube, starts, axis=2)
     edges = np.append(edges[starts], edges[-1])
     label += " and picture" if merged > 1 else " and bin"
-    _write(_pictures(cube, edges, label, metres_per_ns, scale), path, fps)
+    _write(_of_light(cube, edges, label, metres_per_ns, scale), path, fps)
     return path
 
 
@@ -90,9 +90,8 @@ def _write(drawn: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
         write(drawn, temporary, fps)
 
 
-def _light(source: Held | str | Path, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
+def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
-    run = source if isinstance(source, Held) else load(source)
     if isinstance(run, Result):
         return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
     if not isinstance(run, FramesFile):
@@ -120,28 +119,34 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
     return slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, cube.shape[2])
 
 
-def _pictures(
-    cube: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    label: str,
-    metres_per_ns: float,
-    scale: str,
-) -> Iterator[NDArray[np.uint8]]:
-    """RGB pictures, one after the other."""
-    figure, image, title = _figure(cube, label, scale)
+def _pictures(figure: Figure, count: int, show: Callable[[int], None]) -> Iterator[NDArray[np.uint8]]:
+    """RGB pictures, one after the other; `show` puts into the figure what changes."""
+    figure.set_dpi(_DPI)
     canvas = FigureCanvasAgg(figure)
-    for index in range(cube.shape[2]):
-        image.set_data(cube[:, :, index])
-        middle = 0.5 * (edges[index] + edges[index + 1])
-        title.set_text(f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+    for index in range(count):
+        show(index)
         canvas.draw()
         if index == 0:
             figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def _of_light(
+    cube: NDArray[np.float64], edges: NDArray[np.float64], label: str, metres_per_ns: float, scale: str
+) -> Iterator[NDArray[np.uint8]]:
+    """A picture for each bin."""
+    figure, image, title = _light_figure(cube, label, scale)
+
+    def show(index: int) -> None:
+        image.set_data(cube[:, :, index])
+        middle = 0.5 * (edges[index] + edges[index + 1])
+        title.set_text(f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+
+    return _pictures(figure, cube.shape[2], show)
+
+
 @paper()
-def _figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, AxesImage, Text]:
+def _light_figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, AxesImage, Text]:
     """The figure of all pictures, with what changes between them."""
     height, width = cube.shape[:2]
     values = cube[cube > 0]
@@ -150,12 +155,46 @@ def _figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, 
     colours = colour_map(LIGHT_MAP).with_extremes(bad="black", under="black")
     image_height = float(np.clip(3.6 * height / width, 1.1, 6.5))
     figure = new_figure(3.9, image_height + 0.95)
-    figure.set_dpi(_DPI)
     axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.1])
     axes.set(xticks=[], yticks=[])
     image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm)
     figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
     return figure, image, axes.set_title(" ")
+
+
+@paper()
+def _of_sequence(file: SequenceFile, most: int) -> Iterator[NDArray[np.uint8]]:
+    """True depth, measured depth and counts of evenly chosen frames, at most `most`; all have the same scales."""
+    method = file.best_method
+    chosen = range(0, file.frames, -(-file.frames // most))
+    truth = [file.truth(number).depth for number in chosen]
+    counts = [file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen]
+    known = np.concatenate([image[np.isfinite(image)] for image in truth])
+    near, far = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
+    margin = 0.1 * (far - near) + 0.05
+    depth = Normalize(near - margin, far + margin)
+    light = Normalize(0.0, max(1.0, float(np.percentile(counts, 99.5))))
+    height, width = truth[0].shape[:2]
+    image_height = float(np.clip(2.3 * height / width, 0.9, 4.5))
+    figure = new_figure(7.2, image_height + 1.0)
+    axes, bars = figure.subplots(2, 3, height_ratios=[image_height, 0.1])
+    images = []
+    kinds = (("true depth", depth, DEPTH_MAP), ("measured depth", depth, DEPTH_MAP), ("counts", light, INTENSITY_MAP))
+    for axis, bar, (name, scale, colours) in zip(axes, bars, kinds, strict=True):
+        axis.set(xticks=[], yticks=[], title=name)
+        images.append(axis.imshow(np.zeros((height, width)), cmap=colour_map(colours), norm=scale))
+        label = "counts per pixel" if name == "counts" else "depth z [m]"
+        figure.colorbar(images[-1], cax=bar, orientation="horizontal", label=label)
+    title = figure.suptitle(" ")
+
+    def show(index: int) -> None:
+        number = chosen[index]
+        measured = np.full(truth[index].shape, np.nan) if method is None else file.depth(method, number)
+        for image, values in zip(images, (truth[index], measured, counts[index]), strict=True):
+            image.set_data(values)
+        title.set_text(f"frame {number}, {file.trajectory.times[number]:.4g} s")
+
+    return _pictures(figure, len(chosen), show)
 
 
 def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
@@ -200,48 +239,3 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) ->
     process.stderr.close()
     if process.wait() != 0:
         raise FileError(f"{path}: ffmpeg failed: {message}")
-
-
-# ---- A scene in motion, picture by picture: true depth, measured depth and counts of each frame.
-
-
-def moving_pictures(file: SequenceFile, most: int) -> Iterator[NDArray[np.uint8]]:
-    """RGB pictures of evenly chosen frames, at most `most`; all have the same scales."""
-    method = file.best_method
-    chosen = range(0, file.frames, -(-file.frames // most))
-    truth = [file.truth(number).depth for number in chosen]
-    counts = [file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen]
-    known = np.concatenate([image[np.isfinite(image)] for image in truth])
-    near, far = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
-    margin = 0.1 * (far - near) + 0.05
-    brightest = max(1.0, float(np.percentile(counts, 99.5)))
-    figure, images, title = _moving_figure(truth[0].shape, Normalize(near - margin, far + margin), brightest)
-    canvas = FigureCanvasAgg(figure)
-    for index, number in enumerate(chosen):
-        measured = np.full(truth[index].shape, np.nan) if method is None else file.depth(method, number)
-        for image, values in zip(images, (truth[index], measured, counts[index]), strict=True):
-            image.set_data(values)
-        title.set_text(f"frame {number}, {file.trajectory.times[number]:.4g} s")
-        canvas.draw()
-        if index == 0:
-            figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-@paper()
-def _moving_figure(shape: tuple[int, ...], depth: Normalize, brightest: float) -> tuple[Figure, list[Any], Any]:
-    """The figure of all pictures, with what changes between them."""
-    height, width = shape[:2]
-    image_height = float(np.clip(2.3 * height / width, 0.9, 4.5))
-    figure = new_figure(7.2, image_height + 1.0)
-    figure.set_dpi(_DPI)
-    axes, bars = figure.subplots(2, 3, height_ratios=[image_height, 0.1])
-    images = []
-    counts = Normalize(0.0, brightest)
-    kinds = (("true depth", depth, DEPTH_MAP), ("measured depth", depth, DEPTH_MAP), ("counts", counts, INTENSITY_MAP))
-    for axis, bar, (name, scale, colours) in zip(axes, bars, kinds, strict=True):
-        axis.set(xticks=[], yticks=[], title=name)
-        images.append(axis.imshow(np.zeros((height, width)), cmap=colour_map(colours), norm=scale))
-        label = "counts per pixel" if name == "counts" else "depth z [m]"
-        figure.colorbar(images[-1], cax=bar, orientation="horizontal", label=label)
-    return figure, images, figure.suptitle(" ")

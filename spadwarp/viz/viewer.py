@@ -40,9 +40,6 @@ def write_page(path: str | Path, template: str, **values: Any) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-# ---- A run as one HTML file that any browser shows without a network: `view`.
-
-
 HISTOGRAM_BYTES = 5_000_000
 """Largest size of the packed histograms [bytes]; with plotly and the images a page stays below 15 MB."""
 

@@ -138,7 +138,7 @@ def draw_sweep(path, width, of="budget", vary="medium.extinction=0.1:0.4:4", **_
 
 
 def draw_video(path, width, result, **_):
-    transient_video._figure(result.detections, "detections per pulse, pixel and bin", "log")[0].savefig(path)
+    transient_video._light_figure(result.detections, "detections per pulse, pixel and bin", "log")[0].savefig(path)
 
 
 def draw_analytic(path, width, **_):
