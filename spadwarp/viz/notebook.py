@@ -1,4 +1,4 @@
-"""How far a call is, in a notebook or on a terminal: `progress_bar`."""
+"""Notebooks: a figure by `plot`, a picture with numbers by `html`, how far a call is by `progress_bar`."""
 
 from __future__ import annotations
 

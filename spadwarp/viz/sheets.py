@@ -1,4 +1,4 @@
-"""The built-in targets on one sheet."""
+"""Sheets of small images: built-in targets, a mesh file, frames of a dataset."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_rgb
 from numpy.typing import NDArray
 
@@ -41,28 +42,6 @@ FIELD_OF_VIEW = 17.0  # [°]
 _SIDE = 3.5  # [m] of targets that have no size of their own
 _VIEWS = ((0.0, 0.0, 0.0), (0.0, 90.0, 0.0), (90.0, 0.0, 0.0))  # rotations [°]
 _LIGHT = np.array([-0.35, -0.5, -0.79])  # direction to a lamp on the upper left of the camera
-
-
-def target_scene(name: str, *, pixels: int = 192) -> Scene:
-    """The target `name` at 15 m before a camera of 17° and `pixels` × `pixels`."""
-    size = {"size": [_SIDE] * (2 if name == "plane" else 3)} if name in SIZED_BUILTINS else {}
-    return _scene({"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}, pixels)
-
-
-def _scene(target: dict[str, Any], pixels: int) -> Scene:
-    return Scene.from_dict(
-        {
-            "medium": {"extinction": 0.1, "albedo": 0.8},
-            "camera": {
-                "width": pixels,
-                "height": pixels,
-                "horizontal_fov_deg": FIELD_OF_VIEW,
-                "aperture_diameter": 0.01,
-            },
-            "gate": {"bin_width_ps": 100.0, "bins": 1},
-            "targets": [target],
-        }
-    )
 
 
 def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -100,9 +79,9 @@ def draw_targets(
     figure, axes, (bar,) = strips(len(chosen), width=width, least=1.7, ratio=0.5, title=0.2)
     scale = Normalize(DISTANCE - 1.5, DISTANCE + 1.5)
     for axis, name in zip(axes, chosen, strict=False):
-        truth = truth_maps(target_scene(name, pixels=2 * pixels), device=device)
-        views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
-        axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
+        size = {"size": [_SIDE] * (2 if name == "plane" else 3)} if name in SIZED_BUILTINS else {}
+        target = {"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}
+        _show_target(axis, target, scale, pixels, device)
         axis.set_title(name, pad=2)
     strip_bar(bar, scale, DEPTH_MAP, "depth z [m]")
     return save(figure, path)
@@ -133,14 +112,28 @@ def draw_mesh(
         centre = rotation_matrix(rotation) @ (shown * np.array(mesh.centre))
         target = {"mesh": str(mesh.path), "scale": shown, "rotation_deg": list(rotation)}
         target["translation"] = [float(x) for x in np.array([0.0, 0.0, DISTANCE]) - centre]
-        truth = truth_maps(_scene(target, 2 * pixels), device=device)
-        views = [_halved(_shaded(truth.normal)), _halved(coloured_depth(truth.depth, scale))]
-        axis.imshow(np.concatenate(views, axis=1), interpolation="lanczos")
+        _show_target(axis, target, scale, pixels, device)
         axis.set_title(f"rotation_deg = {[round(angle) for angle in rotation]}", pad=3)
     own = Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest)
     strip_bar(bar, own, DEPTH_MAP, "depth from the centre [m]")
     figure.suptitle(wrapped(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}", width - 0.3))
     return save(figure, path)
+
+
+def _show_target(axis: Axes, target: dict[str, Any], scale: Normalize, pixels: int, device: str | None) -> None:
+    """A target at 15 m before a camera of 17°, shaded and as a depth map; means of 2 × 2 pixels, edges without steps."""
+    camera = {"width": 2 * pixels, "height": 2 * pixels, "horizontal_fov_deg": FIELD_OF_VIEW, "aperture_diameter": 0.01}
+    scene = Scene.from_dict(
+        {
+            "medium": {"extinction": 0.1, "albedo": 0.8},
+            "camera": camera,
+            "gate": {"bin_width_ps": 100.0, "bins": 1},
+            "targets": [target],
+        }
+    )
+    truth = truth_maps(scene, device=device)
+    views = np.concatenate([_shaded(truth.normal), coloured_depth(truth.depth, scale)], axis=1)
+    axis.imshow(views.reshape(pixels, 2, 2 * pixels, 2, 3).mean(axis=(1, 3)), interpolation="lanczos")
 
 
 def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -151,11 +144,6 @@ def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
     grey = 0.16 + 0.62 * lamp + 0.2 * facing
     image = grey[..., None] * np.array([1.0, 0.97, 0.92])
     return np.where(np.isfinite(grey)[..., None], image, to_rgb(BACKGROUND)).clip(0.0, 1.0)
-
-
-def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means of 2 × 2 pixels: edges without steps."""
-    return image.reshape(image.shape[0] // 2, 2, image.shape[1] // 2, 2, 3).mean(axis=(1, 3))
 
 
 @paper()

@@ -1,4 +1,4 @@
-"""HTML pages from the templates beside this module."""
+"""A run as one HTML file that any browser shows without a network: `view`."""
 
 from __future__ import annotations
 
@@ -21,23 +21,12 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.paths import check_apart
 from spadwarp.result import Channel, Result, received
 from spadwarp.scene import Scene
-from spadwarp.scene.sight import LinesOfSight, lines_of_sight
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz import style
 from spadwarp.viz.result import channel_text
 from spadwarp.viz.style import median_pixel
 
 __all__ = ["view"]
-
-
-def write_page(path: str | Path, template: str, **values: Any) -> None:
-    """Writes a page of its own: values are escaped except where the template says `safe`. Raises `FileError`."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined)
-    pages.policies["json.dumps_kwargs"] = {}  # keys stay in their order
-    text = pages.get_template(template).render(values)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 HISTOGRAM_BYTES = 5_000_000
@@ -240,14 +229,6 @@ def _name(scene: Scene) -> str:
 # The page's data
 
 
-def _port_shifts(lines: LinesOfSight) -> list[float]:
-    """Of the axis of ranges: what ports add to a path, and to a range [m]; for a laser close to the lens."""
-    if not lines.bent:
-        return [0.0, 0.0]
-    both = 2.0 if lines.laser_port is not None else 1.0
-    return [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
-
-
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
     scene = page.scene
@@ -255,6 +236,10 @@ def _data(page: _Page) -> dict[str, Any]:
     laser = np.zeros(3) if lines.bent else lines.laser
     path = lines.path_from_range(lines.range_from_depth(page.truth))
     arrival = path / scene.medium.pulse_speed
+    port = [0.0, 0.0]  # what ports add to a path, and to a range [m]; for a laser close to the lens
+    if lines.bent:
+        both = 2.0 if lines.laser_port is not None else 1.0
+        port = [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
     cloud = lines.points(lines.range_from_depth(page.depth))
     histograms, block, merged = _histograms(page.layers)
     edges = page.edges[::merged]
@@ -265,12 +250,12 @@ def _data(page: _Page) -> dict[str, Any]:
         images["reflectance"] = page.reflectance
     return {
         "shape": list(page.depth.shape),
-        "images": {name: _packed(image, "<f4") for name, image in images.items()},
-        "cloud": [_packed(cloud[..., axis], "<f4") for axis in range(3)],
-        "arrival": _packed(1e9 * arrival, "<f4"),
-        "towards": _packed(lines.direction @ laser, "<f4"),
+        "images": {name: _packed(image) for name, image in images.items()},
+        "cloud": [_packed(cloud[..., axis]) for axis in range(3)],
+        "arrival": _packed(1e9 * arrival),
+        "towards": _packed(lines.direction @ laser),
         "laser": float(laser @ laser),
-        "port": _port_shifts(lines),
+        "port": port,
         "speed": 1e-9 * scene.medium.pulse_speed,
         "method": page.method,
         "intensityLabel": page.intensity_label,
@@ -311,20 +296,17 @@ def _pack(values: NDArray[Any], layer: _Layer) -> dict[str, Any]:
     metadata = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
     high = float(values.max())
     if layer.filled and high < 65536:
-        return {**metadata, "kind": "whole", "codes": _deflated(values.astype("<u2"))}
+        return {**metadata, "kind": "whole", "codes": _packed(values, "<u2")}
     lowest = high * 10.0**-_DECADES
     codes = np.zeros(values.shape, dtype=np.uint8)
     valid = values > lowest
     codes[valid] = 1 + np.round(254.0 / _DECADES * np.log10(values[valid] / lowest)).astype(np.uint8)
-    return {**metadata, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _deflated(codes)}
+    return {**metadata, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _packed(codes, "u1")}
 
 
-def _packed(values: NDArray[Any], kind: str) -> str:
-    return _deflated(values.astype(kind))
-
-
-def _deflated(values: NDArray[Any]) -> str:
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode("ascii")
+def _packed(values: NDArray[Any], kind: str = "<f4") -> str:
+    """The values, deflated, as text."""
+    return base64.b64encode(zlib.compress(values.astype(kind).tobytes(), 6)).decode("ascii")
 
 
 def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
@@ -339,3 +321,14 @@ def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
         "delay": [round(1e9 * float(delay), 6) for delay in delays[kept]],
         "value": [round(float(value), 5) for value in density[kept] / density.max()],
     }
+
+
+def write_page(path: str | Path, template: str, **values: Any) -> None:
+    """Writes a page of its own: values are escaped except where the template says `safe`. Raises `FileError`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined)
+    pages.policies["json.dumps_kwargs"] = {}  # keys stay in their order
+    text = pages.get_template(template).render(values)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

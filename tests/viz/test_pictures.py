@@ -286,19 +286,6 @@ def test_images_of_samples_fill_their_rows_and_the_note_explains_what_is_there(t
                 assert figure.get_supxlabel().split("; ") == [*explained, "split test"]
 
 
-def test_levels_are_written_in_full(tmp_path, monkeypatch):
-    figure = drawn(monkeypatch, lambda: draw_scores(tmp_path, 7.2))
-    assert figure.axes[-1].get_xticklabels()[0].get_text() == "0.042"
-
-
-def test_a_depth_frame_begins_with_its_titles(tmp_path, monkeypatch):
-    image = np.linspace(1.0, 2.0, 48 * 64).reshape(48, 64)
-    given = {"label": "depth z [m]", "title": "Depth (matched)"}
-    figure = drawn(monkeypatch, lambda: spadwarp.viz.draw_depth(image, image, tmp_path, **given))
-    top = max(axis.title.get_window_extent().y1 for axis in figure.axes) / figure.dpi
-    assert figure.get_figheight() - top < 0.1
-
-
 def drawn(monkeypatch, draw):
     """The figure that a function saves."""
     figures = []
