@@ -44,8 +44,8 @@ def classical_depth(
     """Depth over the gate, `[N, H, W]`, 0 at its start and 1 at its end.
 
     `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`:
-    `spadwarp.denoise.semi_global` on the likelihoods. `"total-variation"`: of the likelihood depth, each pixel weighted
-    by how far its likelihood stands out. `"belief-propagation"`: `spadwarp.denoise.belief_propagation` on the
+    `spadwarp.denoise.classical` on the likelihoods. `"total-variation"`: of the likelihood depth, each pixel weighted
+    by how far its likelihood stands out. `"belief-propagation"`: `spadwarp.denoise.classical` on the
     likelihoods, the strongest of these in most cases.
 
     Args:
@@ -65,10 +65,8 @@ def classical_depth(
     if method == "pooled" and tuning is not None and tuning % 2 != 1:
         raise ArgumentError(f"tuning = {tuning:g} is not an odd number of pixels, such as {TUNINGS[method]}")
     torch = require_torch()
-    from spadwarp.denoise.belief_propagation import JUMPS, beliefs
+    from spadwarp.denoise.classical import JUMPS, aggregate, beliefs, total_variation, usual_jump
     from spadwarp.denoise.histogram_features import highest, log_likelihood, pooled
-    from spadwarp.denoise.semi_global import aggregate, usual_jump
-    from spadwarp.denoise.total_variation import total_variation
 
     found = []
     with torch.inference_mode():

@@ -121,7 +121,7 @@ def draw_mesh(
 
 
 def _show_target(axis: Axes, target: dict[str, Any], scale: Normalize, pixels: int, device: str | None) -> None:
-    """A target at 15 m before a camera of 17°, shaded and as a depth map; means of 2 × 2 pixels, edges without steps."""
+    """A target at 15 m before a camera of 17°, shaded and as a depth map; means of 2 × 2 pixels."""
     camera = {"width": 2 * pixels, "height": 2 * pixels, "horizontal_fov_deg": FIELD_OF_VIEW, "aperture_diameter": 0.01}
     scene = Scene.from_dict(
         {
