@@ -39,7 +39,7 @@ EXPORT_FIELDS: dict[str, tuple[str, str]] = {
     "intensity": ("1", "recorded photons"),
     "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
     "normal": ("1", "unit normals towards the camera, [3, height, width]"),
-    "albedo": ("1", "Lambertian reflectance"),
+    "reflectance": ("1", "Lambertian reflectance"),
     "prior": ("1/m", "density with which the water alone reports the depth in noisy"),
     "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
     "counts": ("1", "histogram of the frame, [bin, height, width]"),

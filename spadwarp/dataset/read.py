@@ -22,7 +22,7 @@ from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
-FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", *HISTOGRAM_FIELDS)
+FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "reflectance", "prior", *HISTOGRAM_FIELDS)
 """Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
 
 
@@ -34,7 +34,7 @@ class FrameReader:
     - `label`: 1 where the pixel reports backscatter or other background, else 0.
     - `intensity`: recorded photons.
     - `bound`: Cramér–Rao bound of the depth [m], NaN for no estimate.
-    - `normal`: `[3, H, W]`, unit vectors towards the camera. `albedo`: Lambertian reflectance.
+    - `normal`: `[3, H, W]`, unit vectors towards the camera. `reflectance`: Lambertian reflectance.
     - `counts`: histograms of the frame `[T, H, W]`; `expected`: their expectation. Of traced scenes only.
     - `polarisation`: degree of polarisation of each bin as both channels of the camera find it, without the noise of
       counts, NaN where no light arrives, `[T, H, W]`. Of traced scenes whose camera records polarisation.

@@ -50,7 +50,7 @@ _READ_COLUMNS = (
     "distance",
     "intensity_step",
 )
-_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "albedo": "albedo"}
+_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflectance": "reflectance"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ _SCENE_NUMBERS: dict[str, tuple[str, str]] = {
     "group_index": ("1", "light travels at 299792458 m/s over this"),
     "gate_near": ("m", "range at which the gate opens"),
     "gate_far": ("m", "range at which the gate closes"),
-    "reflectance": ("1", "of the target; NaN where each pixel has its own"),
+    "target_reflectance": ("1", "of the target; NaN where each pixel has its own"),
     "pulses": ("1", "laser pulses of a frame"),
     "photons": ("1", "photons that were traced; 0: analytic"),
     "signal": ("1", "expected detections of the return per pulse, median over the target's pixels"),
@@ -138,7 +138,7 @@ def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
         "depth": Column(real, "m", "true planar depth; NaN where nothing is hit", shape),
         "bound": Column(real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate", shape),
         "normal": Column(np.float16, "1", "unit normals towards the camera", (*shape, 3)),
-        "albedo": Column(np.float16, "1", "Lambertian reflectance", shape),
+        "reflectance": Column(np.float16, "1", "Lambertian reflectance", shape),
         "backscatter_profile": Column(real, "1/m", "density of the water's backscatter over depth, on axis", (bins,)),
         "profile_edges": Column(real, "m", "edges of the profile's bins", (bins + 1,)),
         "target": FRAME_COLUMNS["target"],
@@ -300,7 +300,7 @@ def _scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
         "depth": rendered.truth.depth,
         "bound": rendered.bound,
         "normal": rendered.truth.normal,
-        "albedo": rendered.truth.reflectance,
+        "reflectance": rendered.truth.reflectance,
         "backscatter_profile": rendered.profile[0],
         "profile_edges": rendered.profile[1],
         "target": draw.target,
@@ -312,7 +312,7 @@ def _scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
         "anisotropy": phase_function(medium).mean_cosine,
         "gate_near": range_from_time(scene.gate.start, medium.group_index) + advance,
         "gate_far": range_from_time(scene.gate.stop, medium.group_index) + advance,
-        "reflectance": getattr(placed, "reflectance", np.nan),
+        "target_reflectance": getattr(placed, "reflectance", np.nan),
         "pulses": scene.pulses_per_depth_frame,
         "photons": draw.photons or 0,
         **{name: getattr(rendered, name) for name in ("signal", "backscatter")},

@@ -402,10 +402,10 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
     tables = {**TABLES, "targets": {"exports": ["exports"]}}
     path = written(Recipe.from_dict(tables), tmp_path)
     make(path, tmp_path / "data")
-    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
+    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "reflectance", "label")):
         clean, valid = item["clean"][0], depth < 60000
         assert (np.isfinite(clean) == valid).all() and item["distance"] == 15.0
-        assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["albedo"][0][valid] == 0.25).all()
+        assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["reflectance"][0][valid] == 0.25).all()
         right = valid & (item["label"][0] == 0)
         assert np.abs(item["noisy"][0][right] - 15.0).max() < 0.05
     traced = load_recipe(path).with_overrides({"monte_carlo.share": 0.5})
