@@ -118,7 +118,7 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
-    """What is wrong with a dataset, one line for each file that is missing or differs from its checksum.
+    """Problems of a dataset, one line for each file that is missing or differs from its checksum.
 
     Raises `FileError` if there is no dataset.
     """
@@ -250,7 +250,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """What a call of `make_dataset` did.
+    """The work of a call of `make_dataset`.
 
     Attributes:
         folder: The dataset.

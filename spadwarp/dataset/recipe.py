@@ -326,9 +326,9 @@ class Recipe(Table):
                 raise ValueError(f"scene.{name} does not belong to the scene: it is in the recipe's own [{name}]")
         medium = self.scene.get("medium")
         if self.plume.probability > 0 and isinstance(medium, Mapping) and {"layers", "grid"} & set(medium):
-            raise ValueError("plume.probability > 0 does not go with layers or a grid in scene.medium")
+            raise ValueError("plume.probability > 0 cannot be combined with layers or a grid in scene.medium")
         if self.plume.probability > 0 and "daylight" in self.scene:
-            raise ValueError("plume.probability > 0 does not go with scene.daylight, which takes one water")
+            raise ValueError("plume.probability > 0 cannot be combined with scene.daylight, which takes one water")
         camera = self.scene.get("camera")
         polarisation = camera.get("polarisation", "none") if isinstance(camera, Mapping) else "none"
         if self.monte_carlo.channel != "I" and polarisation == "none" and "camera.polarisation" not in self.vary:

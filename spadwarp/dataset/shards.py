@@ -563,7 +563,7 @@ class ShardFile:
         return {name: self._image(name, row, window) for name in fields}
 
     def numbers(self, row: int) -> dict[str, Any]:
-        """What else an item holds."""
+        """The numbers of an item."""
         whole, real = ("sample", "scene", "target"), ("backscatter_fraction", "attenuation_lengths", "distance")
         return {
             **{name: int(self.columns[name][row]) for name in whole},

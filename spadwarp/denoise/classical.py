@@ -65,7 +65,7 @@ def guide_channels(total: Tensor) -> list[Tensor]:
 
 
 def edge_penalties(total: Tensor) -> tuple[Tensor, Tensor]:
-    """What the counts add to the penalty of a jump in depth [nats]: to the right `[B, H, W − 1]`, down `[B, H − 1, W]`.
+    """The counts' part of the penalty of a jump in depth [nats]: to the right `[B, H, W − 1]`, down `[B, H − 1, W]`.
 
     The log-likelihood of the two counts of neighbours on one surface less that of a jump. Differences by chance have
     variance 2; those at jumps and at edges of texture have an excess, which the mean of the frame gives. Where there is
@@ -128,7 +128,7 @@ def rows_and_columns(
 
 
 def messages(score: Tensor, jump: Tensor, *, slope: float) -> Tensor:
-    """What the pixels of a row before and behind each tell it of its depth, the sum of both, `[B, H, W, T]`.
+    """Messages of the pixels of a row before and behind each about its depth, the sum of both, `[B, H, W, T]`.
 
     Arguments are those of `aggregate`; `jump` may differ between neighbours, `[B, H, W − 1, 1]`. The best depth
     has 0 in each of the two.

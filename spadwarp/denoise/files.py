@@ -33,7 +33,7 @@ __all__ = ["Denoised", "denoise_file", "depth_files"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """What `denoise_file` wrote: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
+    """Output of `denoise_file`: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
     counts as such, probability that its depth is right, gate [m], paths of the files, and notes for the user."""
 
     depth: NDArray[np.float32]

@@ -31,7 +31,7 @@ _PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those o
 _LARGEST = 3.0  # correction of a logit
 
 METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
-"""What `apply` takes as `model`."""
+"""Models of `apply`."""
 
 # With this probability PyramidNet misses 0.6 % of the target in drawn scenes in open water that no training saw, 2.7 %
 # with the noise of the training; its probabilities are too low on thin structures.
@@ -41,7 +41,7 @@ _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a 
 
 
 class Estimate(NamedTuple):
-    """What denoising answers, float32, each of the frames' shape.
+    """The answer of denoising, float32, each of the frames' shape.
 
     Attributes:
         depth: [m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN).

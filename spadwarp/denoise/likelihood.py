@@ -29,7 +29,7 @@ TUNINGS: dict[str, tuple[Any, ...]] = {
     "total-variation": (0.5, 1.0, 2.0, 4.0),
     "belief-propagation": (2.5, 4.0, 8.0, 16.0),
 }
-"""What is tuned: sides of the window [pixels], penalties of a jump [nats], strengths."""
+"""Tuned values: sides of the window [pixels], penalties of a jump [nats], strengths."""
 
 
 def classical_depth(

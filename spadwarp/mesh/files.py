@@ -160,7 +160,9 @@ def _parts(path: Path, ending: str, name: str) -> Iterator[tuple[trimesh.Trimesh
     from trimesh.resolvers import FilePathResolver
 
     if ending not in ("ply", "obj", "glb", "off"):
-        raise MeshError(f"{name}: reflectance = 'from_file' does not go with {path.suffix or 'this file'}; {_KNOWN}")
+        raise MeshError(
+            f"{name}: reflectance = 'from_file' cannot be combined with {path.suffix or 'this file'}; {_KNOWN}"
+        )
     if ending == "obj":
         _check_materials(path, name)
     check_sizes(path, name)

@@ -296,8 +296,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
             raise ConfigError(f"{field}.{error}") from error
         if target.size is not None and target.builtin not in SIZED_BUILTINS:
             raise ConfigError(
-                f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
-                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
+                f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
+                f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
             )
     if len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh has no faces")
@@ -400,7 +400,7 @@ class MeshSummary:
 
     @property
     def hints(self) -> tuple[str, ...]:
-        """What its target in a scene needs, in words."""
+        """Advice for its target in a scene."""
         found = []
         if self.scale != 1.0:
             found.append(f"scale = {self.scale:g} if the unit is {self.unit}: {self.longest:.3g} m long")

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthMaps:
-    """What is known of a frame beside its counts: the scene, and `[H, W]` [m] depth by an estimator, truth, bound; the
+    """A frame beside its counts: the scene, and `[H, W]` [m] depth by an estimator, truth, bound; the
     channel of polarised light, "I" for all light."""
 
     scene: Scene

@@ -47,7 +47,7 @@ def progress_bar(unit: str = "photons") -> Callable[[str, int, int], None]:
 
 
 class _Bar:
-    """What is called with a stage, what is done and what is to be done; the latter is 0 where nothing is counted."""
+    """Called with a stage, the number done and the number to be done, 0 where nothing is counted."""
 
     def __init__(self, unit: str) -> None:
         self._unit = unit
@@ -130,7 +130,7 @@ def plot(
             raise ArgumentError(f"kind = {kind!r} is not one of {', '.join(map(repr, KINDS))}")
         return result_figure(shown, kind or "depth", method=method, device=device, width=width)
     if kind is not None:
-        raise ArgumentError(f"kind = {kind!r} goes with results only, not with {type(shown).__name__}")
+        raise ArgumentError(f"kind = {kind!r} needs a result, not a {type(shown).__name__}")
     if isinstance(shown, AnalyticResult):
         return analytic_figure(shown, width)
     if isinstance(shown, Fit):

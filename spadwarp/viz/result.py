@@ -273,7 +273,7 @@ def _caption(result: Result) -> str:
 
 
 def channel_text(channel: str | None) -> str:
-    """What a caption says of light of one channel alone; nothing of all light."""
+    """Words of a caption for light of one channel alone; none for all light."""
     names = {str(key): name for key, name in CHANNEL_NAMES.items()}
     return f", {names[channel]} light" if channel in names else ""
 

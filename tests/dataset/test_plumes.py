@@ -47,5 +47,5 @@ def test_plumes_and_layers_exclude_each_other(small):
     tables = small.to_dict()
     layers = [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]
     tables["scene"] = {**tables["scene"], "medium": {**tables["scene"]["medium"], "layers": layers}}
-    with pytest.raises(spadwarp.ConfigError, match="does not go with layers"):
+    with pytest.raises(spadwarp.ConfigError, match="cannot be combined with layers"):
         Recipe.from_dict({**tables, "plume": PLUME}, source=small.source)

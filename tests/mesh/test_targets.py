@@ -304,7 +304,7 @@ def test_built_ins_that_do_not_exist_are_refused_with_the_names_of_those_that_do
 
 def test_size_goes_with_those_that_have_none_of_their_own() -> None:
     with pytest.raises(
-        ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] does not go with builtin = 'staircase'"
+        ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] cannot be combined with builtin = 'staircase'"
     ):
         build_mesh(scene_of({"builtin": "staircase", "size": [2.0, 2.0]}))
 
