@@ -13,4 +13,4 @@ from spadwarp.dataset.read import *  # noqa: F403
 from spadwarp.dataset.recipe import *  # noqa: F403
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = [*export.__all__, *make.__all__, *plan.__all__, *read.__all__, *recipe.__all__]  # noqa: F405
+    __all__ = [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__]  # noqa: F405

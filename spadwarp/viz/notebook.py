@@ -24,8 +24,7 @@ from spadwarp.result import Result
 from spadwarp.scene import Scene
 from spadwarp.transport import truth_maps
 from spadwarp.units import with_prefix
-from spadwarp.viz.frames import analytic_figure, fit_figure, frame_figure, stored_frame_figure
-from spadwarp.viz.result import KINDS, result_figure
+from spadwarp.viz.result import KINDS, analytic_figure, fit_figure, frame_figure, result_figure, stored_frame_figure
 from spadwarp.viz.style import INTENSITY_MAP, PAGE, Panels, paper, shown_limits, spaced
 
 __all__ = ["html", "plot", "progress_bar"]
