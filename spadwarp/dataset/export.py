@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset.card import croissant, export_card
-from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset.read import FIELDS, FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum
 from spadwarp.errors import ArgumentError, FileError
@@ -33,18 +33,8 @@ FEATURE_NAMES = ("peak_depth", "peak_counts", "second_depth", "second_counts", "
 EXPORT_FORMATS = ("parquet", "webdataset", "zarr")
 
 EXPORT_FIELDS: dict[str, tuple[str, str]] = {
-    "noisy": ("m", "depth frame; NaN: no return"),
-    "clean": ("m", "true planar depth; NaN: nothing is hit"),
-    "label": ("1", "1: the pixel reports backscatter or other background"),
-    "intensity": ("1", "recorded photons"),
-    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
-    "normal": ("1", "unit normals towards the camera, [3, height, width]"),
-    "reflectance": ("1", "Lambertian reflectance"),
-    "prior": ("1/m", "density with which the water alone reports the depth in noisy"),
+    **FIELDS,
     "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
-    "counts": ("1", "histogram of the frame, [bin, height, width]"),
-    "expected": ("1", "expected histogram before pile-up, [bin, height, width]"),
-    "polarisation": ("1", "degree of polarisation of the bins, [bin, height, width]; NaN: no light"),
 }
 """Images of an exported frame: unit and meaning."""
 

@@ -99,7 +99,7 @@ class Distribution(Table):
 def _is_finite(value: Any, depth: int = 0) -> bool:
     """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
     if isinstance(value, list | tuple):
-        return depth < 9 and all(_is_finite(one, depth + 1) for one in value)
+        return depth < 9 and all(_is_finite(item, depth + 1) for item in value)
     return not isinstance(value, float) or math.isfinite(value)
 
 
@@ -115,12 +115,12 @@ def within(interval: str) -> AfterValidator:
 
     def check(value: Distribution) -> Distribution:
         values = value.choices or value.limits
-        for one in values:
+        for number in values:
             try:
-                check_real("value", one, interval)
+                check_real("value", number, interval)
             except ArgumentError:
                 problem = f"is no number in {interval}"
-                raise ValueError(problem if len(values) == 1 else f"holds {shown(one)}, which {problem}") from None
+                raise ValueError(problem if len(values) == 1 else f"holds {shown(number)}, which {problem}") from None
         return value
 
     return AfterValidator(check)

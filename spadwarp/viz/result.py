@@ -324,8 +324,8 @@ def merged_edges(values: NDArray[np.float64], variance: NDArray[np.float64]) -> 
     `[T]`.
     """
     alone = (values > 0) & (variance <= (_ERROR * values) ** 2)
-    lit = np.flatnonzero(values)
-    first, last = (int(lit[0]), int(lit[-1]) + 1) if len(lit) else (0, 0)
+    filled = np.flatnonzero(values)
+    first, last = (int(filled[0]), int(filled[-1]) + 1) if len(filled) else (0, 0)
     edges = [0]
     changes = np.flatnonzero(np.diff(np.concatenate([[True], alone, [True]]).astype(np.int8)))
     for start, stop in changes.reshape(-1, 2):
@@ -352,8 +352,8 @@ def shared_edges(
         variance: Of their sum, `[T]`; each has a part of it as it has of the light.
     """
     total = parts.sum(axis=0)
-    lit = [np.flatnonzero(part) for part in parts if part.any()]
-    ends = sorted({0, len(total), *(int(end) for one in lit for end in (one[0], one[-1] + 1))})
+    filled = [np.flatnonzero(part) for part in parts if part.any()]
+    ends = sorted({0, len(total), *(int(end) for bins in filled for end in (bins[0], bins[-1] + 1))})
     edges = _joined(low + merged_edges(total[low:high], variance[low:high]) for low, high in pairwise(ends))
     weight = np.divide(variance, total, out=np.zeros_like(total), where=total > 0)
     return edges, [_own_edges(part, total, weight * part, edges) for part in parts]
@@ -648,8 +648,8 @@ def fit_figure(fit: Fit, width: float = PAGE) -> Figure:
     reach = max(3.5, 1.1 * float(np.abs(left).max()))
     bottom.set(ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
     values = "; ".join(
-        f"{one.name} = {rounded(one.value, one.standard_error)} ± {one.standard_error:.2g} {one.unit}".rstrip()
-        for one in fit.estimates.values()
+        f"{item.name} = {rounded(item.value, item.standard_error)} ± {item.standard_error:.2g} {item.unit}".rstrip()
+        for item in fit.estimates.values()
     )
     panels.caption(f"{values}; {spaced(fit.pulses)} pulses" if values else f"{spaced(fit.pulses)} pulses")
     return panels.figure

@@ -175,7 +175,9 @@ def save(figure: Figure, path: str | os.PathLike[str], *, note: str = "") -> Pat
         figure.supxlabel(note, fontsize=7, color="0.35")
     kind = Path(path).suffix.lstrip(".").lower() or "png"
     if kind not in (known := figure.canvas.get_supported_filetypes()):
-        raise FileError(f"{path}: ending {Path(path).suffix!r} is not one of {', '.join(f'.{one}' for one in known)}")
+        raise FileError(
+            f"{path}: ending {Path(path).suffix!r} is not one of {', '.join(f'.{ending}' for ending in known)}"
+        )
     # Without the date, so that the same figure makes the same file.
     metadata = {"CreationDate": None} if kind == "pdf" else None
     with atomic_path(Path(path)) as temporary, _without_a_date():
