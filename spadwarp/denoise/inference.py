@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import MARGIN, DepthFrames, checked_gate, checked_profile, depth_frames, depth_values
 from spadwarp.denoise.gates import narrowed_input
 from spadwarp.denoise.histogram_inputs import checked_histograms, features_of_histograms, target_bins
-from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.denoise.recipe import MODELS
 from spadwarp.errors import ArgumentError

@@ -8,8 +8,8 @@ import torch
 from scipy.stats import norm
 
 from spadwarp import ArgumentError
+from spadwarp.denoise.baselines import CLASSICAL, classical_depth
 from spadwarp.denoise.classical import aggregate, beliefs, total_variation
-from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 
 pytestmark = pytest.mark.fast
 
