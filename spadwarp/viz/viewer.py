@@ -61,19 +61,18 @@ class _Layer:
 class _Page:
     """The content of a page, from a result or from frames of a camera."""
 
-    title: str
     caption: str
     scene: Scene
-    depth: NDArray[np.float64]
+    depth: NDArray[Any]
     method: str
-    truth: NDArray[np.float64]
-    reflectance: NDArray[np.float64] | None
-    intensity: NDArray[np.float64]
+    truth: NDArray[Any]
+    intensity: NDArray[Any]
     intensity_label: str
     layers: list[_Layer]
     edges: NDArray[np.float64]
     unit: str
     response: InstrumentResponse
+    reflectance: NDArray[Any] | None = None
 
 
 def view(
@@ -120,7 +119,8 @@ def view(
         raise ArgumentError(f"channel = {channel!r}: only results have channels")
     else:
         page = _of_frames(held, method, frame) if isinstance(held, FramesFile) else _of_depth(held, method, frame)
-    write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
+    title = "spadwarp" if page.scene.source is None else Path(page.scene.source).stem
+    write_page(path, "viewer.html", title=title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
     return Path(path)
 
 
@@ -134,7 +134,6 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
     return _Page(
-        title=_name(scene),
         caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
         + (", interrupted" if result.partial else "")
         + channel_text(result.provenance.get("channel"))
@@ -142,8 +141,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         scene=scene,
         depth=result.depth(method=chosen, device=device),
         method=chosen,
-        truth=result.truth.depth.astype(np.float64),
-        reflectance=result.truth.reflectance.astype(np.float64),
+        truth=result.truth.depth,
+        reflectance=result.truth.reflectance,
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
         layers=[
@@ -166,15 +165,13 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     background = np.broadcast_to(file.background, counts.shape)
     mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
-        title=_name(file.scene),
         caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
         f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
         scene=file.scene,
-        depth=file.depth(chosen, frame).astype(np.float64),
+        depth=file.depth(chosen, frame),
         method=chosen,
-        truth=file.truth_depth.astype(np.float64),
-        reflectance=None,
-        intensity=file.intensity(frame).astype(np.float64),
+        truth=file.truth_depth,
+        intensity=file.intensity(frame),
         intensity_label="counts in the frame",
         layers=[
             _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
@@ -196,15 +193,13 @@ def _of_depth(held: Held, method: str | None, frame: int) -> _Page:
     assert shown.scene is not None and shown.depth is not None
     cube, edges = reported_depths(frames, frame)
     return _Page(
-        title=_name(shown.scene),
         caption=f"frame {frame} of {frames.count}: {shown.content}; histograms are of the depths that the frames of "
         "this scene report",
         scene=shown.scene,
-        depth=shown.images["Z"].astype(np.float64),
+        depth=shown.images["Z"],
         method="stored",
-        truth=shown.depth.astype(np.float64),
-        reflectance=None,
-        intensity=shown.images.get("intensity", shown.images["background"]).astype(np.float64),
+        truth=shown.depth,
+        intensity=shown.images.get("intensity", shown.images["background"]),
         intensity_label="recorded photons" if "intensity" in shown.images else "background photon (1) or return (0)",
         layers=[_Layer(label="frames", colour="#999999", cube=cube, factor=1.0, filled=True)],
         edges=edges,
@@ -230,34 +225,31 @@ def reported_depths(frames: FrameSequence, frame: int) -> tuple[NDArray[np.int64
     return cube.reshape(scene.camera.height, scene.camera.width, bins), edges
 
 
-def _name(scene: Scene) -> str:
-    return "spadwarp" if scene.source is None else Path(scene.source).stem
-
-
 # The page's data
 
 
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
     scene = page.scene
+    depth, truth, intensity = (np.asarray(image, np.float64) for image in (page.depth, page.truth, page.intensity))
     lines = lines_of_sight(scene)
     laser = np.zeros(3) if lines.bent else lines.laser
-    path = lines.path_from_range(lines.range_from_depth(page.truth))
+    path = lines.path_from_range(lines.range_from_depth(truth))
     arrival = path / scene.medium.pulse_speed
     port = [0.0, 0.0]  # what ports add to a path, and to a range [m]; for a laser close to the lens
     if lines.bent:
         both = 2.0 if lines.laser_port is not None else 1.0
         port = [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
-    cloud = lines.points(lines.range_from_depth(page.depth))
+    cloud = lines.points(lines.range_from_depth(depth))
     histograms, block, merged = _histograms(page.layers)
     edges = page.edges[::merged]
     if edges[-1] != page.edges[-1]:
         edges = np.append(edges, page.edges[-1])
-    images = {"depth": page.depth, "truth": page.truth, "error": page.depth - page.truth, "intensity": page.intensity}
+    images = {"depth": depth, "truth": truth, "error": depth - truth, "intensity": intensity}
     if page.reflectance is not None:
         images["reflectance"] = page.reflectance
     return {
-        "shape": list(page.depth.shape),
+        "shape": list(depth.shape),
         "images": {name: _packed(image) for name, image in images.items()},
         "cloud": [_packed(cloud[..., axis]) for axis in range(3)],
         "arrival": _packed(1e9 * arrival),
@@ -274,7 +266,7 @@ def _data(page: _Page) -> dict[str, Any]:
         "unit": page.unit,
         "sparse": not any(layer.filled for layer in page.layers),
         "response": _response(page.response),
-        "first": median_pixel(page.intensity, np.isfinite(page.depth) & np.isfinite(page.truth)),
+        "first": median_pixel(intensity, np.isfinite(depth) & np.isfinite(truth)),
     }
 
 
