@@ -52,7 +52,7 @@ Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
 
 class Noise(_Table):
-    """What the noise of a training is drawn from: `[lowest, highest]`, or a part of the samples."""
+    """The noise of a training: `[lowest, highest]`, or a part of the samples."""
 
     backscatter: Shares = Field(
         (0.0, 0.6), description="part of the pixels that report backscatter; low ones are drawn more often"

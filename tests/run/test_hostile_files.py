@@ -69,7 +69,7 @@ NOT_READ = {
     "data/frames-00000.h5": {"seed", "pulses"},
     "data/histograms-00000.h5": {"gate_start", "bin_width"},
 }
-SCENE_COLUMNS = {"depth", "bound", "normal", "albedo", "backscatter_profile", "profile_edges"}
+SCENE_COLUMNS = {"depth", "bound", "normal", "reflectance", "backscatter_profile", "profile_edges"}
 SCENE_COLUMNS |= {"gate_near", "gate_far", "config", "signal", "pulses", "distance"}
 
 

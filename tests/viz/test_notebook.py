@@ -91,7 +91,7 @@ def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
 
 def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
     display = pytest.importorskip("IPython.display")
-    from spadwarp.viz import progress
+    from spadwarp.viz import notebook
 
     shown = []
 
@@ -105,7 +105,7 @@ def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
         return Handle()
 
     monkeypatch.setattr(display, "display", first)
-    monkeypatch.setattr(progress, "_in_notebook", lambda: True)
+    monkeypatch.setattr(notebook, "_in_notebook", lambda: True)
     bar = spadwarp.viz.progress_bar("frames")
     for stage, done, total in (("compile", 0, 0), ("<note>", 0, 0), ("frames", 1, 4), ("frames", 4, 4)):
         bar(stage, done, total)

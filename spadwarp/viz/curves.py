@@ -1,26 +1,41 @@
-"""Pictures of photon budgets and sweeps."""
+"""Curves and points: photon budgets, sweeps, learning curves, and cases of the validation."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow
 from spadwarp.analytic.sweeps import Sweep
 from spadwarp.scene import Scene
-from spadwarp.viz.style import PAGE, SERIES, columns_that_fit, log_axis, new_figure, paper, plain_axis, save, wrapped
+from spadwarp.viz.style import (
+    BLUE,
+    PAGE,
+    RED,
+    SERIES,
+    TEXT,
+    columns_that_fit,
+    log_axis,
+    new_figure,
+    panel_grid,
+    paper,
+    plain_axis,
+    save,
+    wrapped,
+)
 
-__all__ = ["draw_budget", "draw_sweep"]
+__all__ = ["draw_budget", "draw_learning_curves", "draw_sweep", "draw_validation"]
 
 # Label, factor, and the widest range of values to show.
 _PANELS: dict[str, tuple[str, float, tuple[float, float]]] = {
@@ -49,7 +64,7 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
     figure of this width [inch], and writes it where `path` is given.
     """
     waters = list(dict.fromkeys(row.medium for row in rows))
-    figure, axes = _grid(len(_PANELS), width)
+    figure, axes = panel_grid(len(_PANELS), width, least=2.3, height=2.1, more=0.5)
     for number, name in enumerate(waters):
         own = [row for row in rows if row.medium == name]
         x = np.array([row.range for row in own])
@@ -102,7 +117,7 @@ def draw_sweep(
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
     names = list(columns or (_PANELS if budgets else _ERROR_PANELS))
-    figure, axes = _grid(len(names), width)
+    figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.5)
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
     x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
     for number, (axis, name) in enumerate(zip(axes, names, strict=False)):
@@ -162,19 +177,6 @@ def _unit(field: str) -> str:
     return found.group(0) if found else ""
 
 
-def _grid(panels: int, width: float) -> tuple[Figure, list[Axes]]:
-    columns = columns_that_fit(panels, width, 2.3)
-    lines = math.ceil(panels / columns)
-    columns = math.ceil(panels / lines)
-    figure = new_figure(width, 2.1 * lines + 0.5)
-    axes = list(np.ravel(figure.subplots(lines, columns)))
-    for axis in axes[panels:]:
-        axis.remove()
-    for axis in axes[:panels]:
-        plain_axis(axis)
-    return figure, axes[:panels]
-
-
 def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
     """The ranges themselves where they are few, else 1, 2 and 5 times the powers of ten."""
     low, high = min(ranges), max(ranges)
@@ -186,3 +188,70 @@ def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
         log_axis(axis, "x")
         axis.xaxis.set_major_locator(FixedLocator(ticks))
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+@paper()
+def draw_learning_curves(
+    log: Sequence[Mapping[str, Any]], path: str | Path, *, title: str, width: float = PAGE
+) -> Path:
+    """Loss and validation PSNR against steps; returns the picture's path.
+
+    `log`: for each report its `step`, `loss` and `psnr` [dB], a mapping from the backscatter fraction, or from the
+    signal photons per pixel (1 and more), to the PSNR there. `width`: of the picture [inch].
+    """
+    steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
+    style: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
+    levels = list(log[-1]["psnr"])
+    counted = all(float(level) >= 1 for level in levels)
+    in_line = columns_that_fit(len(levels) + 1, width, 0.8)
+    more = 0.7 + 0.14 * (len(levels) // in_line)
+    figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1, more=more)
+    loss.plot(steps, losses, color=BLUE, **style)
+    loss.set(xlabel="step", ylabel="loss")
+    if min(losses) > 0:  # "psnr" is a logarithm
+        log_axis(loss, "y")
+    for level, shade in zip(levels, np.linspace(0.85, 0.0, len(levels)), strict=True):
+        colour = matplotlib.colormaps["viridis"](shade)
+        label = f"{float(level):g}" if counted else level
+        psnr.plot(steps, [line["psnr"][level] for line in log], color=colour, label=label, **style)
+    psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
+    title_of_levels = "signal photons per pixel" if counted else "backscatter fraction"
+    figure.legend(title=title_of_levels, loc="outside lower center", ncols=in_line)
+    for axis in (loss, psnr):
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    figure.suptitle(wrapped(title, width - 0.3), color=TEXT)
+    return save(figure, path)
+
+
+@paper()
+def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, title: str, width: float = PAGE) -> Path:
+    """Draws the quantities of a case as a PNG; returns its path.
+
+    `rows`: of each `quantity` its `value`, `reference`, `standard_error`, `z` and whether it `passed`. `width`: of the
+    picture [inch]. Raises `FileError`.
+    """
+    names = [wrapped(row["quantity"], 0.36 * width, size=7) for row in rows]
+    lines = sum(name.count("\n") + 1 for name in names)
+    title = wrapped(title, width - 0.3)
+    figure = new_figure(width, 0.9 + 0.15 * (lines + len(rows)) + 0.14 * title.count("\n"))
+    ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    for y, row in enumerate(rows):
+        style: dict[str, Any] = {"color": BLUE if row["passed"] else RED, "marker": "o" if row["passed"] else "X"}
+        reference = row["reference"]
+        if reference:
+            error = abs(row["standard_error"] / reference)
+            ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, linestyle="none", **style)
+        if math.isfinite(row["z"]):
+            deviation.plot(row["z"], y, **style)
+    ratio.axvline(0.0, color="0.6", linewidth=0.8)
+    ratio.set_xlabel("value / reference − 1")
+    ratio.set_yticks(range(len(rows)), names)
+    ratio.set_ylim(len(rows) - 0.5, -0.5)
+    deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
+    deviation.set_xlabel(wrapped("z [standard errors]", 0.22 * width))
+    for axis in (ratio, deviation):
+        axis.locator_params(axis="x", nbins=4)
+        axis.xaxis.minorticks_on()
+        plain_axis(axis)
+    figure.suptitle(title)
+    return save(figure, path)
