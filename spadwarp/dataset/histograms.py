@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from spadwarp.dataset.rendered import RenderedScene
 from spadwarp.dataset.schema import HISTOGRAM_COLUMNS, PACKED, describe
 from spadwarp.errors import FileError
-from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.io.hdf5 import Hdf5File
 
 __all__ = ["HISTOGRAM_FIELDS", "HistogramFile", "HistogramWriter"]
 

@@ -22,10 +22,8 @@ from spadwarp.dataset.sampling import Plan
 from spadwarp.dataset.shards import write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.atomic import atomic_path, remove_temporaries
-from spadwarp.io.lock import lock
-from spadwarp.io.parsing import parse_toml, read_toml
-from spadwarp.io.text import write_json
+from spadwarp.io.paths import atomic_path, lock, remove_temporaries
+from spadwarp.io.text import parse_toml, read_toml, write_json
 from spadwarp.limits import check_integer, check_part
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
 

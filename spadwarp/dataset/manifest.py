@@ -18,9 +18,8 @@ from spadwarp.dataset.schema import FORMAT_VERSION
 from spadwarp.dataset.shards import checksum, write_scene_index
 from spadwarp.device import core_count
 from spadwarp.errors import FileError
-from spadwarp.io.parsing import parse_json, read_text
 from spadwarp.io.paths import file_problem
-from spadwarp.io.text import write_json, write_text
+from spadwarp.io.text import parse_json, read_text, write_json, write_text
 from spadwarp.limits import shown
 
 __all__ = ["check_shards", "finish", "read_manifest", "record_path", "verify_dataset"]

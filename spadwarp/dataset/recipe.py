@@ -35,8 +35,8 @@ from spadwarp.dataset.distributions import (
 )
 from spadwarp.dataset.plumes import Plume
 from spadwarp.errors import ConfigError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.io.paths import example_or_path
+from spadwarp.io.text import read_toml
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe

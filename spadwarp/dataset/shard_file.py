@@ -15,8 +15,7 @@ from spadwarp.dataset.histograms import HISTOGRAM_FIELDS, HistogramFile
 from spadwarp.dataset.rendered import PROFILE_BINS
 from spadwarp.dataset.schema import FORMAT_VERSION, scene_columns
 from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.io.hdf5 import open_hdf5
-from spadwarp.io.hdf5_file import Hdf5File
+from spadwarp.io.hdf5 import Hdf5File, open_hdf5
 from spadwarp.scene import Scene
 
 __all__ = ["SceneFile", "ShardFile", "frame_count"]

@@ -21,8 +21,8 @@ from spadwarp.dataset.sampling import Plan, Shard
 from spadwarp.dataset.schema import FORMAT_VERSION, FRAME_COLUMNS, PACKED, describe, scene_columns, scene_row
 from spadwarp.device import core_count, pick_device
 from spadwarp.errors import DeviceError
-from spadwarp.io.atomic import remove_temporaries
 from spadwarp.io.hdf5 import write_hdf5
+from spadwarp.io.paths import remove_temporaries
 
 __all__ = ["checksum", "render_scene", "write_scene_index", "write_shard"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
+from spadwarp.io.paths import atomic_path
+from spadwarp.io.text import write_text
+from spadwarp.limits import check_integer
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
+from spadwarp.transport import truth_maps
 from spadwarp.units import time_from_path
 
-__all__ = ["FrameSequence", "SequenceFrame", "exr_metadata", "write_exr_frame", "write_mat", "write_npy", "write_ptu"]
+__all__ = [
+    "FrameSequence",
+    "SequenceFrame",
+    "exr_metadata",
+    "write_exr_frame",
+    "write_mat",
+    "write_npy",
+    "write_ptu",
+    "write_sensor_fusion",
+]
 
 _LARGEST_VARIABLE = 2**31 - 1  # bytes of one array in a MATLAB 5 file
 _LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
@@ -124,7 +137,6 @@ def write_mat(
     frames: FrameSequence, path: Path, number: int, *, more: Mapping[str, NDArray[Any]] | None = None
 ) -> Path:
     """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `more`: further ones."""
-    from scipy.io import savemat
     from scipy.sparse import csc_matrix
 
     frame, counts = frames.with_counts(number, ".mat")
@@ -156,6 +168,12 @@ def write_mat(
         "pulses": float(frame.pulses),
         **(more or {}),
     }
+    return _save_mat(path, variables)
+
+
+def _save_mat(path: Path, variables: Mapping[str, Any]) -> Path:
+    from scipy.io import savemat
+
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         savemat(file, variables, do_compression=True)
     return path
@@ -228,3 +246,84 @@ def exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | flo
     if scene is not None:
         metadata |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
     return metadata
+
+
+# Sensor fusion
+
+
+def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: range, factor: int = 8) -> list[Path]:
+    """Writes frames as the loader of Lindell, O'Toole and Wetzstein (2018) for sensor fusion reads them.
+
+    - `intensity/STEM-00000.mat`: `intensity` `[factor · H, factor · W]`, 0 to 255: reflectance times the cosine of the
+      angle of view, as a photo with a flash without scattering.
+    - `spad/STEM-00000_p1.mat`: the variables of `write_mat`, and `bin_hr` `[factor · H, factor · W]`, the bin of the
+      true time of flight, counted from 1 at its centre and with its fraction, within [1, T]; 0 without a target.
+    - `STEM.txt`: the list of the intensity files, which the loader takes.
+
+    Args:
+        frames: With counts, of scenes whose targets are meshes.
+        folder: Where they are written.
+        stem: Of their names.
+        chosen: Numbers of the frames.
+        factor: Pixels of the camera image in a pixel, along a row and along a column, in [1, 64].
+
+    Raises:
+        ArgumentError: Depth without counts, or no scene.
+        FileError: A file cannot be written.
+    """
+    factor = check_integer("factor", factor, "[1, 64]")
+    listed, written = [], []
+    images: dict[Scene, dict[str, Any]] = {}
+    for number in chosen:
+        frame, _ = frames.with_counts(number, "sensor fusion")
+        if frame.scene is None or not frame.scene.targets:
+            raise ArgumentError(f"{frames.name}: frame {number} has no scene of meshes to take a finer image of")
+        if frame.scene not in images:
+            images = {frame.scene: _camera_image(frame, factor)}  # frames of one scene follow each other
+        image = images[frame.scene]
+        name = f"{stem}-{number:05}"
+        intensity = folder / "intensity" / f"{name}.mat"
+        _save_mat(intensity, {"intensity": image["intensity"]})
+        spad = folder / "spad" / f"{name}_p1.mat"
+        write_mat(frames, spad, number, more={"bin_hr": image["bin_hr"]})
+        listed.append(os.path.abspath(intensity))
+        written += [intensity, spad]
+    path = folder / f"{stem}.txt"
+    write_text("".join(f"{name}\n" for name in listed), path)
+    return [*written, path]
+
+
+def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
+    """Truth of a camera with `factor`² pixels in each pixel of the frame's."""
+    assert frame.scene is not None and frame.counts is not None
+    scene, bins = _finer(frame.scene, factor), frame.counts.shape[-1]
+    truth = truth_maps(scene, device="cpu")
+    found = frame.bins_of(scene, truth.depth)
+    seen = (found >= 0) & (found < bins)
+    cosine = -np.einsum("hwi,hwi->hw", truth.normal, lines_of_sight(scene).direction)
+    light = np.nan_to_num(truth.reflectance * np.clip(cosine, 0.0, 1.0))
+    return {
+        "bin_hr": np.where(seen, np.clip(found + 0.5, 1.0, bins), 0.0),
+        "intensity": (255.0 * light / max(float(light.max()), 1e-300)).astype(np.float32),
+    }
+
+
+def _finer(scene: Scene, factor: int) -> Scene:
+    """The scene by a camera of the same place and view with `factor` times as many pixels each way."""
+    camera, tables = scene.camera, scene.to_dict()
+    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
+    tables["camera"] = {
+        "width": factor * camera.width,
+        "height": factor * camera.height,
+        "fx": factor * fx,
+        "fy": factor * fy,
+        "cx": factor * column - 0.5,
+        "cy": factor * row - 0.5,
+        "distortion": list(camera.distortion),
+        "position": list(camera.position),
+        "rotation_deg": list(camera.rotation_deg),
+        "pinhole": True,
+        "aperture_diameter": 0.01,
+    }
+    tables.pop("scan", None)
+    return Scene.from_dict(tables, source=scene.source)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, first_photon_probabilities
-from spadwarp.frames.monte_carlo_noise import noise_caption
+from spadwarp.frames.spad import noise_caption
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz.panels import Panels, arrival_line, shown_limits, target_limits
 from spadwarp.viz.result import channel_text

@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from spadwarp.frames.sequence_file import SequenceFile
+from spadwarp.frames.file import SequenceFile
 from spadwarp.viz.style import DEPTH_MAP, INTENSITY_MAP, colour_map, new_figure, paper
 
 __all__ = ["moving_pictures"]

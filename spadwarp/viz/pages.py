@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import atomic_path
 
 __all__ = ["write_page"]
 

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import atomic_path
 from spadwarp.limits import check_real
 from spadwarp.result import Channel
 

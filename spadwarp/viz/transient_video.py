@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile
-from spadwarp.frames.sequence_file import SequenceFile
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.paths import check_apart
+from spadwarp.frames.file import SequenceFile
+from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Result
 from spadwarp.viz.moving_pictures import moving_pictures

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from spadwarp.frames.estimators import arrival_time
+from spadwarp.frames.depth import arrival_time
 
 GATE = dict(gate_start=100e-9, bin_width=50e-12)
 IRF = np.exp(-0.5 * ((np.arange(15) - 7) / 2.0) ** 2)

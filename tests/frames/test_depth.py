@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import spadwarp
+from spadwarp.files import write_depth
 from spadwarp.frames.depth import Reduction, depth_of
 from spadwarp.frames.measured import read_histograms
-from spadwarp.io.ply import point_cloud, point_normals, write_ply
-from spadwarp.run import write_depth
+from spadwarp.io.arrays import point_cloud, point_normals, write_ply
 from spadwarp.scene import Camera
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.pose import rotation_matrix, to_camera

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from spadwarp.io import hdf5_packing
+from spadwarp.io import hdf5
 
 RNG = np.random.default_rng(3)
 FILTERS = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
@@ -20,9 +20,9 @@ FILTERS = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletc
 )
 @pytest.mark.parametrize("least", [0, 1 << 30])
 def test_arrays_come_back_from_files_as_hdf5_makes_them(tmp_path, monkeypatch, values, chunks, least):
-    monkeypatch.setattr(hdf5_packing, "_LARGE", least)
+    monkeypatch.setattr(hdf5, "_LARGE", least)
     with h5py.File(tmp_path / "own.h5", "w") as file:
-        hdf5_packing.write_packed(file, "x", values, chunks=chunks, compression=1)
+        hdf5.write_packed(file, "x", values, chunks=chunks, compression=1)
     with h5py.File(tmp_path / "hdf5.h5", "w") as file:
         file.create_dataset("x", data=values, chunks=chunks, **FILTERS)
     with h5py.File(tmp_path / "own.h5") as own, h5py.File(tmp_path / "hdf5.h5") as other:
@@ -35,9 +35,9 @@ def test_arrays_come_back_from_files_as_hdf5_makes_them(tmp_path, monkeypatch, v
 
 
 def test_a_damaged_chunk_is_found(tmp_path, monkeypatch):
-    monkeypatch.setattr(hdf5_packing, "_LARGE", 0)
+    monkeypatch.setattr(hdf5, "_LARGE", 0)
     with h5py.File(tmp_path / "x.h5", "w") as file:
-        made = hdf5_packing.write_packed(file, "x", np.arange(6000), chunks=(1000,), compression=1)
+        made = hdf5.write_packed(file, "x", np.arange(6000), chunks=(1000,), compression=1)
         place = made.id.get_chunk_info(3).byte_offset
     data = bytearray((tmp_path / "x.h5").read_bytes())
     data[place + 10] ^= 1
