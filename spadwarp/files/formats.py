@@ -294,8 +294,8 @@ def _chosen(source: FrameSequence, frames: int | slice | None) -> range:
     chosen = every if frames is None else every[frames]
     if not chosen:
         ends = (None, None) if frames is None else (frames.start, frames.stop)
-        asked = ":".join("" if end is None else str(end) for end in ends)
-        raise ArgumentError(f"{source.name} holds {source.count} frames, none of them in {asked}")
+        text = ":".join("" if end is None else str(end) for end in ends)
+        raise ArgumentError(f"{source.name} holds {source.count} frames, none of them in {text}")
     return chosen
 
 

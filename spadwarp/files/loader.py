@@ -25,7 +25,7 @@ from spadwarp.units import range_from_time
 __all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "stored_depth", "summary"]
 
 Held = Result | FramesFile | SequenceFile | AnalyticFile | FrameReader | PhotonRecords
-"""What a file of ours holds."""
+"""Content of a file of ours."""
 
 _NAMES = ("frames.h5", "result.h5", "analytic.h5", "sequence.h5")
 _DATASET, _CHECKPOINT = "manifest.json", "checkpoint.h5"
@@ -39,7 +39,7 @@ _LOADERS: dict[str, Callable[[Path], Held]] = {
 
 
 def load(path: str | os.PathLike[str]) -> Held:
-    """What a file that spadwarp wrote holds.
+    """Loads a file that spadwarp wrote.
 
     - `result.h5`, `checkpoint.h5`: a `Result`.
     - `frames.h5` of `detect`: a `FramesFile`, which reads counts and depth when asked.

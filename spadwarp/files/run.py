@@ -256,7 +256,7 @@ def _write_points(reduction: Reduction, path: str | Path, frame: str, comment: s
 
 def fit_files(unknowns: Sequence[Unknown]) -> list[str]:
     """Names of the files that `write_fit` writes for these unknowns."""
-    maps = [_file_name(one.name) for one in unknowns if one.per_pixel]
+    maps = [_file_name(unknown.name) for unknown in unknowns if unknown.per_pixel]
     return ["fit.png", "scene.toml", *(f"{name}{ending}.npy" for name in maps for ending in ("", "_error"))]
 
 
@@ -268,10 +268,10 @@ def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
     """
     folder = Path(directory)
     written = [_Pictures(fit, folder).save(), write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
-    for one in fit.maps.values():
-        name = _file_name(one.name)
-        written += [write_array(folder / f"{name}.npy", one.value)]
-        written += [write_array(folder / f"{name}_error.npy", one.standard_error)]
+    for estimate in fit.maps.values():
+        name = _file_name(estimate.name)
+        written += [write_array(folder / f"{name}.npy", estimate.value)]
+        written += [write_array(folder / f"{name}_error.npy", estimate.standard_error)]
     return written
 
 

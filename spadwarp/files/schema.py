@@ -78,8 +78,8 @@ def _widened(name: str, field: dict[str, Any], table: str, *, scene: bool) -> di
     kind = {key: value for key, value in field.items() if key not in ("description", "default", "title")}
     if name in (*COEFFICIENTS, *ENERGIES[1:]):
         extra.pop("default", None)
-    if name == "preset" and (names := [one for one in presets() if one.split(".")[0] == _SECTIONS.get(table)]):
-        return {"enum": [one.partition(".")[2] for one in names], **extra}
+    if name == "preset" and (names := [preset for preset in presets() if preset.split(".")[0] == _SECTIONS.get(table)]):
+        return {"enum": [preset.partition(".")[2] for preset in names], **extra}
     if name == "builtin" and table == "Target":
         return {"enum": list(builtin_names()), **extra}
     also: list[dict[str, Any]] = []
@@ -97,13 +97,13 @@ def _widened(name: str, field: dict[str, Any], table: str, *, scene: bool) -> di
 
 
 def _takes(field: Mapping[str, Any], kind: str) -> bool:
-    return field.get("type") == kind or any(_takes(one, kind) for one in field.get("anyOf", ()))
+    return field.get("type") == kind or any(_takes(option, kind) for option in field.get("anyOf", ()))
 
 
 def _vectors(field: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for one in (field, *field.get("anyOf", ())):
-        if isinstance(one, dict) and "prefixItems" in one:
-            yield one
+    for option in (field, *field.get("anyOf", ())):
+        if isinstance(option, dict) and "prefixItems" in option:
+            yield option
 
 
 def _distribution(table: dict[str, Any]) -> dict[str, Any]:

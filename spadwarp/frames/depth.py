@@ -16,6 +16,10 @@ from spadwarp.scene import Camera
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
 from spadwarp.units import path_from_time
 
+if TYPE_CHECKING:
+    from spadwarp.frames.measured import Histograms
+    from spadwarp.result import Result
+
 __all__ = ["METHODS", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
@@ -96,9 +100,9 @@ def arrival_time(
             stop=stop,
             half_width=half_width,
         )
-        found: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
-    found = found.double() if is_torch(found) else found.astype(np.float64)
-    return gate_start + (found.reshape(frame) - offset) * bin_width
+        position: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
+    position = position.double() if is_torch(position) else position.astype(np.float64)
+    return gate_start + (position.reshape(frame) - offset) * bin_width
 
 
 def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float, bins: int) -> tuple[int, int]:
@@ -138,8 +142,8 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
         valid = bool(np.isfinite(array).all() and (array >= 0).all())
         values = wp.array(array, dtype=wp.float32, device=rows.device)
     if not valid:
-        found = values.numpy()
-        raise ArgumentError(f"background = {found.min()} … {found.max()} is outside [0, inf)")
+        array = values.numpy()
+        raise ArgumentError(f"background = {array.min()} … {array.max()} is outside [0, inf)")
     return values
 
 
@@ -199,11 +203,6 @@ def _monotone_cubic(x: NDArray[np.floating], y: NDArray[np.floating]) -> Any:
 
 
 # Depth
-
-
-if TYPE_CHECKING:
-    from spadwarp.frames.measured import Histograms
-    from spadwarp.result import Result
 
 
 def depth_frame(

@@ -68,8 +68,8 @@ class SequenceFrame:
     def true_bins(self) -> NDArray[np.float64]:
         """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
         assert self.scene is not None and self.depth is not None and self.counts is not None
-        found = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
-        return np.where((found >= 1) & (found <= self.counts.shape[-1]), found, 0.0)
+        bins = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
+        return np.where((bins >= 1) & (bins <= self.counts.shape[-1]), bins, 0.0)
 
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
@@ -134,7 +134,7 @@ def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
 
 
 def write_mat(
-    frames: FrameSequence, path: Path, number: int, *, more: Mapping[str, NDArray[Any]] | None = None
+    frames: FrameSequence, path: Path, number: int, *, extra: Mapping[str, NDArray[Any]] | None = None
 ) -> Path:
     """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `more`: further ones."""
     from scipy.sparse import csc_matrix
@@ -166,7 +166,7 @@ def write_mat(
         "mean_signal_photons": photons,
         "mean_background_photons": frame.background,
         "pulses": float(frame.pulses),
-        **(more or {}),
+        **(extra or {}),
     }
     return _save_mat(path, variables)
 
@@ -285,7 +285,7 @@ def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: 
         intensity = folder / "intensity" / f"{name}.mat"
         _save_mat(intensity, {"intensity": image["intensity"]})
         spad = folder / "spad" / f"{name}_p1.mat"
-        write_mat(frames, spad, number, more={"bin_hr": image["bin_hr"]})
+        write_mat(frames, spad, number, extra={"bin_hr": image["bin_hr"]})
         listed.append(os.path.abspath(intensity))
         written += [intensity, spad]
     path = folder / f"{stem}.txt"
@@ -298,12 +298,12 @@ def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
     assert frame.scene is not None and frame.counts is not None
     scene, bins = _finer(frame.scene, factor), frame.counts.shape[-1]
     truth = truth_maps(scene, device="cpu")
-    found = frame.bins_of(scene, truth.depth)
-    seen = (found >= 0) & (found < bins)
+    position = frame.bins_of(scene, truth.depth)
+    inside = (position >= 0) & (position < bins)
     cosine = -np.einsum("hwi,hwi->hw", truth.normal, lines_of_sight(scene).direction)
     light = np.nan_to_num(truth.reflectance * np.clip(cosine, 0.0, 1.0))
     return {
-        "bin_hr": np.where(seen, np.clip(found + 0.5, 1.0, bins), 0.0),
+        "bin_hr": np.where(inside, np.clip(position + 0.5, 1.0, bins), 0.0),
         "intensity": (255.0 * light / max(float(light.max()), 1e-300)).astype(np.float32),
     }
 

@@ -106,9 +106,9 @@ class _StoredFrames:
 
     @staticmethod
     def _common(file: Hdf5File, path: str | Path) -> dict[str, Any]:
-        """What files of both kinds hold."""
-        found = file.names("depth")
-        if unknown := [name for name in found if name not in METHODS]:
+        """Fields that files of both kinds have."""
+        names = file.names("depth")
+        if unknown := [name for name in names if name not in METHODS]:
             file.refuse(f"depth/{unknown[0]}", f"is not by one of {', '.join(METHODS)}")
         period = file.real("period", "(0, inf]")
         return {
@@ -118,7 +118,7 @@ class _StoredFrames:
             "gate_start": file.real("gate_start"),
             "bin_width": file.real("bin_width", "(0, inf)"),
             "period": period if np.isfinite(period) else None,
-            "methods": tuple(name for name in METHODS if name in found),
+            "methods": tuple(name for name in METHODS if name in names),
         }
 
 
@@ -222,8 +222,8 @@ def _expectation(file: Hdf5File, name: str, shape: tuple[int, int, int]) -> NDAr
     """Expected detections `[H, W, T]`, or `[H, W, 1]`; None where the file has none."""
     if name not in file:
         return None
-    one = file.stored(name, np.float32, (*shape[:2], None)).shape[2] == 1 and name == "background"
-    values = file.array(name, np.float32, (*shape[:2], 1) if one else shape)
+    is_even = file.stored(name, np.float32, (*shape[:2], None)).shape[2] == 1 and name == "background"
+    values = file.array(name, np.float32, (*shape[:2], 1) if is_even else shape)
     if not (np.isfinite(values).all() and (values >= 0).all()):
         file.refuse(name, "is negative or not finite in some bins")
     return values

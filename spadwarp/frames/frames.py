@@ -13,7 +13,11 @@ from spadwarp.errors import ArgumentError
 from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.interop import Variable, labelled
+from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.limits import check_integer
+
+if TYPE_CHECKING:
+    import xarray
 
 __all__ = ["Frames", "TimeTags", "coates", "first_photon_probabilities", "to_xarray"]
 
@@ -34,8 +38,8 @@ def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np
         if rows.dtype not in (wp.float32, wp.float64):
             rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
         law = kernels.first_photon_probabilities(rows)
-        found: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
-    return found.reshape(shape)
+        values: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
+    return values.reshape(shape)
 
 
 def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float64]:
@@ -68,8 +72,8 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
         if rows.dtype != wp.int32:
             rows = wp.array(values.astype(np.int32), dtype=wp.int32, device=rows.device)
         corrected = kernels.coates(rows, pulses=pulses)
-        found: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
-    return found.reshape(shape)
+        result: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
+    return result.reshape(shape)
 
 
 # Frames
@@ -87,7 +91,7 @@ class TimeTags(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Frames:
-    """What the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
+    """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
 
     Attributes:
         counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
@@ -206,10 +210,6 @@ class Frames:
 # Labelled arrays
 
 
-if TYPE_CHECKING:
-    import xarray
-
-
 def to_xarray(frames: Frames) -> xarray.Dataset:
     """Counts, and the expectation that they were drawn from, as an xarray data set with coordinates and units.
 
@@ -223,18 +223,16 @@ def to_xarray(frames: Frames) -> xarray.Dataset:
     background = np.broadcast_to(on_host(frames.background), expected.shape)
     height, width, _ = expected.shape
     cube = ("y", "x", "time")
-    dimensions = cube if frames.summed else ("frame", *cube)
-    edges = frames.gate_start + frames.edges
     variables: dict[str, Variable] = {
-        "counts": (dimensions, counts, "1", "detections in the bin"),
+        "counts": (cube if frames.summed else ("frame", *cube), counts, "1", "detections in the bin"),
         "expected": (cube, expected, "1", "expected detections per pulse and bin before pile-up"),
         "background": (cube, background, "1", "the part of `expected` that is not target"),
     }
+    edges = frames.gate_start + frames.edges
     coordinates: dict[str, Variable] = {
         "time": (("time",), 0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
         "bin_width": (("time",), np.diff(edges), "s", "width of the bin"),
-        "y": (("y",), np.arange(height), "1", "row of pixels, downwards"),
-        "x": (("x",), np.arange(width), "1", "column of pixels, to the right"),
+        **{name: ((name,), *image_coordinates(height, width)[name]) for name in PIXELS},
     }
     if not frames.summed:
         numbers = np.arange(frames.first_frame, frames.first_frame + frames.frames)

@@ -76,8 +76,8 @@ class Histograms:
         return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
-class _Asked(NamedTuple):
-    """What the caller says about a file, as in `read_histograms`."""
+class _Request(NamedTuple):
+    """Facts that the caller states about a file, as in `read_histograms`."""
 
     dataset: str | None
     axes: str | None
@@ -88,7 +88,7 @@ class _Asked(NamedTuple):
 
 
 class _Raw(NamedTuple):
-    """Histograms as they stand in a file, in their own order of axes, with what the file says."""
+    """Histograms as they stand in a file, in their own order of axes, and the facts in the file."""
 
     values: NDArray[Any]
     notes: tuple[str, ...] = ()
@@ -145,16 +145,16 @@ def read_histograms(
             check_real(f"{name} [s]", value, "(0, 0.001)")
     if gate_start is not None:
         check_real("gate_start [s]", gate_start, "[-1, 1]")
-    asked = _Asked(dataset, axes, image_size, tag_unit, bin_width, sum_frames)
+    request = _Request(dataset, axes, image_size, tag_unit, bin_width, sum_frames)
     ending = path.suffix.lower()
     if ending in (".h5", ".hdf5") and _is_own(path):
-        given = {**asked._asdict(), "gate_start": gate_start, "irf": irf}
-        if clash := [name.replace("_", " ") for name, value in given.items() if value]:
+        arguments = {**request._asdict(), "gate_start": gate_start, "irf": irf}
+        if clash := [name.replace("_", " ") for name, value in arguments.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    raw = _read(path, ending, asked)
+    raw = _read(path, ending, request)
     _check(raw.values, path)
     values, notes = raw.values, list(raw.notes)
     if not raw.ordered:
@@ -213,18 +213,18 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
     )
 
 
-def _read(path: Path, ending: str, asked: _Asked) -> _Raw:
-    readers: dict[str, Callable[[Path, _Asked], _Raw]] = {
+def _read(path: Path, ending: str, request: _Request) -> _Raw:
+    readers: dict[str, Callable[[Path, _Request], _Raw]] = {
         ".h5": _read_hdf5,
         ".hdf5": _read_hdf5,
-        ".npy": lambda path, asked: _Raw(read_npy(path)),
+        ".npy": lambda path, request: _Raw(read_npy(path)),
         ".mat": _read_mat,
         ".ptu": _read_ptu,
     }
     if ending not in readers:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
     try:
-        return readers[ending](path, asked)
+        return readers[ending](path, request)
     except (SpadwarpError, MemoryError):
         raise
     except ModuleNotFoundError as error:
@@ -294,12 +294,12 @@ def _in_words(shape: tuple[int, ...], axes: str) -> str:
 # Arrays by their names, in HDF5 files of others and in MATLAB's
 
 
-def _named(path: Path, dataset: str | None, names: Sequence[str], found: Sequence[str], listed: str) -> str:
+def _named(path: Path, dataset: str | None, names: Sequence[str], candidates: Sequence[str], listed: str) -> str:
     """The dataset that was asked for, else the first that was found. Raises `FileError` if it is not there."""
-    if dataset is None and not found:
+    if dataset is None and not candidates:
         others = ", sparse matrix or cells" if path.suffix.lower() == ".mat" else ""
         raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {listed}")
-    name = dataset or found[0]
+    name = dataset or candidates[0]
     if name not in names:
         raise FileError(f"{path}: no array {name!r}; it holds {listed}")
     return name
@@ -318,25 +318,28 @@ def _numeric_shapes(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]])
     return {name: shape for name, (shape, dtype) in arrays.items() if dtype.kind in "biuf"}
 
 
-def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
+def _read_hdf5(path: Path, request: _Request) -> _Raw:
     with read_hdf5(path) as file:
         arrays = file.arrays()
     listed = _listed({name: shape for name, (shape, _) in arrays.items()})
     cubes = [name for name, shape in _numeric_shapes(arrays).items() if len(shape) in (3, 4)]
-    if asked.dataset is None and len(cubes) > 1:
+    if request.dataset is None and len(cubes) > 1:
         raise _unnamed(path, listed)
-    name = _named(path, asked.dataset, list(arrays), cubes, listed)
+    name = _named(path, request.dataset, list(arrays), cubes, listed)
     shape, dtype = arrays[name]
     _check_size(shape, "a part of the array")
     with read_hdf5(path) as file:
-        return _Raw(file.array(name, dtype, shape), () if asked.dataset else (f"reads {name}",))
+        return _Raw(file.array(name, dtype, shape), () if request.dataset else (f"reads {name}",))
 
 
-def _read_mat(path: Path, asked: _Asked) -> _Raw:
+def _read_mat(path: Path, request: _Request) -> _Raw:
     with open_mat(path) as variables:
-        listed = ", ".join(f"{name} {one.shape} {one.kind}" for name, one in variables.items()) or "no numbers"
-        found = _histograms_in(variables)
-        name = _named(path, asked.dataset, list(variables), found, listed)
+        listed = (
+            ", ".join(f"{name} {variable.shape} {variable.kind}" for name, variable in variables.items())
+            or "no numbers"
+        )
+        candidates = _histograms_in(variables)
+        name = _named(path, request.dataset, list(variables), candidates, listed)
         chosen = variables[name]
         if chosen.kind == "dense":
             _check_size(chosen.shape, "a part of the array")
@@ -346,18 +349,18 @@ def _read_mat(path: Path, asked: _Asked) -> _Raw:
             for key in ("bin_size", "gate_start")
             if key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
         }
-        shapes = [one.shape for one in variables.values() if one.kind == "dense"]
-    notes = [] if asked.dataset or len(found) == 1 else [f"reads {name}, not {', '.join(found[1:])}"]
+        shapes = [variable.shape for variable in variables.values() if variable.kind == "dense"]
+    notes = [] if request.dataset or len(candidates) == 1 else [f"reads {name}, not {', '.join(candidates[1:])}"]
     if chosen.kind == "cell":
-        if asked.tag_unit is None:
+        if request.tag_unit is None:
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (--tag-unit-ps)")
-        return _of_tags(value, asked.tag_unit, asked.bin_width, notes)
+        return _of_tags(value, request.tag_unit, request.bin_width, notes)
     width = facts.get("bin_size")
     width = width if width is not None and 1e-15 < width < 1e-3 else None
-    if asked.bin_width is None and width is not None:
+    if request.bin_width is None and width is not None:
         notes.append(f"bin width {width * 1e12:g} ps from bin_size")
     if isinstance(value, SparseMatrix):
-        height, across = _image_shape(value.shape[0], asked.image_size, shapes)
+        height, across = _image_shape(value.shape[0], request.image_size, shapes)
         notes.append(f"{across} x {height} pixels, column by column")
         cube = _dense(value, height, across)
         return _Raw(cube, tuple(notes), width, facts.get("gate_start"), ordered=True)
@@ -368,26 +371,27 @@ def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
     """Variables that may hold histograms, counts before rates: sparse matrices, cells, arrays by their size."""
     rank = {"sparse": 0, "cell": 1, "dense": 2}
     fits = {
-        name: (rank[one.kind], -math.prod(one.shape))
-        for name, one in variables.items()
-        if math.prod(one.shape) > 1 and (one.kind != "dense" or len(one.shape) in (3, 4))
+        name: (rank[variable.kind], -math.prod(variable.shape))
+        for name, variable in variables.items()
+        if math.prod(variable.shape) > 1 and (variable.kind != "dense" or len(variable.shape) in (3, 4))
     }
     return sorted(fits, key=lambda name: fits[name])
 
 
-def _image_shape(pixels: int, given: tuple[int, int] | None, shapes: list[tuple[int, ...]]) -> tuple[int, int]:
+def _image_shape(pixels: int, image_size: tuple[int, int] | None, shapes: list[tuple[int, ...]]) -> tuple[int, int]:
     """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many.
 
     Raises `ArgumentError` where none or several do.
     """
-    if given is not None:
-        if given[0] * given[1] != pixels:
-            raise ArgumentError(f"image size = {given[1]} x {given[0]} has {given[0] * given[1]} pixels, not {pixels}")
-        return given
-    found = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
-    if len(found) != 1:
+    if image_size is not None:
+        height, width = image_size
+        if height * width != pixels:
+            raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
+        return image_size
+    fitting = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
+    if len(fitting) != 1:
         raise ArgumentError(f"the image's size is missing (--image-size): {pixels} pixels, one after the other")
-    (height, width), *_ = found
+    (height, width), *_ = fitting
     return height, width
 
 
@@ -440,23 +444,23 @@ def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: l
 # PicoQuant's files of T3 records: images, and other scans by their markers
 
 
-def _read_ptu(path: Path, asked: _Asked) -> _Raw:
+def _read_ptu(path: Path, request: _Request) -> _Raw:
     """Counts of all channels. Raises `ArgumentError` for a size that is missing or does not fit the markers."""
     import ptufile
 
     with ptufile.PtuFile(path) as file:
         _check_ptu(file, path)
-        if file.is_image and asked.image_size is None:
-            counts, text = _ptu_image(file, asked.sum_frames), "pixels by the image in its header"
+        if file.is_image and request.image_size is None:
+            counts, text = _ptu_image(file, request.sum_frames), "pixels by the image in its header"
         else:
-            counts, text = _ptu_scan(file, asked.image_size)
+            counts, text = _ptu_scan(file, request.image_size)
         if (channels := file.number_channels) > 1:
             text += f"; {channels} channels, added up"
         notes = [text, f"{len(counts)} frames; --sum-frames adds them up"][: counts.ndim - 2]
         # Time of flight at the start of bin 0, which `spadwarp export` writes in the comment.
-        own = file.tags.get("CreatorSW_Name") == "spadwarp"
-        found = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if own else None
-        start = 1e-9 * float(found[1]) if found else None
+        is_ours = file.tags.get("CreatorSW_Name") == "spadwarp"
+        gate = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if is_ours else None
+        start = 1e-9 * float(gate[1]) if gate else None
         return _Raw(counts, tuple(notes), float(file.tcspc_resolution), start, ordered=True)
 
 
@@ -471,8 +475,8 @@ def _check_ptu(file: Any, path: Path) -> None:
     if not file.is_t3:
         raise FileError(f"{path}: T2 records have no time since the pulse; T3 records are needed")
     file.cache_records = True
-    if (there := len(file.read_records())) < file.number_records:
-        raise FileError(f"{path}: cut: of {file.number_records} records {there} are there")
+    if (readable := len(file.read_records())) < file.number_records:
+        raise FileError(f"{path}: cut: of {file.number_records} records {readable} are there")
     if not 1e-15 < (width := float(file.tcspc_resolution)) < 1e-3:
         raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")
 
@@ -521,10 +525,10 @@ def _ptu_starts(records: Any, marks: NDArray[np.intp], height: int, width: int) 
                 start = (ends[:-1, None] + np.arange(width) / width * np.diff(ends)[:, None]).ravel()
                 ends = np.append(start, ends[-1])
             return ends, text.format(kind)
-    found = ", ".join(f"{time.size} of kind {kind}" for kind, time in times.items()) or "none"
+    markers = ", ".join(f"{time.size} of kind {kind}" for kind, time in times.items()) or "none"
     raise ArgumentError(
         f"image size = {width} x {height}: {height * width} markers of one kind, or {height}, are needed; "
-        f"the file has {found}"
+        f"the file has {markers}"
     )
 
 
@@ -544,10 +548,14 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
         return (array, "") if array.ndim in sides else None
     if ending == ".mat":
         with open_mat(path) as variables:
-            images = {name: one for name, one in variables.items() if one.kind == "dense" and len(one.shape) in (2, 3)}
+            images = {
+                name: variable
+                for name, variable in variables.items()
+                if variable.kind == "dense" and len(variable.shape) in (2, 3)
+            }
             name, choice = dataset, ""
             if name is None and (several or not _histograms_in(variables)):
-                sizes = {name: one.shape for name, one in images.items() if math.prod(one.shape) > 1}
+                sizes = {name: variable.shape for name, variable in images.items() if math.prod(variable.shape) > 1}
                 name, choice = _largest(path, sizes)
             if name not in images or len(images[name].shape) not in sides:
                 return None
@@ -557,12 +565,12 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
             arrays = file.arrays()
         shapes = _numeric_shapes(arrays)
         cubes = [name for name, shape in shapes.items() if len(shape) in (3, 4)]
-        found = [name for name in cubes if several and len(shapes[name]) == 3]
+        images_found = [name for name in cubes if several and len(shapes[name]) == 3]
         if not cubes:
-            found = [name for name, shape in shapes.items() if len(shape) == 2 and math.prod(shape) > 1]
-        if dataset is None and len(found) > 1:
+            images_found = [name for name, shape in shapes.items() if len(shape) == 2 and math.prod(shape) > 1]
+        if dataset is None and len(images_found) > 1:
             raise _unnamed(path, _listed({name: shape for name, (shape, _) in arrays.items()}))
-        name = found[0] if dataset is None and found else dataset
+        name = images_found[0] if dataset is None and images_found else dataset
         shape, dtype = arrays.get(name or "", ((), np.dtype(float)))
         if name is not None and len(shape) in sides:
             with read_hdf5(path) as file:

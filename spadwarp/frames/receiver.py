@@ -66,11 +66,11 @@ def detector_window(
     edges = np.append(0.0, np.cumsum(widths)) * bin_width
     if not wrap:
         period = max(period, edges[-1])
-    left = period - edges[-1]
-    if free_running and left > 1e-9 * period:
+    rest = period - edges[-1]
+    if free_running and rest > 1e-9 * period:
         # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
-        more = math.ceil(left / bin_width) if wrap else 1
-        edges = np.append(edges, edges[-1] + left * np.arange(1, more + 1) / more)
+        extra = math.ceil(rest / bin_width) if wrap else 1
+        edges = np.append(edges, edges[-1] + rest * np.arange(1, extra + 1) / extra)
     return Window(start, edges, bins, period)
 
 
@@ -87,7 +87,7 @@ def missing_light(window: Window, gate_start: float) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Receiver:
-    """What a detector makes of expected light.
+    """Expected detections of a detector, from expected light.
 
     Attributes:
         detector: The section of a scene.
@@ -126,7 +126,7 @@ class Receiver:
         """
         from spadwarp_kernels import detection as kernels
 
-        own = detector_window(
+        time_window = detector_window(
             window or (axis[0], shape[2]),
             axis[1],
             tdc_widths,
@@ -146,7 +146,7 @@ class Receiver:
         )
         return cls(
             detector=detector,
-            window=own,
+            window=time_window,
             image=(shape[0], shape[1]),
             noise=noise if ambient is None else _with_ambient(noise, ambient, shape),
             matrix=response_matrix(
@@ -154,8 +154,8 @@ class Receiver:
                 source_start=axis[0],
                 source_width=axis[1],
                 source_bins=shape[2],
-                edges=own.start + own.edges,
-                period=own.period if detector.wrap else None,
+                edges=time_window.start + time_window.edges,
+                period=time_window.period if detector.wrap else None,
             ),
             equal_bins=tdc_widths is None,
         )

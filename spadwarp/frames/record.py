@@ -137,8 +137,8 @@ def record_frames(
                 recording = Recording(
                     path=Path(path),
                     first=replace(part, counts=part.counts[:1].copy(), frames=1, tags=None),
-                    depth={method: found[0] for method, found in depth.items()},
-                    errors={method: _errors(found, result.truth.depth) for method, found in depth.items()},
+                    depth={method: values[0] for method, values in depth.items()},
+                    errors={method: _errors(values, result.truth.depth) for method, values in depth.items()},
                     bound_time=bound_time,
                     bound_depth=bound_depth,
                     bound_noise=bound_noise,
@@ -163,10 +163,10 @@ def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map, float, 
     if not detector_response(scene.detector, scene.laser).is_smooth:
         return missing, missing, np.nan, ()
     law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
-    found = bound_of_result(result, pulses=pulses, law=law, device=device)
-    if found.problem is not None:
-        return missing, missing, found.noise, (f"no Cramér–Rao bound: {found.problem}",)
-    return found.sigma, found.sigma * depth_per_time(scene, distance), found.noise, ()
+    bound = bound_of_result(result, pulses=pulses, law=law, device=device)
+    if bound.problem is not None:
+        return missing, missing, bound.noise, (f"no Cramér–Rao bound: {bound.problem}",)
+    return bound.sigma, bound.sigma * depth_per_time(scene, distance), bound.noise, ()
 
 
 def _errors(depth: Map, truth: NDArray[np.float32]) -> FrameErrors:
@@ -230,19 +230,21 @@ def simulate_sequence(
     seed = base.transport.seed if seed is None else check_integer("seed", seed, SEED)
     pulses = base.detector.pulses_per_frame if pulses is None else pulses
     photons = base.transport.photons if photons is None else photons
-    one = None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]  # for the rest
-    options: dict[str, Any] = {"pulses": pulses, "frames": 1, "seed": seed, "tags": tags, "device": one}
+    first_device = (
+        None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]
+    )  # for the rest
+    options: dict[str, Any] = {"pulses": pulses, "frames": 1, "seed": seed, "tags": tags, "device": first_device}
     kept: dict[str, Any] = {}
     with write_hdf5(path) as opened:
         file = SequenceWriter(opened, base, moves, photons=photons)
         for number, at in enumerate(scenes):
-            own = int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0])
+            frame_seed = int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0])
             with warnings.catch_warnings():
                 if number:  # said of the first frame
                     warnings.simplefilter("ignore", SpadwarpWarning)
-                result = simulate(at, photons=photons, seed=own, device=device, kept=kept)
+                result = simulate(at, photons=photons, seed=frame_seed, device=device, kept=kept)
                 part = detect(result, first_frame=number, **options)
-            times = {method: part.arrival_time(method, device=one) for method in methods}
+            times = {method: part.arrival_time(method, device=first_device) for method in methods}
             file.add_frame(result, part, {method: depth_from_time(time, scene=at) for method, time in times.items()})
             if progress is not None:
                 progress("frames", number + 1, len(scenes))

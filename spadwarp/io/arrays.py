@@ -148,18 +148,18 @@ def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[
         FileError: No such file, not a `.npz` archive, shorter than a header says, of another type, or too large.
     """
     place = existing_file(path)
-    found: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     try:
         with zipfile.ZipFile(place) as archive:
             for info in archive.infolist():
                 if (name := info.filename.removesuffix(".npy")) in names:
                     with archive.open(info) as file:
-                        found[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
+                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
     except FileError:
         raise
     except Exception as error:  # a damaged header is parsed by Python's own parser
         raise FileError(f"{path}: damaged or not a .npz archive: {error}") from error
-    return found
+    return arrays
 
 
 def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) -> NDArray[Any]:
@@ -169,13 +169,13 @@ def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) ->
     if version not in readers:
         raise ValueError(f"format version {version}")
     shape, _, kind = readers[version](file)
-    values, left = math.prod(shape), size - file.tell()
+    values, available = math.prod(shape), size - file.tell()
     if kind.kind not in kinds:
         raise FileError(f"{where} holds {kind}; numbers are needed")
     if largest is not None and values > largest:
         raise FileError(f"{where} {shape} are {values} values; at most {largest} are allowed")
-    if values * kind.itemsize > left:
-        raise FileError(f"{where} cut: {kind} {shape} takes {values * kind.itemsize} bytes, and {left} are there")
+    if values * kind.itemsize > available:
+        raise FileError(f"{where} cut: {kind} {shape} takes {values * kind.itemsize} bytes, and {available} are there")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
 
@@ -213,12 +213,12 @@ def point_normals(distance: ArrayLike, directions: ArrayLike) -> NDArray[np.floa
 
     def step(axis: int) -> NDArray[np.float64]:
         ahead = np.full_like(image, np.nan)
-        there = [slice(None)] * 3
-        there[axis] = slice(None, -1)
-        ahead[tuple(there)] = np.diff(image, axis=axis)
+        inner = [slice(None)] * 3
+        inner[axis] = slice(None, -1)
+        ahead[tuple(inner)] = np.diff(image, axis=axis)
         behind = np.roll(ahead, 1, axis=axis)  # the last row and column are NaN, and so is what comes round
-        one, other = (np.abs((part * view).sum(axis=-1)) for part in (ahead, behind))
-        use_behind = ~(one <= other) & ~np.isnan(other)
+        cost_ahead, cost_behind = (np.abs((part * view).sum(axis=-1)) for part in (ahead, behind))
+        use_behind = ~(cost_ahead <= cost_behind) & ~np.isnan(cost_behind)
         return np.where(use_behind[..., None], behind, ahead)
 
     normal = np.cross(step(1), step(0))
@@ -249,8 +249,8 @@ def write_ply(
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise ArgumentError(f"points have shape {xyz.shape}; [P, 3] is needed")
     columns = {name: xyz[:, axis] for axis, name in enumerate("xyz")}
-    for name, given in (properties or {}).items():
-        values = np.asarray(given)
+    for name, value in (properties or {}).items():
+        values = np.asarray(value)
         if values.shape != (len(xyz),):
             raise ArgumentError(f"property {name!r} has shape {values.shape}; ({len(xyz)},) is needed")
         if not name.isidentifier() or name in columns:

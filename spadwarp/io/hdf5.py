@@ -85,10 +85,12 @@ def open_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
         raise FileError(f"{path}: {problem}") from error
     file = Hdf5File(opened, path, format or "HDF5 file of this kind")
     try:
-        found = file.attribute("format", "unknown")
-        if format is not None and not (isinstance(found, str) and found == format):
+        stored_format = file.attribute("format", "unknown")
+        if format is not None and not (isinstance(stored_format, str) and stored_format == format):
             hint = "; give the directory of a run of `spadwarp simulate`" if format == "spadwarp result" else ""
-            raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {found!r}, not {format!r}{hint}")
+            raise FileError(
+                f"{path}: an HDF5 file, but not a {format}: its format is {stored_format!r}, not {format!r}{hint}"
+            )
         if version is not None and (newer := file.integer("format_version")) > version:
             raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
     except BaseException:
@@ -104,8 +106,8 @@ def hdf5_format(path: str | Path) -> str | None:
         FileError: No such file, or not HDF5.
     """
     with read_hdf5(path) as file:
-        found = file.attribute("format", None)
-        return found if isinstance(found, str) else None
+        value = file.attribute("format", None)
+        return value if isinstance(value, str) else None
 
 
 def _checked(
@@ -184,19 +186,19 @@ class Hdf5File:
 
         if group not in self._file:
             return []
-        found = self._object(group)
-        return list(found) if isinstance(found, h5py.Group) else self.refuse(group, "is not a group")
+        item = self._object(group)
+        return list(item) if isinstance(item, h5py.Group) else self.refuse(group, "is not a group")
 
     def arrays(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Shape and dtype of the arrays in the file and its groups, by name; links are passed over."""
-        found: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
-        left = ["/"]
-        while left and len(found) < _MOST_ARRAYS:
-            left += self._list_arrays(left.pop(), found)
-        return found
+        arrays: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
+        groups = ["/"]
+        while groups and len(arrays) < _MOST_ARRAYS:
+            groups += self._list_arrays(groups.pop(), arrays)
+        return arrays
 
     @_checked
-    def _list_arrays(self, group: str, found: dict[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> list[str]:
+    def _list_arrays(self, group: str, arrays: dict[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> list[str]:
         """Adds the arrays of a group; returns the groups in it."""
         import h5py
 
@@ -208,7 +210,7 @@ class Hdf5File:
             if isinstance(item, h5py.Group) and full.count("/") < _DEEPEST:
                 groups.append(full)
             elif isinstance(item, h5py.Dataset) and item.shape is not None:
-                found[full] = item.shape, item.dtype
+                arrays[full] = item.shape, item.dtype
         return groups
 
     @_checked
@@ -280,16 +282,18 @@ class Hdf5File:
             kind: Its dtype, or several that it may have; "S" for text of any length.
             shape: Its shape; None for a side of any length.
         """
-        found = self._dataset(name, self._object(name))
+        dataset = self._dataset(name, self._object(name))
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        fits = found.shape is not None and len(found.shape) == len(shape)
-        fits = fits and all(b in (a, None) for a, b in zip(found.shape, shape, strict=True))
-        if not fits or not any(found.dtype.kind == "S" if one == "S" else found.dtype == one for one in kinds):
-            wanted = " or ".join("text" if one == "S" else str(np.dtype(one)) for one in kinds)
+        fits = dataset.shape is not None and len(dataset.shape) == len(shape)
+        fits = fits and all(b in (a, None) for a, b in zip(dataset.shape, shape, strict=True))
+        if not fits or not any(
+            dataset.dtype.kind == "S" if dtype == "S" else dataset.dtype == dtype for dtype in kinds
+        ):
+            needed = " or ".join("text" if dtype == "S" else str(np.dtype(dtype)) for dtype in kinds)
             sides = ", ".join("any" if side is None else str(side) for side in shape)
-            self.refuse(name, f"is {found.dtype} {found.shape}; {wanted} ({sides}) is needed")
-        self._check_size(name, found)
-        return Stored(found, name, self)
+            self.refuse(name, f"is {dataset.dtype} {dataset.shape}; {needed} ({sides}) is needed")
+        self._check_size(name, dataset)
+        return Stored(dataset, name, self)
 
     @_checked
     def values(self, name: str, dataset: Any, key: Any) -> Any:
@@ -305,12 +309,12 @@ class Hdf5File:
         """A dataset that is one text."""
         import h5py
 
-        found = self._dataset(name, self._object(name))
+        dataset = self._dataset(name, self._object(name))
         self._check_text(name)
-        if h5py.check_string_dtype(found.dtype) is None or found.shape != ():
-            self.refuse(name, f"is {found.dtype} {found.shape}; one text is needed")
-        self._check_size(name, found)
-        return found.asstr()[()]
+        if h5py.check_string_dtype(dataset.dtype) is None or dataset.shape != ():
+            self.refuse(name, f"is {dataset.dtype} {dataset.shape}; one text is needed")
+        self._check_size(name, dataset)
+        return dataset.asstr()[()]
 
     @_checked
     def table(self, name: str) -> dict[str, Any]:
@@ -337,7 +341,7 @@ class Hdf5File:
     # Checks
 
     def _object(self, name: str) -> Any:
-        """What a name stands for, if the way there stays in this file."""
+        """The object of a name, if the way there stays in this file."""
         import h5py
 
         place = self._file
@@ -350,13 +354,13 @@ class Hdf5File:
             place = place[part]
         return place
 
-    def _dataset(self, name: str, found: Any) -> Any:
+    def _dataset(self, name: str, item: Any) -> Any:
         """An object, if it is a dataset that lies in this file and is packed by what HDF5 knows itself."""
         import h5py
 
-        if not isinstance(found, h5py.Dataset):
+        if not isinstance(item, h5py.Dataset):
             self.refuse(name, "is not an array")
-        created = found.id.get_create_plist()
+        created = item.id.get_create_plist()
         if created.get_external_count() or created.get_layout() == h5py.h5d.VIRTUAL:
             self.refuse(name, "lies in other files; only what is in the file itself is read")
         for index in range(created.get_nfilters()):
@@ -364,7 +368,7 @@ class Hdf5File:
             if number not in _FILTERS:
                 text = title.decode(errors="replace") or number
                 self.refuse(name, f"is packed by the filter {text}; {', '.join(_FILTERS.values())} are known")
-        return found
+        return item
 
     def _check_size(self, name: str, dataset: Any) -> None:
         """Compares what a dataset declares with what is stored of it."""
@@ -396,7 +400,7 @@ _WHOLE, _ENDS = 1 << 30, 1 << 26  # of larger files the first and the last part:
 
 @functools.lru_cache(maxsize=4096)
 def _text_problem(path: str, *state: int) -> str | None:
-    """What is wrong with the places of a file where text of any length is kept; None if they can be read."""
+    """Damage in the places of a file that hold text of any length; None if they can be read."""
     size = state[2]
     if size == 0:
         return "is empty"

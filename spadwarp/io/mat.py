@@ -95,7 +95,7 @@ def _sparse(shape: tuple[int, ...], row: NDArray[Any], start: NDArray[Any], valu
 
 
 def _version_7(file: Hdf5File) -> Iterator[tuple[str, Variable]]:
-    arrays = {name: found for name, found in file.arrays().items() if not name.startswith("#")}
+    arrays = {name: array for name, array in file.arrays().items() if not name.startswith("#")}
     for name, (shape, dtype) in arrays.items():
         if "/" not in name and file.attribute("MATLAB_class", b"", of=name) == b"cell":
             yield name, Variable("cell", shape[::-1], partial(_cells_7, file, name, shape))
@@ -136,11 +136,11 @@ def _version_5(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
         if kind not in (_COMPRESSED, _MATRIX):
             raise ValueError(f"type {kind} at byte {place}")
         if kind == _COMPRESSED:
-            found, place = _compressed(content[start:stop], order), stop
+            variable, place = _compressed(content[start:stop], order), stop
         else:
-            found, place = _matrix(content[start:stop], order, size), stop + -size % 8
-        if found is not None:
-            yield found
+            variable, place = _matrix(content[start:stop], order, size), stop + -size % 8
+        if variable is not None:
+            yield variable
 
 
 def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
@@ -148,8 +148,8 @@ def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
     kind, size = struct.unpack_from(order + "II", head)
     if kind != _MATRIX or size > 1100 * len(packed) + _HEAD:  # zlib makes nothing smaller than this
         raise ValueError(f"a compressed array of type {kind} and {size} bytes")
-    found = _matrix(head[8:], order, size)
-    if found is None:
+    variable = _matrix(head[8:], order, size)
+    if variable is None:
         return None
 
     def read() -> Any:
@@ -157,7 +157,7 @@ def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
         assert whole is not None
         return whole[1].read()
 
-    return found[0], Variable(found[1].kind, found[1].shape, read)
+    return variable[0], Variable(variable[1].kind, variable[1].shape, read)
 
 
 def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
@@ -198,10 +198,10 @@ def _cells_5(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> 
     for index in range(cells.size):
         kind, size = struct.unpack_from(order + "II", content, place)
         start, stop = place + 8, place + 8 + size
-        found = _matrix(content[start:stop], order, size) if kind == _MATRIX and stop <= len(content) and size else None
-        if size and (found is None or found[1].kind != "dense"):
+        cell = _matrix(content[start:stop], order, size) if kind == _MATRIX and stop <= len(content) and size else None
+        if size and (cell is None or cell[1].kind != "dense"):
             raise ValueError(f"cell {index} holds no array of numbers")
-        cells[index] = np.ravel(found[1].read()) if found is not None else np.zeros(0)
+        cells[index] = np.ravel(cell[1].read()) if cell is not None else np.zeros(0)
         place = stop + -size % 8
     return cells.reshape(shape, order="F")
 

@@ -60,18 +60,18 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 
 def similar(path: str | os.PathLike[str]) -> str:
-    """What to add to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
+    """Addition to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
     it."""
     place = Path(path)
     try:
-        beside = [one for one in os.listdir(place.parent) if one.endswith(place.suffix)]
+        beside = [name for name in os.listdir(place.parent) if name.endswith(place.suffix)]
     except (OSError, ValueError):
         return ""
     return suggestion(place.name, beside)
 
 
 def used(path: str | os.PathLike[str]) -> str:
-    """What to add to an error about a file of another kind: how a scene, a mesh or a result is used."""
+    """Addition to an error about a file of another kind: how a scene, a mesh or a result is used."""
     ending = Path(path).suffix.lower()
     if ending == ".toml":
         return f"; if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it"
@@ -106,11 +106,11 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
     folder = Path(path)
     if not os.path.isdir(folder):
         return folder
-    found = [folder / name for name in names if (folder / name).is_file()]
-    if len(found) != 1:
-        held = " and ".join(path.name for path in found) if found else f"no {' and no '.join(names)}"
-        raise FileError(f"{path}: holds {held}; name the file")
-    return found[0]
+    files = [folder / name for name in names if (folder / name).is_file()]
+    if len(files) != 1:
+        text = " and ".join(path.name for path in files) if files else f"no {' and no '.join(names)}"
+        raise FileError(f"{path}: holds {text}; name the file")
+    return files[0]
 
 
 def check_apart(output: str | Path, source: Any) -> None:

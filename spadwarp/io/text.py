@@ -78,7 +78,7 @@ _WITH_UNIT = re.compile(r"""(?<![\w.+"'-])([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)
 
 
 def _bare_unit(text: str, error: str) -> str:
-    """What to add to the error of a line such as `aperture_diameter = 20 mm`."""
+    """Addition to the error of a line such as `aperture_diameter = 20 mm`."""
     if (place := re.search(r"at line (\d+)", error)) is None:
         return ""
     line = text.split("\n")[int(place[1]) - 1][:200]
