@@ -31,7 +31,7 @@ _ROOMS = {
     "benchmark": (),
     "doctor": (),
     "device": (),
-    "interop": ("data_frame",),
+    "interop": ("to_pandas",),
     "io": (),
     "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
@@ -53,7 +53,6 @@ __all__ = [  # written out for type checkers
     "budget",
     "check",
     "crlb",
-    "data_frame",
     "detect",
     "export",
     "fit",
@@ -65,6 +64,7 @@ __all__ = [  # written out for type checkers
     "simulate",
     "simulate_analytic",
     "sweep",
+    "to_pandas",
     "truth_maps",
 ]
 
@@ -98,7 +98,7 @@ if TYPE_CHECKING:
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
     from spadwarp.files import export, load
     from spadwarp.frames import Frames, arrival_time, crlb, detect
-    from spadwarp.interop import data_frame
+    from spadwarp.interop import to_pandas
     from spadwarp.inverse import fit
     from spadwarp.parallel import Ray
     from spadwarp.result import Result, load_result, merge
