@@ -87,16 +87,14 @@ def _of_frames(frames: Frames, result: Result | None) -> FrameSequence:
             depth=truth,
         )
 
-    most = int(counts.sum(axis=-1, dtype=np.int64).max())
-    return FrameSequence(name="Frames", count=len(counts), frame=frame, largest_count=most)
+    return FrameSequence(name="Frames", count=len(counts), frame=frame)
 
 
 def _of_stored(file: FramesFile | SequenceFile) -> FrameSequence:
     best = file.best_method
     still: dict[str, Any] = {}
-    most, content = None, [f"Z by {best}"] if best else []
+    content = [f"Z by {best}"] if best else []
     if isinstance(file, FramesFile):
-        most = max(int(file.intensity(number).max()) for number in range(file.frames))
         still = {"scene": file.scene, "depth": file.truth_depth, "content": "".join(content)}
         if file.expected is not None:
             still["expected"] = file.expected * np.float32(file.pulses)
@@ -128,7 +126,7 @@ def _of_stored(file: FramesFile | SequenceFile) -> FrameSequence:
             **facts,
         )
 
-    return FrameSequence(name=str(file.path), count=file.frames, frame=frame, largest_count=most)
+    return FrameSequence(name=str(file.path), count=file.frames, frame=frame)
 
 
 def _of_analytic(file: AnalyticFile) -> FrameSequence:
@@ -256,13 +254,18 @@ def export_sensor_fusion(
     split: str = "all",
     result: Result | None = None,
 ) -> list[Path]:
-    """Writes frames beside a camera image of finer pixels, in the layout that networks for sensor fusion read.
+    """Writes frames beside a camera image of finer pixels, as the loader of Lindell, O'Toole and Wetzstein (2018) for
+    sensor fusion reads them.
 
-    The layout is that of Lindell, O'Toole and Wetzstein (2018): see `write_sensor_fusion` for files and variables.
+    - `intensity/STEM-00000.mat`: `intensity` `[factor · H, factor · W]`, 0 to 255: reflectance times the cosine of the
+      angle of view, as a photo with a flash without scattering.
+    - `spad/STEM-00000_p1.mat`: the variables of `export`, and `bin_hr` `[factor · H, factor · W]`, the bin of the
+      true time of flight, counted from 1 at its centre and with its fraction, within [1, T]; 0 without a target.
+    - `STEM.txt`: the list of the intensity files, which the loader takes.
 
     Args:
-        source: Frames with counts, as for `export`.
-        folder: For the folders `intensity`, `spad` and the list of the files.
+        source: Frames with counts, of scenes whose targets are meshes, as for `export`.
+        folder: Where they are written.
         stem: Of the files' names.
         factor: Pixels of the camera image in a pixel, each way, in [1, 64].
         frames, split, result: As for `export`.

@@ -122,29 +122,14 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
     """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
     import warp as wp
 
-    from spadwarp_kernels.detection import first_invalid_row
-
     bins = rows.shape[1]
-    if not (is_torch(background) or isinstance(background, wp.array)):
-        background = real_array("background", background)
+    if not is_torch(background) and not (isinstance(background, wp.array) and background.dtype == wp.float32):
+        background = real_array("background", background.numpy() if isinstance(background, wp.array) else background)
     shape = tuple(background.shape)
     if shape not in ((), (bins,), *((*frame[i:], last) for i in range(len(frame)) for last in (bins, 1))):
         raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
-    last = shape[-1] if shape else 1
-    if isinstance(background, wp.array) and background.dtype != wp.float32:
-        background = background.numpy()
-    if is_torch(background) or isinstance(background, wp.array):
-        values = wp.from_torch(background.detach().float().contiguous()) if is_torch(background) else background
-        values = values.to(rows.device).contiguous().reshape((values.size // last, last))
-        valid = first_invalid_row(values) is None
-    else:
-        array = np.ascontiguousarray(background.reshape(-1, last))
-        valid = bool(np.isfinite(array).all() and (array >= 0).all())
-        values = wp.array(array, dtype=wp.float32, device=rows.device)
-    if not valid:
-        array = values.numpy()
-        raise ArgumentError(f"background = {array.min()} … {array.max()} is outside [0, inf)")
-    return values
+    flat = background.float() if is_torch(background) else background
+    return histogram_rows(flat.reshape((-1, shape[-1] if shape else 1)), name="background", device=rows.device)[0]
 
 
 def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:

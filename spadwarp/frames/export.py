@@ -90,7 +90,6 @@ class FrameSequence:
         name: What to call the source in an error.
         count: Of the frames.
         frame: Number of a frame, from 0 → the frame.
-        largest_count: Of a pixel in any frame, if that is known.
         same_scene: Number of a frame → numbers of the frames of the same scene, itself included; None where frames have
             counts.
     """
@@ -98,7 +97,6 @@ class FrameSequence:
     name: str
     count: int
     frame: Callable[[int], SequenceFrame]
-    largest_count: int | None = None
     same_scene: Callable[[int], range] | None = None
 
     def at(self, number: int) -> SequenceFrame:
@@ -192,9 +190,7 @@ def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     height, width, bins = counts.shape
     if bins > _LARGEST_DTIME:
         raise FileError(f"{path}: {bins} bins are more than the {_LARGEST_DTIME} of a T3 record")
-    most = frames.largest_count
-    if most is None:
-        most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
+    most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
     sync = max(first.period or 0.0, bins * first.bin_width)
     # A pixel lasts long enough for its detections, one a sync.
     pixel_time = sync * max(most, 1)
@@ -251,26 +247,9 @@ def exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | flo
 # Sensor fusion
 
 
-def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: range, factor: int = 8) -> list[Path]:
-    """Writes frames as the loader of Lindell, O'Toole and Wetzstein (2018) for sensor fusion reads them.
-
-    - `intensity/STEM-00000.mat`: `intensity` `[factor · H, factor · W]`, 0 to 255: reflectance times the cosine of the
-      angle of view, as a photo with a flash without scattering.
-    - `spad/STEM-00000_p1.mat`: the variables of `write_mat`, and `bin_hr` `[factor · H, factor · W]`, the bin of the
-      true time of flight, counted from 1 at its centre and with its fraction, within [1, T]; 0 without a target.
-    - `STEM.txt`: the list of the intensity files, which the loader takes.
-
-    Args:
-        frames: With counts, of scenes whose targets are meshes.
-        folder: Where they are written.
-        stem: Of their names.
-        chosen: Numbers of the frames.
-        factor: Pixels of the camera image in a pixel, along a row and along a column, in [1, 64].
-
-    Raises:
-        ArgumentError: Depth without counts, or no scene.
-        FileError: A file cannot be written.
-    """
+def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: range, factor: int) -> list[Path]:
+    """Frames with counts, of scenes whose targets are meshes, and their camera images; see `spadwarp.files`'
+    `export_sensor_fusion`."""
     factor = check_integer("factor", factor, "[1, 64]")
     listed, written = [], []
     images: dict[Scene, dict[str, Any]] = {}

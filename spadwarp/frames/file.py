@@ -87,22 +87,20 @@ class _StoredFrames:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
         return self._read(f"depth/{method}", np.float32, frame)
 
-    def _count_and_scene(self) -> tuple[int, Scene]:
-        """Number of frames, and a scene with the camera."""
+    @property
+    def _shape(self) -> tuple[int, int, int]:
+        """Number of frames, height and width."""
         raise NotImplementedError
 
     def _check(self, frame: int | None) -> None:
-        frames, _ = self._count_and_scene()
-        if frame is not None and not 0 <= frame < frames:
-            raise ArgumentError(f"frame = {frame} is outside [0, {frames}), the frames of {self.path}")
+        if frame is not None and not 0 <= frame < self._shape[0]:
+            raise ArgumentError(f"frame = {frame} is outside [0, {self._shape[0]}), the frames of {self.path}")
 
     def _read(self, name: str, kind: Any, frame: int | None, *rest: int | None) -> NDArray[Any]:
         """An array `[frames, H, W, ...]`, or one frame of it."""
         self._check(frame)
-        frames, scene = self._count_and_scene()
-        shape = (frames, scene.camera.height, scene.camera.width, *rest)
         with read_hdf5(self.path, self.FORMAT) as file:
-            return np.asarray(file.stored(name, kind, shape)[... if frame is None else frame])
+            return np.asarray(file.stored(name, kind, (*self._shape, *rest))[... if frame is None else frame])
 
     @staticmethod
     def _common(file: Hdf5File, path: str | Path) -> dict[str, Any]:
@@ -207,8 +205,9 @@ class FramesFile(_StoredFrames):
         with read_hdf5(self.path, self.FORMAT) as file:
             return file.array("bound/depth", np.float64, self.truth_depth.shape)
 
-    def _count_and_scene(self) -> tuple[int, Scene]:
-        return self.frames, self.scene
+    @property
+    def _shape(self) -> tuple[int, int, int]:
+        return self.frames, self.scene.camera.height, self.scene.camera.width
 
 
 def _response(file: Hdf5File) -> InstrumentResponse:
@@ -297,8 +296,9 @@ class SequenceFile(_StoredFrames):
         sides = {name: (3,) if name == "normal" else () for name in _TRUTH}
         return Truth(**{name: self._read(f"truth/{name}", np.float32, frame, *rest) for name, rest in sides.items()})
 
-    def _count_and_scene(self) -> tuple[int, Scene]:
-        return self.frames, self.base
+    @property
+    def _shape(self) -> tuple[int, int, int]:
+        return self.frames, self.base.camera.height, self.base.camera.width
 
 
 # Writing: everything but the frames at the first part, and then each part

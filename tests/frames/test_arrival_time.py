@@ -71,7 +71,7 @@ def test_a_gate_leaves_out_what_lies_before_it():
         ({"histogram": np.zeros(8)}, r"shape \(8,\)"),
         ({"histogram": np.zeros((2, 2, 0))}, "at least one pixel and one bin"),
         ({"background": np.zeros(7)}, r"background has shape \(7,\)"),
-        ({"background": -1.0}, "background = -1.0"),
+        ({"background": -1.0}, "background holds a negative"),
         ({"gate": (0.0, 1e-9)}, "gate = "),
         ({"irf": [-1.0, 2.0], "method": "matched"}, "irf must be"),
         ({"irf": np.ones((2, 2)), "method": "matched"}, "irf has shape"),
