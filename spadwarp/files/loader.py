@@ -151,26 +151,26 @@ def summary(held: Held) -> dict[str, Any]:
     if isinstance(held, Result):
         return {"kind": "result", **held.summary()}
     if isinstance(held, FramesFile):
-        return {"kind": "frames", **_frames(held)}
+        return {"kind": "frames", **_of_frames(held)}
     if isinstance(held, SequenceFile):
-        return {"kind": "sequence", **_sequence(held)}
+        return {"kind": "sequence", **_of_sequence(held)}
     if isinstance(held, AnalyticFile):
-        return {"kind": "analytic", **_analytic(held)}
+        return {"kind": "analytic", **_of_analytic(held)}
     if isinstance(held, FrameReader):
-        return {"kind": "dataset", **_dataset(held)}
+        shards, targets = held.shards, list(held.manifest["targets"])
+        facts = {"name": held.manifest["name"], "folder": str(held.path)}
+        facts |= {"shards": shards if len(shards) == 1 else len(shards), "frames": len(held)}
+        return {"kind": "dataset", **facts, **_image(held.shape[1], held.shape[0]), "targets": targets}
     ended = {name: int(np.count_nonzero(held.reason == number)) for number, name in enumerate(held.reasons)}
     ended = {name: count for name, count in ended.items() if count}
     return {"kind": "records", "photons": len(held.id), "ended": ended}
 
 
-def _frames(file: FramesFile) -> dict[str, Any]:
+def _of_frames(file: FramesFile) -> dict[str, Any]:
     mean = [float(file.intensity(number).mean()) for number in range(file.frames)]
     return {
-        "scene": _source(file.scene),
-        "frames": file.frames,
+        **_common(file.scene, file, len(file.edges) - 1),
         "pulses": file.pulses,
-        "seed": file.seed,
-        **_axes(file.scene, len(file.edges) - 1),
         "gate_start_ns": 1e9 * file.gate_start,
         "bin_width_ps": 1e12 * file.bin_width,
         "period_ns": None if file.period is None else 1e9 * file.period,
@@ -181,56 +181,44 @@ def _frames(file: FramesFile) -> dict[str, Any]:
     }
 
 
-def _sequence(file: SequenceFile) -> dict[str, Any]:
+def _of_sequence(file: SequenceFile) -> dict[str, Any]:
     times = file.trajectory.times
     return {
-        "scene": _source(file.base),
-        "frames": file.frames,
+        **_common(file.base, file, file.bins),
+        "pulses": file.pulses,
         "times_s": [float(times[0]), float(times[-1])],
         "moving": list(file.trajectory.fields),
-        "pulses": file.pulses,
-        "seed": file.seed,
-        **_axes(file.base, file.bins),
         "depth_by": list(file.methods),
     }
 
 
-def _analytic(file: AnalyticFile) -> dict[str, Any]:
-    estimated = file.maps["fisher"] > 0
-
-    def median(name: str) -> float | None:
-        return float(np.median(file.maps[name][estimated])) if estimated.any() else None
-
-    chosen = file.scene.analytic
+def _of_analytic(file: AnalyticFile) -> dict[str, Any]:
+    estimated, chosen = file.maps["fisher"] > 0, file.scene.analytic
+    medians = {
+        "signal_per_pulse": "signal",
+        "sigma_depth_m": "sigma_depth",
+        "outlier_probability": "outlier_probability",
+    }
     return {
-        "scene": _source(file.scene),
+        **_common(file.scene, file, file.scene.gate.bins),
+        **{name: getattr(chosen, name) for name in ("form", "backscatter", "count_law")},
+        "pixels_with_estimate": int(np.count_nonzero(estimated)),
+        **{
+            name: float(np.median(file.maps[field][estimated])) if estimated.any() else None
+            for name, field in medians.items()
+        },
+    }
+
+
+def _common(scene: Scene, file: FramesFile | SequenceFile | AnalyticFile, bins: int) -> dict[str, Any]:
+    return {
+        "scene": str(scene.source) if scene.source else None,
         "frames": file.frames,
         "seed": file.seed,
-        **_axes(file.scene, file.scene.gate.bins),
-        "form": chosen.form,
-        "backscatter": chosen.backscatter,
-        "count_law": chosen.count_law,
-        "pixels_with_estimate": int(np.count_nonzero(estimated)),
-        "signal_per_pulse": median("signal"),
-        "sigma_depth_m": median("sigma_depth"),
-        "outlier_probability": median("outlier_probability"),
+        **_image(scene.camera.width, scene.camera.height),
+        "bins": bins,
     }
 
 
-def _dataset(reader: FrameReader) -> dict[str, Any]:
-    return {
-        "name": reader.manifest["name"],
-        "folder": str(reader.path),
-        "shards": reader.shards if len(reader.shards) == 1 else len(reader.shards),
-        "frames": len(reader),
-        "image": {"width": reader.shape[1], "height": reader.shape[0]},
-        "targets": list(reader.manifest["targets"]),
-    }
-
-
-def _axes(scene: Scene, bins: int) -> dict[str, Any]:
-    return {"image": {"width": scene.camera.width, "height": scene.camera.height}, "bins": bins}
-
-
-def _source(scene: Scene) -> str | None:
-    return str(scene.source) if scene.source else None
+def _image(width: int, height: int) -> dict[str, Any]:
+    return {"image": {"width": width, "height": height}}

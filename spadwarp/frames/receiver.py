@@ -36,38 +36,29 @@ class Window(NamedTuple):
     period: float
 
 
-def detector_window(
-    window: tuple[float, int],
-    bin_width: float,
-    tdc_widths: ArrayLike | None,
-    *,
-    period: float,
-    wrap: bool,
-    free_running: bool,
+def _window(
+    detector: Detector, laser: Laser | None, window: tuple[float, int], bin_width: float, tdc_widths: ArrayLike | None
 ) -> Window:
     """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
     if not (isinstance(window, tuple | list) and len(window) == 2):
         raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
     start = check_real("start of window", window[0], TIME)
     bins = check_integer("bins of window", window[1], "[1, 1000000]")
+    wrap, period = detector.wrap, math.inf if laser is None else 1.0 / laser.repetition_rate
     if wrap:
         # The detector knows no time beyond that from one pulse to the next.
         bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
         if bins < 1:
             raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
-    widths = np.full(bins, 1.0)
-    if tdc_widths is not None:
-        widths = np.asarray(tdc_widths, np.float64)
-        if widths.shape != (bins,):
-            raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
-        if not (np.isfinite(widths).all() and (widths > 0).all()):
-            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
-        widths = widths / widths.mean()
-    edges = np.append(0.0, np.cumsum(widths)) * bin_width
-    if not wrap:
-        period = max(period, edges[-1])
+    widths = np.ones(bins) if tdc_widths is None else np.asarray(tdc_widths, np.float64)
+    if widths.shape != (bins,):
+        raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
+    if not (np.isfinite(widths).all() and (widths > 0).all()):
+        raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+    edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
+    period = period if wrap else max(period, edges[-1])
     rest = period - edges[-1]
-    if free_running and rest > 1e-9 * period:
+    if detector.mode == "free_running" and rest > 1e-9 * period:
         # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
         extra = math.ceil(rest / bin_width) if wrap else 1
         edges = np.append(edges, edges[-1] + rest * np.arange(1, extra + 1) / extra)
@@ -126,14 +117,7 @@ class Receiver:
         """
         from spadwarp_kernels import detection as kernels
 
-        time_window = detector_window(
-            window or (axis[0], shape[2]),
-            axis[1],
-            tdc_widths,
-            period=math.inf if laser is None else 1.0 / laser.repetition_rate,
-            wrap=detector.wrap,
-            free_running=detector.mode == "free_running",
-        )
+        time_window = _window(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
         noise = kernels.dark_count_rates(
             shape[0] * shape[1],
             median=detector.dark_count_rate,
