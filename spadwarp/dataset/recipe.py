@@ -26,8 +26,8 @@ from pydantic import (
 )
 
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.io.paths import example_or_path
+from spadwarp.io.text import read_toml
 from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text

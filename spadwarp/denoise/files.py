@@ -22,8 +22,8 @@ from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import holds_own_file, locate
 from spadwarp.frames.measured import Histograms
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
+from spadwarp.io.paths import atomic_path
 from spadwarp.limits import check_real
 from spadwarp.units import percent
 from spadwarp.viz import draw_denoised

@@ -11,8 +11,8 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.io.paths import example_or_path
+from spadwarp.io.text import read_toml
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole
 

@@ -26,7 +26,7 @@ from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.selection import CHOICES
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import atomic_path
 from spadwarp.limits import environment_integer
 
 __all__ = ["Run", "Trained", "Workers", "save_weights"]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.analytic import AnalyticResult
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import METHODS, Frames, FramesFile, Method, Recording, first_photon_probabilities
-from spadwarp.frames.monte_carlo_noise import noise_caption
+from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.result import COMPONENTS, Result, degree_of_polarisation
 from spadwarp.result.batch_moments import pixel_standard_error

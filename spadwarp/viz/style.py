@@ -24,7 +24,7 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, 
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path
+from spadwarp.io.paths import atomic_path
 from spadwarp.limits import check_real
 from spadwarp.result import Channel
 

@@ -23,10 +23,9 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
-from spadwarp.frames.monte_carlo_noise import noise_caption
-from spadwarp.frames.sequence_file import SequenceFile
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.paths import check_apart
+from spadwarp.frames.file import SequenceFile
+from spadwarp.frames.spad import noise_caption
+from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Channel, Result, received
 from spadwarp.scene import Scene

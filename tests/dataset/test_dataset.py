@@ -30,7 +30,7 @@ from spadwarp.dataset import (
     verify_dataset,
 )
 from spadwarp.dataset.shards import HISTOGRAM_FIELDS
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT
 

@@ -16,7 +16,7 @@ from spadwarp.denoise.gates import bins_of_target, gates_of_target
 from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import WEIGHTS
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.io.exr import read_exr
+from spadwarp.io.arrays import read_exr
 
 OF_DEPTH = [name for name in MODELS if name != "histograms"]
 of_depth = pytest.mark.parametrize("model", OF_DEPTH)

@@ -150,12 +150,12 @@ def test_labelled_arrays_go_into_a_file(result, tmp_path):
 
 def test_tables_as_data_frames():
     rows = spadwarp.budget(SCENE, [1.0, 2.0])
-    table = spadwarp.data_frame(rows)
+    table = spadwarp.to_pandas(rows)
     assert list(table.range) == [1.0, 2.0] and "sigma_depth" in table.columns
     curves = spadwarp.sweep(SCENE, vary="medium.extinction=0.1:0.3:3", device="cpu")
-    swept = spadwarp.data_frame(curves)
+    swept = spadwarp.to_pandas(curves)
     assert swept.index.name == "medium.extinction" and list(swept.index) == pytest.approx([0.1, 0.2, 0.3])
     assert np.array_equal(swept.signal, curves.column("signal"))
-    assert spadwarp.data_frame(spadwarp.scene.presets("medium")).name[0] == "petzold-autec-8"
+    assert spadwarp.to_pandas(spadwarp.scene.presets("medium")).name[0] == "petzold-autec-8"
     with pytest.raises(spadwarp.ArgumentError, match="data classes or dicts"):
-        spadwarp.data_frame([1, 2])
+        spadwarp.to_pandas([1, 2])

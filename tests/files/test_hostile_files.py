@@ -41,8 +41,7 @@ def read_frames(path):
 
 
 def read_analytic(path):
-    with open_source(path) as frames:
-        frames.frame(0)
+    open_source(path).frame(0)
 
 
 def read_dataset(path):

@@ -11,7 +11,7 @@ import spadwarp
 from helpers.cli import run
 from helpers.synthetic_result import make_scene
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.run import simulate_sequence
+from spadwarp.frames import simulate_sequence
 from spadwarp.scene import Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_matrix
 

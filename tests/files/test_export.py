@@ -226,9 +226,9 @@ def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_pat
         ratio = (middle["intensity"] / light)[there]
         assert ratio.max() / ratio.min() < 1.001 and (middle["intensity"][~there] == 0).all()
     with pytest.raises(ValueError, match="draw frames first"):
-        spadwarp.run.export_sensor_fusion(result, tmp_path / "none")
+        spadwarp.files.export_sensor_fusion(result, tmp_path / "none")
     with pytest.raises(ValueError, match="no scene of meshes"):
-        spadwarp.run.export_sensor_fusion(detection, tmp_path / "none")
+        spadwarp.files.export_sensor_fusion(detection, tmp_path / "none")
 
 
 def test_calibration_of_a_run(frames, result, tmp_path):
