@@ -19,7 +19,7 @@ import warp as wp
 import warp._src.build
 
 import spadwarp
-from spadwarp.io import examples
+from spadwarp.io import paths as examples
 from spadwarp_kernels.base import kernels as compiled
 
 

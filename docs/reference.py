@@ -7,6 +7,7 @@ mkdocstrings shows.
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import math
 import pkgutil
@@ -245,16 +246,20 @@ def _short(value: Any) -> str:
 def dataset() -> str:
     """Datasets in the files of a dataset."""
     from spadwarp.dataset import Plan
-    from spadwarp.dataset.schema import FRAME_COLUMNS, HISTOGRAM_COLUMNS, scene_columns
+    from spadwarp.dataset.shards import FRAME_COLUMNS, HISTOGRAM_COLUMNS, Column, scene_columns
 
-    def table(rows: Mapping[str, tuple[str, str]]) -> str:
-        lines = [f"| `{name}` | {unit} | {text} |" for name, (unit, text) in rows.items()]
+    def table(columns: Mapping[str, Column]) -> str:
+        lines = [f"| `{name}` | {column.unit} | {column.meaning} |" for name, column in columns.items()]
         return "\n".join(["| dataset | unit | what |", "|---|---|---|", *lines])
 
     plan = Plan(spadwarp.dataset.load_recipe(FOLDER.parents[1] / "configs" / "datasets" / "small.toml"))
     scenes = {
-        name: (unit, f"{text}; {np.dtype(kind)}" + (f" `{list(shape)}` a scene" if shape else ""))
-        for name, (shape, kind, unit, text) in scene_columns(plan.shape).items()
+        name: dataclasses.replace(
+            column,
+            meaning=f"{column.meaning}; {np.dtype(column.kind)}"
+            + (f" `{list(column.shape)}` a scene" if column.shape else ""),
+        )
+        for name, column in scene_columns(plan.shape).items()
     }
     parts = [
         MADE

@@ -25,14 +25,13 @@ _ROOMS = {
     "inverse": ("fit",),
     "dataset": (),
     "denoise": (),
-    "files": ("load",),
+    "files": ("export", "load"),
     "viz": (),
-    "run": ("export",),
     "validate": (),
     "benchmark": (),
     "doctor": (),
     "device": (),
-    "interop": ("data_frame",),
+    "interop": ("to_pandas",),
     "io": (),
     "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
@@ -54,7 +53,6 @@ __all__ = [  # written out for type checkers
     "budget",
     "check",
     "crlb",
-    "data_frame",
     "detect",
     "export",
     "fit",
@@ -66,6 +64,7 @@ __all__ = [  # written out for type checkers
     "simulate",
     "simulate_analytic",
     "sweep",
+    "to_pandas",
     "truth_maps",
 ]
 
@@ -88,7 +87,6 @@ if TYPE_CHECKING:
         mesh as mesh,
         parallel as parallel,
         result as result,
-        run as run,
         scene as scene,
         transport as transport,
         validate as validate,
@@ -98,13 +96,12 @@ if TYPE_CHECKING:
     from spadwarp.analytic import budget, plan, simulate_analytic, sweep
     from spadwarp.checks import check
     from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.files import load
+    from spadwarp.files import export, load
     from spadwarp.frames import Frames, arrival_time, crlb, detect
-    from spadwarp.interop import data_frame
+    from spadwarp.interop import to_pandas
     from spadwarp.inverse import fit
     from spadwarp.parallel import Ray
     from spadwarp.result import Result, load_result, merge
-    from spadwarp.run import export
     from spadwarp.scene import Scene, load_scene
     from spadwarp.transport import simulate, truth_maps
 else:

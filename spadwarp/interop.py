@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-__all__ = ["Variable", "data_frame", "labelled"]
+__all__ = ["Variable", "labelled", "to_pandas"]
 
 Variable = tuple[tuple[str, ...], Any, str, str]
 """Dimensions, values, unit ("1" for a plain number) and meaning of an array."""
@@ -38,10 +38,10 @@ def labelled(
     )
 
 
-def data_frame(rows: Iterable[Any] | Any) -> pandas.DataFrame:
+def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
     """Rows as a pandas DataFrame: a list of data classes or dicts, or a `Sweep`, whose values are the index.
 
-    For what `spadwarp.budget`, `sweep`, `check`, `scene.presets` and `analytic.plan` give: `data_frame(budget(scene))`.
+    For what `spadwarp.budget`, `sweep`, `check`, `scene.presets` and `analytic.plan` give: `to_pandas(budget(scene))`.
 
     Raises:
         FileError: pandas is not installed.

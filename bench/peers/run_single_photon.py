@@ -20,7 +20,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from spadwarp.denoise import estimate
-from spadwarp.denoise.likelihood import CLASSICAL
+from spadwarp.denoise.baselines import CLASSICAL
 
 BIN = 80e-12  # [s]
 RESPONSE = np.array([0.029, 0.096, 0.229, 0.394, 0.462, 0.384, 0.247, 0.099, 0.030])

@@ -13,7 +13,7 @@ import spadwarp
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
 from spadwarp.viz import style
-from spadwarp.viz.water import draw_slice
+from spadwarp.viz.scenes import draw_slice
 
 GATE = (34.5, 38.5)  # [ns], about the target
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.labelled import MAP_UNITS
 from spadwarp.analytic.model import response_sigma
 from spadwarp.errors import ArgumentError
-from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
+from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.limits import check_integer
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene

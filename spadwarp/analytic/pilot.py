@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import source_name
 from spadwarp.errors import ConfigError
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
-from spadwarp.frames.estimators import METHODS, arrival_time
+from spadwarp.frames.depth import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, merge, received
 from spadwarp.scene import noise_rate

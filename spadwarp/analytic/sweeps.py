@@ -15,7 +15,7 @@ from spadwarp.analytic.model import source_name, warn_of_model
 from spadwarp.analytic.photon_budget import LONGEST, BudgetRow, axis_rows
 from spadwarp.analytic.simulate import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
-from spadwarp.io.parsing import parse_toml
+from spadwarp.io.text import parse_toml
 from spadwarp.limits import check_choice, check_integer, parse_number, shown
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.geometry import pixel_directions

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class PlyFrame(enum.StrEnum):
-    """What `spadwarp.run.write_depth` takes as `ply_frame`."""
+    """What `spadwarp.files.write_depth` takes as `ply_frame`."""
 
     camera = "camera"
     world = "world"
@@ -90,8 +90,8 @@ def depth(
           --irf-fwhm-ps 200 --method likelihood --out depth/
       spadwarp depth tags.mat --tag-unit-ps 8 --bin-width-ps 64 --gate-start-ns 0 --group-index 1 --out depth/
     """
+    from spadwarp.files import write_depth
     from spadwarp.frames import depth_of, read_histograms
-    from spadwarp.run import write_depth
 
     given = measured.facts(
         dataset, axes, image_size, tag_unit_ps, bin_width_ps, gate_start_ns, irf_fwhm_ps, irf, sum_frames

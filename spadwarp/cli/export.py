@@ -15,7 +15,7 @@ from spadwarp.cli._app import app, say
 
 
 class Format(enum.StrEnum):
-    """Endings of `spadwarp.run.FORMATS`, and a layout; known without loading it."""
+    """Endings of `spadwarp.files.FORMATS`, and a layout; known without loading it."""
 
     npy = "npy"
     mat = "mat"
@@ -92,7 +92,7 @@ def export(
     # Those that not every source has go first, so that nothing is written where one is refused.
     for one in sorted(set(formats), key=["fusion", "ptu", "mat", "npy", "exr", "xml"].index):
         if one is Format.fusion:
-            written[one.value] = spadwarp.run.export_sensor_fusion(
+            written[one.value] = spadwarp.files.export_sensor_fusion(
                 source, out, stem=stem, factor=factor, frames=chosen, split=split
             )
             continue

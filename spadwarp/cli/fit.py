@@ -84,7 +84,7 @@ def fit(
       spadwarp fit counts.npy scene.toml --pulses 1e6 --unknown absorption,scattering,depth:pixel \\
           --start medium.absorption=0.1 --out fit/
     """
-    from spadwarp.run import fit_files, write_fit
+    from spadwarp.files import fit_files, write_fit
 
     scene = opt.read_scene(scene_path, mesh=None, overrides=overrides)
     given = measured.facts(

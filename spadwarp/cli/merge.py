@@ -35,7 +35,7 @@ def merge(
       spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
       spadwarp merge a/ b/ --out ab/
     """
-    from spadwarp.run import RUN_FILES, bytes_needed, write_run
+    from spadwarp.files import RUN_FILES, bytes_needed, write_run
 
     result = spadwarp.merge(opt.load_run(place) for place in runs)
     needed = bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +14,7 @@ from spadwarp.cli._app import app, say
 
 
 class Kind(enum.StrEnum):
-    """`spadwarp.run.SCHEMAS`, known without loading it."""
+    """Kinds of TOML files."""
 
     scene = "scene"
     dataset = "dataset"
@@ -38,11 +38,13 @@ def schema(
     Example:
       spadwarp schema scene
     """
-    from spadwarp.run import json_schema
-
     path = out or Path(f"{kind.value}.schema.json")
     opt.check_outputs(files={"--out": path}, overwrite=overwrite)
-    spadwarp.io.write_json(json_schema(kind.value), path)
+    if kind is Kind.scene:
+        model: Any = spadwarp.Scene
+    else:
+        model = spadwarp.dataset.Recipe if kind is Kind.dataset else spadwarp.denoise.TrainingRecipe
+    spadwarp.io.write_json(spadwarp.files.json_schema(model), path)
     if not quiet:
         place = path if path.is_absolute() or path.parent.parts else f"./{path}"
         say(f"written: {path}")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from spadwarp import Ray, Result, Scene
     from spadwarp.cli._progress import Report
-    from spadwarp.run import RunFiles
+    from spadwarp.files import RunFiles
 
 
 @app.command()
@@ -229,7 +229,7 @@ def _warn(scene: Scene, device: str | None) -> None:
 
 def _earlier(place: Path, photons: int | None) -> Result:
     """The run to resume, whose scene asks for as many photons as it shall have."""
-    from spadwarp.run import load_resumable
+    from spadwarp.files import load_resumable
 
     earlier, place = load_resumable(place)
     start, stop = earlier.requested
@@ -250,7 +250,7 @@ def _check_records(scene: Scene, *, whole: bool) -> None:
 
 def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt.Outputs:
     """Makes the directory; refuses one that holds another run, or a part of one."""
-    from spadwarp.run import CHECKPOINT, RUN_FILES, remove_checkpoint
+    from spadwarp.files import CHECKPOINT, RUN_FILES, remove_checkpoint
 
     if (out / CHECKPOINT).exists() and not (resume or overwrite):
         problem = f"{out} has a run that was not finished; --resume {out} resumes it, --overwrite replaces it"
@@ -262,10 +262,10 @@ def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt
 
 
 def _prepared(device: str | None, engine: Ray | None) -> ModuleType:
-    """Begins to prepare the compiler of kernels; returns the room `spadwarp.run`, which is loaded meanwhile."""
+    """Begins to prepare the compiler of kernels; returns the package `spadwarp.files`, which is loaded meanwhile."""
     if engine is None:
         spadwarp.transport.prepare_kernels(device)
-    return importlib.import_module("spadwarp.run")
+    return importlib.import_module("spadwarp.files")
 
 
 def _load_pictures(scene: Scene) -> threading.Thread | None:

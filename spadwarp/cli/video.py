@@ -126,7 +126,7 @@ def _moving(
     names = ("sequence.h5", "sequence.gif")
     opt.check_outputs(out, names, inputs=(scene, trajectory), overwrite=overwrite)
     with progress(quiet=quiet, unit="frames") as report:
-        file = spadwarp.run.simulate_sequence(base, trajectory, out / names[0], progress=report, **options)
+        file = spadwarp.frames.simulate_sequence(base, trajectory, out / names[0], progress=report, **options)
     path = spadwarp.viz.video(file, out / names[1], **drawn)
     if not quiet:
         times = file.trajectory.times

@@ -4,21 +4,13 @@
 `FrameReader`, `SpadDataset` (for torch) and `iterate_dataset` read it; `export_dataset` writes it for other loaders.
 """
 
-from spadwarp.dataset.export import EXPORT_FIELDS, EXPORT_FORMATS, export_dataset
-from spadwarp.dataset.make import DatasetReport, make_dataset
-from spadwarp.dataset.manifest import read_manifest, verify_dataset
-from spadwarp.dataset.read import FIELDS, FrameReader, SpadDataset, iterate_dataset
-from spadwarp.dataset.recipe import SPLITS, Distribution, Recipe, load_recipe
-from spadwarp.dataset.sampling import Plan
+from typing import TYPE_CHECKING
 
-__all__ = ["FIELDS", "SPLITS", "DatasetReport", "Distribution", "FrameReader", "Plan", "Recipe", "SpadDataset"]
-__all__ += [
-    "EXPORT_FIELDS",
-    "EXPORT_FORMATS",
-    "export_dataset",
-    "iterate_dataset",
-    "load_recipe",
-    "make_dataset",
-    "read_manifest",
-    "verify_dataset",
-]
+from spadwarp.dataset.export import *  # noqa: F403
+from spadwarp.dataset.make import *  # noqa: F403
+from spadwarp.dataset.plan import *  # noqa: F403
+from spadwarp.dataset.read import *  # noqa: F403
+from spadwarp.dataset.recipe import *  # noqa: F403
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__]  # noqa: F405

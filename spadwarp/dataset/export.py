@@ -13,57 +13,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.dataset.card import export_card
-from spadwarp.dataset.croissant import croissant
-from spadwarp.dataset.features import FEATURE_NAMES, histogram_features
-from spadwarp.dataset.histograms import HISTOGRAM_FIELDS
-from spadwarp.dataset.read import FrameReader
+from spadwarp.dataset.card import croissant, export_card
+from spadwarp.dataset.read import FIELDS, FrameReader
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.schema import Column
-from spadwarp.dataset.shards import checksum
+from spadwarp.dataset.shards import FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.text import write_json, write_text
 from spadwarp.limits import check_choice, check_integer
+from spadwarp.scene import Scene
+from spadwarp.scene.sight import depth_from_time
 
 __all__ = ["EXPORT_FIELDS", "EXPORT_FORMATS", "export_dataset"]
+
+FEATURE_NAMES = ("peak_depth", "peak_counts", "second_depth", "second_counts", "first_depth", "mean_depth")
+"""Channels of `histogram_features`."""
 
 EXPORT_FORMATS = ("parquet", "webdataset", "zarr")
 
 EXPORT_FIELDS: dict[str, tuple[str, str]] = {
-    "noisy": ("m", "depth frame; NaN: no return"),
-    "clean": ("m", "true planar depth; NaN: nothing is hit"),
-    "label": ("1", "1: the pixel reports backscatter or other background"),
-    "intensity": ("1", "recorded photons"),
-    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
-    "normal": ("1", "unit normals towards the camera, [3, height, width]"),
-    "albedo": ("1", "Lambertian reflectance"),
-    "prior": ("1/m", "density with which the water alone reports the depth in noisy"),
+    **FIELDS,
     "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
-    "counts": ("1", "histogram of the frame, [bin, height, width]"),
-    "expected": ("1", "expected histogram before pile-up, [bin, height, width]"),
-    "polarisation": ("1", "degree of polarisation of the bins, [bin, height, width]; NaN: no light"),
 }
 """Images of an exported frame: unit and meaning."""
 
 _DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
 _OF_HISTOGRAMS = ("features", *HISTOGRAM_FIELDS)
 _ZARR_FRAMES = 16  # of a chunk
-_NUMBERS: dict[str, tuple[type, str, str]] = {
-    "sample": (np.int64, "1", "id of the frame in the whole dataset"),
-    "scene": (np.int64, "1", "id of the scene"),
-    "backscatter_fraction": (
-        np.float32,
-        "1",
-        "requested part of pixels that report backscatter; NaN: the rates decide",
+_NUMBERS = {
+    "sample": FRAME_COLUMNS["sample"],
+    "scene": Column(np.int64, "1", "id of the scene"),
+    "backscatter_fraction": Column(
+        np.float32, "1", "requested part of pixels that report backscatter; NaN: the rates decide"
     ),
-    "attenuation_lengths": (np.float32, "1", "extinction times distance, one way"),
-    "distance": (np.float32, "m", "of the target's centre along the optical axis"),
-    "gate_near": (np.float32, "m", "range at which the gate opens"),
-    "gate_far": (np.float32, "m", "range at which the gate closes"),
-    "pulses": (np.float64, "1", "laser pulses of the frame"),
-    "photons": (np.float64, "1", "photons traced for the scene; 0: analytic"),
+    "attenuation_lengths": FRAME_COLUMNS["attenuation_lengths"],
+    "distance": FRAME_COLUMNS["distance"],
+    "gate_near": Column(np.float32, "m", "range at which the gate opens"),
+    "gate_far": Column(np.float32, "m", "range at which the gate closes"),
+    "pulses": Column(np.float64, "1", "laser pulses of the frame"),
+    "photons": Column(np.float64, "1", "photons traced for the scene; 0: analytic"),
 }
 
 
@@ -156,15 +145,11 @@ class _Source:
         deep = {"normal": (3,), "features": (len(FEATURE_NAMES),), **dict.fromkeys(HISTOGRAM_FIELDS, (bins,))}
         self.columns = {
             name: Column(
-                (*deep.get(name, ()), *base.shape),
-                np.dtype(np.uint8 if name == "label" else np.float32),
-                *EXPORT_FIELDS[name],
+                np.uint8 if name == "label" else np.float32, *EXPORT_FIELDS[name], (*deep.get(name, ()), *base.shape)
             )
             for name in self.fields
         }
-        for name, (kind, unit, meaning) in _NUMBERS.items():
-            self.columns[name] = Column((), np.dtype(kind), unit, meaning)
-        self.columns["target"] = Column((), np.dtype(object), "1", "name of the target")
+        self.columns |= {**_NUMBERS, "target": Column(object, "1", "name of the target")}
 
     def rows(self, split: str) -> Iterator[dict[str, Any]]:
         """The frames of a split, all columns of each."""
@@ -207,7 +192,7 @@ def _write_parquet(source: _Source, out: Path, size: int) -> Iterator[None]:
     from pyarrow import parquet
 
     def kind_of(column: Column) -> Any:
-        kind = pa.string() if column.is_text else pa.from_numpy_dtype(column.kind)
+        kind = pa.string() if column.is_text else pa.from_numpy_dtype(np.dtype(column.kind))
         for _ in column.shape:
             kind = pa.list_(kind)
         return kind
@@ -301,3 +286,41 @@ def _files(made: Path, format: str) -> list[Path]:
     """The files of an export, for checksums; of a Zarr store, which has one for each frame, its metadata."""
     found = sorted(path for path in made.rglob("*") if path.is_file())
     return [path for path in found if path.name == "zarr.json"] if format == "zarr" else found
+
+
+def histogram_features(counts: ArrayLike, scene: Scene) -> NDArray[np.float32]:
+    """Features of a frame's histograms `[6, H, W]`, by `FEATURE_NAMES`.
+
+    Planar depth [m] and counts of the window with most counts, as long as pulse and jitter together (FWHM); the same of
+    the best window that does not overlap with it; depth of the first count, and of the mean of all counts. NaN where
+    there are no counts.
+
+    Args:
+        counts: `[T, H, W]`.
+        scene: Of the frame.
+    """
+    cube = np.asarray(counts, np.float64)
+    bins, total = len(cube), cube.sum(axis=0)
+    fwhm = np.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps) * 1e-12
+    width = int(np.clip(round(fwhm / scene.gate.bin_width), 1, bins))
+    sums = np.concatenate([np.zeros((1, *total.shape)), np.cumsum(cube, axis=0)])
+    windows = sums[width:] - sums[:-width]  # of the bins k to k + width - 1
+    number = np.arange(bins)[:, None, None]
+
+    def depth(bin: NDArray[np.float64]) -> NDArray[np.float64]:
+        return depth_from_time(scene.gate.start + (bin + 0.5) * scene.gate.bin_width, scene=scene)
+
+    def mean_bin(weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        amount = weight.sum(axis=0)
+        return np.divide((weight * number).sum(axis=0), amount, out=np.full(total.shape, np.nan), where=amount > 0)
+
+    features = []
+    for _ in range(2):
+        start = windows.argmax(axis=0)
+        inside = (number >= start) & (number < start + width)
+        features += [depth(mean_bin(np.where(inside, cube, 0.0))), np.where(inside, cube, 0.0).sum(axis=0)]
+        windows = np.where(np.abs(number[: len(windows)] - start) >= width, windows, -1.0)
+        cube = np.where(inside, 0.0, cube)
+    cube = np.asarray(counts, np.float64)
+    first = np.where(total > 0, (cube > 0).argmax(axis=0), np.nan)
+    return np.stack([*features, depth(first), depth(mean_bin(cube))]).astype(np.float32)

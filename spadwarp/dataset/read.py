@@ -13,36 +13,41 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset.histograms import HISTOGRAM_FIELDS, HistogramFile
-from spadwarp.dataset.manifest import read_manifest
+from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.shard_file import ShardFile, frame_count
+from spadwarp.dataset.shards import HistogramFile, ShardFile, frame_count
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.limits import SEED, check_choice, check_integer
 from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 
-FIELDS = ("noisy", "clean", "label", "intensity", "bound", "normal", "albedo", "prior", *HISTOGRAM_FIELDS)
-"""Images that an item can hold, float32 `[1, H, W]`; normals `[3, H, W]`, histograms `[T, H, W]`."""
+FIELDS: dict[str, tuple[str, str]] = {
+    "noisy": ("m", "depth frame; NaN: no return"),
+    "clean": ("m", "true planar depth; NaN: nothing is hit"),
+    "label": ("1", "1: the pixel reports backscatter or other background, else 0"),
+    "intensity": ("1", "recorded photons"),
+    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
+    "normal": ("1", "unit normals towards the camera, [3, height, width]"),
+    "reflectance": ("1", "Lambertian reflectance"),
+    "prior": ("1/m", "density with which the water alone reports the depth in noisy; NaN where noisy is"),
+    "counts": ("1", "histogram of the frame, [bin, height, width]; of traced scenes only"),
+    "expected": ("1", "expected histogram before pile-up, [bin, height, width]; of traced scenes only"),
+    "polarisation": (
+        "1",
+        "degree of polarisation of the bins by both channels, without the noise of counts, [bin, height, width]; "
+        "NaN: no light; of traced scenes whose camera records polarisation",
+    ),
+}
+"""Images that an item can hold, float32 `[1, H, W]` where no other shape is given: unit and meaning."""
 
 
 class FrameReader:
     """The frames of a split as a sequence of dicts of float32 NumPy arrays `[C, H, W]`.
 
-    - `noisy`: depth frame [m], NaN where there was no return.
-    - `clean`: true planar depth [m], NaN where nothing is hit.
-    - `label`: 1 where the pixel reports backscatter or other background, else 0.
-    - `intensity`: recorded photons.
-    - `bound`: Cramér–Rao bound of the depth [m], NaN for no estimate.
-    - `normal`: `[3, H, W]`, unit vectors towards the camera. `albedo`: Lambertian reflectance.
-    - `counts`: histograms of the frame `[T, H, W]`; `expected`: their expectation. Of traced scenes only.
-    - `polarisation`: degree of polarisation of each bin as both channels of the camera find it, without the noise of
-      counts, NaN where no light arrives, `[T, H, W]`. Of traced scenes whose camera records polarisation.
-    - `prior`: density [1/m] with which the water alone reports the depth in `noisy`; NaN where `noisy` is.
-
-    And numbers: `sample`, `scene`, `target` (int64), `backscatter_fraction`, `attenuation_lengths`, `distance`
-    (float32), `gate` (float32 `[2]`, ranges at which it opens and closes [m]).
+    An item has images by the names of `FIELDS`, and numbers: `sample`, `scene`, `target` (int64),
+    `backscatter_fraction`, `attenuation_lengths`, `distance` (float32), `gate` (float32 `[2]`, ranges at which it opens
+    and closes [m]).
 
     Args:
         path: The dataset's folder, or the file of one of its shards, whose frames are read alone.

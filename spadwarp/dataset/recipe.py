@@ -7,43 +7,171 @@ uniform in the logarithm).
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
+    AfterValidator,
+    BaseModel,
     BeforeValidator,
+    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
     model_validator,
 )
 
-from spadwarp.dataset.distributions import (
-    Angle,
-    Distribution,
-    Names,
-    NotNegative,
-    Positive,
-    PulseCount,
-    Real,
-    Share,
-    Table,
-    constant,
-    distribution,
-)
-from spadwarp.dataset.plumes import Plume
-from spadwarp.errors import ConfigError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.io.paths import example_or_path
+from spadwarp.io.text import read_toml
+from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
 from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
-from spadwarp.scene.renamed import current_fields, current_path
-from spadwarp.scene.sections import Whole
+from spadwarp.scene.sections import Whole, listed
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
+
+Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
+
+
+class Table(BaseModel):
+    """One table of a recipe: frozen, strict about types, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as TOML has them, without those that are None: `Recipe.from_dict` makes an equal recipe of them."""
+        return {name: plain(value) for name, value in self if value is not None}
+
+
+class Distribution(Table):
+    """One of `choices`, equally likely, or uniform between `low` and `high`."""
+
+    choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
+    low: float | None = Field(None, ge=-1e19, le=1e19, description="lowest value")
+    high: float | None = Field(None, ge=-1e19, le=1e19, description="highest value")
+    log: bool = Field(False, description="whether uniform in the logarithm")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if bool(self.choices) == (self.low is not None and self.high is not None):
+            raise ValueError("needs a number, a list of choices, or low and high")
+        if self.low is not None and self.high is not None:
+            if not self.low <= self.high:
+                raise ValueError(f"low = {self.low} is outside (-inf, {self.high}], {self.high} being high")
+            if self.log and not self.low > 0:
+                raise ValueError(f"low = {self.low} is outside (0, inf), the range of a logarithm")
+            if not math.isfinite(self.high / self.low if self.log else self.high - self.low):
+                raise ValueError(f"low = {self.low} and high = {self.high} are too far apart")
+        if not all(map(_is_finite, self.choices)):
+            raise ValueError(f"holds {shown(self.choices)}, not all of which are finite")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value that can be drawn."""
+        if self.choices:
+            return min(self.choices), max(self.choices)
+        assert self.low is not None and self.high is not None
+        return self.low, self.high
+
+    def draw(self, generator: np.random.Generator) -> Any:
+        """One value."""
+        if self.choices:
+            return self.choices[int(generator.integers(len(self.choices)))]
+        low, high = self.limits
+        u = float(generator.random())
+        return low * (high / low) ** u if self.log else low + (high - low) * u
+
+    def to_dict(self) -> Any:
+        """As TOML has it: a number, a list or a table."""
+        if self.choices:
+            single = len(self.choices) == 1 and not isinstance(self.choices[0], (list, tuple))
+            return self.choices[0] if single else list(self.choices)
+        return {"low": self.low, "high": self.high, **({"log": True} if self.log else {})}
+
+
+def _is_finite(value: Any, depth: int = 0) -> bool:
+    """Whether a choice, a number or a list of them, is free of NaN and infinity; words are."""
+    if isinstance(value, list | tuple):
+        return depth < 9 and all(_is_finite(item, depth + 1) for item in value)
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def distribution(value: Any) -> Any:
+    """A number or a list as the table of a distribution."""
+    if isinstance(value, (Mapping, Distribution)):
+        return value
+    return {"choices": list(value) if isinstance(value, (list, tuple)) else [value]}
+
+
+def within(interval: str) -> AfterValidator:
+    """A distribution of numbers in a range."""
+
+    def check(value: Distribution) -> Distribution:
+        values = value.choices or value.limits
+        for number in values:
+            try:
+                check_real("value", number, interval)
+            except ArgumentError:
+                problem = f"is no number in {interval}"
+                raise ValueError(problem if len(values) == 1 else f"holds {shown(number)}, which {problem}") from None
+        return value
+
+    return AfterValidator(check)
+
+
+Positive = Annotated[Distribution, BeforeValidator(distribution), within("[1e-9, 1e9]")]
+NotNegative = Annotated[Distribution, BeforeValidator(distribution), within("[0, 1e9]")]
+PulseCount = Annotated[Distribution, BeforeValidator(distribution), within("[0.5, 9e18]")]
+Share = Annotated[Distribution, BeforeValidator(distribution), within("[0, 1]")]
+Angle = Annotated[Distribution, BeforeValidator(distribution), within("[-360, 360]")]
+Real = Annotated[Distribution, BeforeValidator(distribution), within("[-1e9, 1e9]")]
+
+
+def constant(value: float) -> Distribution:
+    """The distribution of one value."""
+    return Distribution(choices=(value,))
+
+
+def plain(value: Any) -> Any:
+    """A table, or what is in one, as TOML has it."""
+    if isinstance(value, Table):
+        return value.to_dict()
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+Shape = Literal["cloud", "plume", "sediment"]
+
+UNIFORM = Distribution(low=0.0, high=1.0)
+
+
+class Plume(Table):
+    """Suspended matter between camera and target in part of the scenes."""
+
+    probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
+    shape: Annotated[tuple[Shape, ...], BeforeValidator(listed), Field(min_length=1)] = Field(
+        ("cloud", "plume", "sediment"), description="shapes of medium.grid, equally likely"
+    )
+    optical_depth: Positive = Field(constant(1.0), description="that it adds on the optical axis, one way")
+    place: Share = Field(
+        Distribution(low=0.3, high=0.8), description="of its middle, as part of the distance of the target's centre"
+    )
+    shift: Real = Field(constant(0.0), description="sideways, drawn for x and for y [m]")
+    size: Positive = Field(constant(1.0), description="edge of its box [m]")
+    albedo: Share = Field(constant(0.8), description="single-scattering albedo of its matter")
+    turbulence: NotNegative = Field(
+        constant(0.5), description="standard deviation of the logarithm of its density, up to 3"
+    )
+    cells: Whole = Field(32, ge=1, le=256, description="cells along the edges of its box")
+
 
 _MOST_TRIED = 1000  # values of a field that varies
 
@@ -198,9 +326,9 @@ class Recipe(Table):
                 raise ValueError(f"scene.{name} does not belong to the scene: it is in the recipe's own [{name}]")
         medium = self.scene.get("medium")
         if self.plume.probability > 0 and isinstance(medium, Mapping) and {"layers", "grid"} & set(medium):
-            raise ValueError("plume.probability > 0 does not go with layers or a grid in scene.medium")
+            raise ValueError("plume.probability > 0 cannot be combined with layers or a grid in scene.medium")
         if self.plume.probability > 0 and "daylight" in self.scene:
-            raise ValueError("plume.probability > 0 does not go with scene.daylight, which takes one water")
+            raise ValueError("plume.probability > 0 cannot be combined with scene.daylight, which takes one water")
         camera = self.scene.get("camera")
         polarisation = camera.get("polarisation", "none") if isinstance(camera, Mapping) else "none"
         if self.monte_carlo.channel != "I" and polarisation == "none" and "camera.polarisation" not in self.vary:
@@ -226,18 +354,17 @@ class Recipe(Table):
         """
         name = None if source is None else str(source)
         try:
-            recipe = cls.model_validate(_with_paths(_current(tables), source))
+            recipe = cls.model_validate(_with_paths(tables, source))
         except ValidationError as error:
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
+        part = "scene"
         try:
             template = recipe.template()
-        except ConfigError as error:
-            raise ConfigError([f"scene: {line}" for line in error.problems], source=name) from None
-        try:
+            part = "vary"
             recipe._check_vary(template)
         except ConfigError as error:
-            raise ConfigError([f"vary: {line}" for line in error.problems], source=name) from None
+            raise ConfigError([f"{part}: {line}" for line in error.problems], source=name) from None
         return recipe
 
     def _check_vary(self, template: Scene) -> None:
@@ -268,7 +395,7 @@ class Recipe(Table):
         pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
         tables = self.to_dict()
         for key, value in pairs:
-            parts = current_path(key if isinstance(key, str) else ".".join(map(str, key))).split(".")
+            parts = (key if isinstance(key, str) else ".".join(map(str, key))).split(".")
             inner = tables
             for part in parts[:-1]:
                 inner = inner.setdefault(part, {})
@@ -292,26 +419,18 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     return Recipe.from_dict(tables, source=path)
 
 
-def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's own tables with former names replaced; a scene replaces its own."""
-    exposure = tables.get("exposure")
-    return {**tables, "exposure": current_fields("exposure", exposure)} if isinstance(exposure, Mapping) else {**tables}
-
-
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """The tables with the paths of targets made absolute."""
+    """The tables with the paths of targets and of the trajectory made absolute."""
+    changed = dict(tables)
     if source is None:
-        return dict(tables)
-    folder = Path(source).absolute().parent
-    if isinstance(moves := tables.get("trajectory"), str) and moves:
-        tables = {**tables, "trajectory": str(folder / os.path.expanduser(moves))}
-    targets = tables.get("targets")
-    if not isinstance(targets, Mapping):
-        return dict(tables)
-    changed = dict(targets)
-    for name in ("meshes", "exports"):
-        if isinstance(given := targets.get(name), (list, tuple)):
-            changed[name] = [
-                str(folder / os.path.expanduser(path)) if isinstance(path, str) else path for path in given
-            ]
-    return {**tables, "targets": changed}
+        return changed
+
+    def placed(path: Any) -> Any:
+        return str(Path(source).absolute().parent / os.path.expanduser(path)) if isinstance(path, str) else path
+
+    if tables.get("trajectory"):
+        changed["trajectory"] = placed(tables["trajectory"])
+    if isinstance(targets := tables.get("targets"), Mapping):
+        lists = {name: targets[name] for name in ("meshes", "exports") if isinstance(targets.get(name), (list, tuple))}
+        changed["targets"] = {**targets, **{name: list(map(placed, paths)) for name, paths in lists.items()}}
+    return changed

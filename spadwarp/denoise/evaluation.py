@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames
-from spadwarp.denoise.likelihood import CLASSICAL
 from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
 from spadwarp.denoise.network_files import own_weights
 from spadwarp.errors import ArgumentError, FileError

@@ -34,7 +34,7 @@ LEVELS = (0.042, 0.183, 0.264, 0.337, 0.394, 0.480)
 """The paper's backscatter fractions."""
 
 SETTINGS = ("wall", "open water", "floor")
-"""What is behind the shapes."""
+"""Surfaces behind the shapes."""
 
 WATERS = ("front", "uniform", "near-range")
 """Where backscatter comes from: uniformly from in front of the target; uniformly from the whole gate; mostly from the

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.denoise.baselines import CLASSICAL, classical_depth
 from spadwarp.denoise.frames import MARGIN, depth_frames
 from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
 from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
-from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, weights_metadata
 from spadwarp.denoise.reading import ENDINGS, DepthReading, backscatter_profile, depth_at, read_depth
 from spadwarp.denoise.second_return import second_return
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import holds_own_file, locate
 from spadwarp.frames.measured import Histograms
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
+from spadwarp.io.paths import atomic_path
 from spadwarp.limits import check_real
 from spadwarp.units import percent
 from spadwarp.viz import draw_denoised
@@ -33,7 +33,7 @@ __all__ = ["Denoised", "denoise_file", "depth_files"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """What `denoise_file` wrote: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
+    """Output of `denoise_file`: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
     counts as such, probability that its depth is right, gate [m], paths of the files, and notes for the user."""
 
     depth: NDArray[np.float32]

@@ -15,14 +15,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.belief_propagation import JUMPS, beliefs
+from spadwarp.denoise.classical import (
+    GUIDES,
+    JUMPS,
+    beliefs,
+    counts_level,
+    edge_penalties,
+    guide_channels,
+    highest,
+    mean_depth,
+    pooled,
+    total_variation,
+)
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.guide import GUIDES, counts_level, edge_penalties, guide_channels
-from spadwarp.denoise.marginals import mean_depth
 from spadwarp.denoise.scattered_light import LIGHT, light_channels
 from spadwarp.denoise.sides import LIKENESS, beside_edges
-from spadwarp.denoise.total_variation import total_variation
-from spadwarp.denoise.volumes import highest, pooled
 
 __all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
 __all__ += ["log_likelihood", "pooled", "toeplitz"]

@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
 from spadwarp.denoise.evaluation_scenes import GATE, EvaluationScene, evaluation_scene
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.histogram_inputs import features_of_histograms
 from spadwarp.denoise.inference import denoise_frames
-from spadwarp.denoise.likelihood import TUNINGS, classical_depth
 
 __all__ = ["HistogramScores", "Point", "draw_counts", "evaluate_histograms"]
 

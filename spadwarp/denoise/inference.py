@@ -5,26 +5,32 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.baselines import BASELINES, MEDIAN_WINDOWS, median_filter
+from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import MARGIN, DepthFrames, checked_gate, checked_profile, depth_frames, depth_values
 from spadwarp.denoise.gates import narrowed_input
 from spadwarp.denoise.histogram_inputs import checked_histograms, features_of_histograms, target_bins
-from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
 from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.denoise.target_probability import corrected_target
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "denoise_frames", "estimate", "estimate_frames", "target_threshold"]
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+_WATER = -2.2  # logits below it, and above 0, are sure enough to count how pixels of water, and of the target, report
+_PRIOR = 30.0  # pixels of the target whose reports are assumed to be as those of the water
+_LARGEST = 3.0  # correction of a logit
+
 METHODS = (*MODELS, *(name for name in BASELINES if name != "input"), *CLASSICAL)
-"""What `apply` takes as `model`."""
+"""Models of `apply`."""
 
 # With this probability PyramidNet misses 0.6 % of the target in drawn scenes in open water that no training saw, 2.7 %
 # with the noise of the training; its probabilities are too low on thin structures.
@@ -34,7 +40,7 @@ _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a 
 
 
 class Estimate(NamedTuple):
-    """What denoising answers, float32, each of the frames' shape.
+    """The answer of denoising, float32, each of the frames' shape.
 
     Attributes:
         depth: [m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN).
@@ -287,3 +293,39 @@ def _baseline(frames: DepthFrames, model: str, window: int, weights: str | Path 
     empty = ~reported.any(axis=(1, 2), keepdims=True)
     found = np.where(empty, np.float32(np.nan), found)
     return Estimate(found, reported.astype(np.float32), np.full_like(frames.depth, np.nan))
+
+
+def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tensor) -> Tensor:
+    """Logit of "sees a target", corrected by what the network is not given, `[N, H, W]`.
+
+    The network sees the part of the gate that holds the target. It cannot tell pixels that reported nothing, which are
+    mostly water, from those that reported backscatter outside that part. How often pixels of the target, and of the
+    water, do one or the other is counted in the frame where the network is sure, and Bayes' rule does the rest. Nor
+    does it see the whole of a large frame: where few pixels report and their depths agree no more often than those of
+    backscatter, a target can take only a small part of the frame, and its pixels are as much less probable.
+
+    Args:
+        logit: Of the network, `[N, H, W]`.
+        depth: NaN where nothing was reported, `[N, H, W]`.
+        reported: Which pixels reported a depth that the network was given, 1 or 0, `[N, H, W]`.
+        share: The largest part of the frame that a target can take, of `gates_of_target`, `[N]`.
+    """
+    import torch
+
+    absent = depth.isnan()
+    beyond = (reported < 0.5) & ~absent
+
+    def counts(chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Chosen pixels without a report, and with one outside that part of the gate, each `[N]`."""
+        return (chosen & absent).flatten(1).sum(1), (chosen & beyond).flatten(1).sum(1)
+
+    none, some = counts(logit < _WATER)
+    water = (none + 0.5) / (none + some + 1.0)
+    none, some = counts(logit > 0.0)
+    target = (none + _PRIOR * water) / (none + some + _PRIOR)
+    of_absent, of_beyond = (
+        ratio.log().clamp(-_LARGEST, _LARGEST)[:, None, None]
+        for ratio in (target / water, (1.0 - target) / (1.0 - water))
+    )
+    logit = logit + torch.where(absent, of_absent, torch.where(beyond, of_beyond, 0.0))
+    return logit + share.log().clamp_min(-_LARGEST)[:, None, None]

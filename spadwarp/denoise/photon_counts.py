@@ -22,7 +22,7 @@ from spadwarp.denoise.inference import METHODS, denoise_frames
 from spadwarp.denoise.network_files import own_weights
 from spadwarp.errors import SpadwarpError
 from spadwarp.frames.cramer_rao import crlb_from_histogram
-from spadwarp.frames.estimators import arrival_time
+from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import detector_response
 from spadwarp.limits import SEED, check_choice, check_integer, check_real
 from spadwarp.scene.sight import depth_from_time, port_advance

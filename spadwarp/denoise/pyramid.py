@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -13,11 +16,145 @@ from spadwarp.denoise.frames import POOLED, SCORED
 from spadwarp.denoise.histogram_features import SEEN
 from spadwarp.denoise.repeatable import edge_padded, enlarged
 from spadwarp.denoise.selection import Selection, selected, selected_depth
-from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean
-from spadwarp.denoise.two_surfaces import follow_the_others
-from spadwarp.denoise.votes import VOTES, Votes, neighbour_votes
+from spadwarp.denoise.symmetric import GROUP, SymmetricConv, SymmetricWindow, symmetric_mean, turned
 
-__all__ = ["CLOSE", "LONGEST_DELAY", "OUTPUTS", "PyramidNet"]
+__all__ = ["OUTPUTS", "PyramidNet"]
+
+VOTES = 4
+"""Scalar channels among the votes: `near`, `wide`, `depth` and `support`."""
+
+_SAME, _ALIKE = 0.012, 0.04  # depths this far apart do not agree, among 3 × 3 and 5 × 5 pixels [gate widths]
+_FAR = 10.0  # behind any depth that is reported [gate widths]
+_REACH = 3  # pixels of padding, more than those of a pair are apart
+_RING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
+_SHARPNESS = 6.0  # a depth with one vote more counts exp(_SHARPNESS) times as much
+
+
+class Votes(NamedTuple):
+    """Agreement of reported depths: 1 where two are equal, falling to 0, and 0 where one is missing.
+
+    Attributes:
+        near, wide: Mean agreement of a pixel with the 8 and the 24 pixels around it, `[B, 1, H, W]`.
+        depth: Of the eight pixels around it, the depth with which most of them agree, `[B, 1, H, W]`; 1 where none
+            reports.
+        support: How many of the eight agree with it, over 8, `[B, 1, H, W]`.
+        agreement: With each of the eight, as two features whose channels turn with the image, `[B, 16, H, W]`.
+    """
+
+    near: Tensor
+    wide: Tensor
+    depth: Tensor
+    support: Tensor
+    agreement: Tensor
+
+
+@torch.no_grad()
+def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
+    """Votes of frames of depth over the gate and of which pixels reported, `[B, 1, H, W]`."""
+    height, width = depth.shape[-2:]
+    # Pixels that are missing, or beyond the border, agree with none: each has a depth of its own far behind the gate.
+    image = F.pad(torch.where(reported > 0.5, depth, torch.nan), (_REACH,) * 4, value=torch.nan)
+    image = torch.where(torch.isnan(image), _apart(*image.shape[-2:], image.device), image)
+
+    def beside(values: Tensor, place: tuple[int, int]) -> Tensor:
+        y, x = (_REACH + step for step in place)
+        return values[..., y : y + height, x : x + width]
+
+    agreeing: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # of all pixels with those so many rows, columns away
+    # All images as one line, in which a neighbour is a fixed number of places away; what crosses a border is not used.
+    line, row, pixels = image.flatten(), image.shape[3], image.numel()
+    line = torch.cat([line, line[: 2 * row + 2]])
+    for step in ((y, x) for y in range(3) for x in range(-2, 3) if (y, x) > (0, 0)):
+        places = step[0] * row + step[1]
+        apart = (line[:pixels] - line[places : places + pixels]).abs_().view_as(image)
+        fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
+        agreeing[step] = fine, coarse
+
+    def pair(one: tuple[int, int], other: tuple[int, int], kind: int = 0) -> Tensor:
+        """Agreement of the pixels at two places beside each pixel."""
+        first, second = sorted((one, other))
+        return beside(agreeing[second[0] - first[0], second[1] - first[1]][kind], first)
+
+    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0)]
+    single = {place: pair((0, 0), place) for place in _RING}
+    near = sum(single.values(), torch.zeros_like(depth)) / 8.0
+    wide = sum((pair((0, 0), place, 1) for place in around), torch.zeros_like(depth)) / 24.0
+    depths = [beside(image, place) for place in _RING]
+    counts = [(value < _FAR).float() for value in depths]
+    for first, one in enumerate(_RING):
+        for second in range(first + 1, 8):
+            agree = pair(one, _RING[second])
+            counts[first].add_(agree)
+            counts[second].add_(agree)
+    count = torch.cat(counts, dim=1)
+    most = count.amax(dim=1, keepdim=True)
+    weight = torch.exp(_SHARPNESS * (count - most)) * (count > 0.0)
+    ring = torch.cat(depths, dim=1)
+    total = weight.sum(dim=1, keepdim=True)
+    voted = torch.where(total > 0.0, (weight * ring).sum(dim=1, keepdim=True) / total.clamp_min(1e-9), 1.0)
+    agreement = torch.cat([single[place] for place in _directions()], dim=1)
+    return Votes(near, wide, voted, most / 8.0, agreement)
+
+
+@lru_cache(maxsize=4)
+def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Depths behind the gate of which no two within five rows and columns are equal, `[rows, columns]`."""
+    with torch.inference_mode(False):
+        row, column = torch.arange(rows, device=device) % 5, torch.arange(columns, device=device) % 5
+        return _FAR + 5.0 * row[:, None] + column
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[tuple[int, int], ...]:
+    """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
+    places = []
+    for start in ((1, 2), (2, 2)):
+        for element in range(GROUP):
+            probe = np.zeros((3, 3), np.int64)
+            probe[start] = 1
+            row, column = np.argwhere(turned(probe, element))[0]
+            places.append((int(row) - 1, int(column) - 1))
+    return tuple(places)
+
+
+# Pixels that see the same two surfaces: the one that nearly all of them take is that of each.
+
+
+_VOTERS = 3  # pixels around that vote
+_ONE_SURFACE, _APART = 0.01, 0.05  # depths this near are one surface, this far apart two [gate widths]
+_LEAST, _TIMES = 4, 3.0  # votes for a surface, and how many times the pixels that took the other one, that move to it
+_SURE = 4.0  # log-likelihood from which on a return is one [nats]
+_PHOTON = 5.0  # log-likelihood of a photon, about the highest [nats]
+_CHANCE = 2.0  # deviations by which the two returns may differ
+
+
+@torch.no_grad()
+def follow_the_others(found: Tensor, features: Tensor) -> Tensor:
+    """The answers `[B, 1, H, W]` over the gate, some of them moved to a return of their pixel that is far away.
+
+    `features`: see `spadwarp.denoise.histogram_features`, with 0.5 subtracted from the first depths.
+    """
+    pair, order = (0.5 + features[:, :2]).sort(dim=1)  # the highest return of a pixel and the second, the nearer first
+    light = (10.0 * features[:, SEEN : SEEN + 2]).gather(1, order)
+    two = (light > _SURE).all(dim=1, keepdim=True) & (pair.diff(dim=1) > _APART)
+    pair = torch.where(two, pair, torch.nan)  # near to none
+    height, width = found.shape[-2:]
+    around = F.pad(torch.cat([pair, found], dim=1), (_VOTERS,) * 4, value=torch.nan)
+    votes, taken = torch.zeros_like(pair), torch.zeros_like(pair)
+    for y in range(2 * _VOTERS + 1):
+        for x in range(2 * _VOTERS + 1):
+            if (y, x) != (_VOTERS, _VOTERS):
+                other, answer = around[..., y : y + height, x : x + width].split([2, 1], dim=1)
+                alike = ((pair - other).abs() < _ONE_SURFACE).all(dim=1, keepdim=True)
+                near = (answer - pair).abs() < _ONE_SURFACE
+                taken += near
+                votes += alike & near
+    more = light.flip(1) - light  # of the other return
+    by_chance = more <= _CHANCE * (_PHOTON * light.sum(dim=1, keepdim=True)).clamp_min(0.0).sqrt()
+    outvoted = (votes >= _LEAST) & (votes >= _TIMES * taken.flip(1))
+    moves = outvoted & by_chance & ((found - pair).abs() > _APART)
+    return torch.where(moves.any(dim=1, keepdim=True), torch.where(moves, pair, 0.0).sum(dim=1, keepdim=True), found)
+
 
 LONGEST_DELAY = 0.2
 """Largest delay of forward-scattered light that the network can correct [gate widths]."""
@@ -66,7 +203,7 @@ class PyramidNet(nn.Module):
     never the mean of two returns. The delay of scattered light, which the shape of the return shows, is subtracted from
     the result. Last, `spadwarp.denoise.selection` takes the answer or another candidate, and `spadwarp.denoise.context`
     weighs them with the view of a wide surrounding; then pixels with two returns follow those around that have the same
-    two (`spadwarp.denoise.two_surfaces`). A fifth output is the depth of the candidates, and one for each candidate its
+    two (`spadwarp.denoise.pyramid`). A fifth output is the depth of the candidates, and one for each candidate its
     logit. While it learns, there are also the candidates of the selection and their scores, those of the wide view, its
     answer and its logit of "sees a target"; depth and logits are those before the selection.
     """

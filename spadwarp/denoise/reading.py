@@ -16,12 +16,10 @@ from spadwarp.denoise.frames import checked_gate
 from spadwarp.denoise.histogram_inputs import dim_pixels
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, gate_of, is_own_file, load, locate, sequence, stored_depth
-from spadwarp.frames.depth import depth_of
-from spadwarp.frames.estimators import Method
-from spadwarp.frames.measured import Histograms, read_histograms
-from spadwarp.frames.sequence_file import SequenceFile
-from spadwarp.frames.stored_images import stored_images
-from spadwarp.io.exr import read_exr
+from spadwarp.frames.depth import Method, depth_of
+from spadwarp.frames.file import SequenceFile
+from spadwarp.frames.measured import Histograms, read_histograms, stored_images
+from spadwarp.io.arrays import read_exr
 from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
 from spadwarp.scene.sight import depth_from_time

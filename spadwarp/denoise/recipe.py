@@ -11,8 +11,8 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import read_toml
+from spadwarp.io.paths import example_or_path
+from spadwarp.io.text import read_toml
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole
 
@@ -52,7 +52,7 @@ Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
 
 class Noise(_Table):
-    """What the noise of a training is drawn from: `[lowest, highest]`, or a part of the samples."""
+    """The noise of a training: `[lowest, highest]`, or a part of the samples."""
 
     backscatter: Shares = Field(
         (0.0, 0.6), description="part of the pixels that report backscatter; low ones are drawn more often"

@@ -65,11 +65,11 @@ class Scenes:
 
 
 class Samples(Protocol):
-    """What a step learns from. `batch` is recorded in a CUDA graph, `prepare` is gone through before each step."""
+    """Samples of a step: `batch` is recorded in a CUDA graph, `prepare` is gone through before each step."""
 
     scenes: Scenes
     seconds: float
-    """What `prepare` takes, on average over the steps."""
+    """Time of `prepare`, on average over the steps."""
 
     def due(self, step: int) -> int:
         """Samples that are still to be drawn before the step."""

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.volumes import pooled
+from spadwarp.denoise.classical import pooled
 
 __all__ = ["LIGHT", "light_channels"]
 

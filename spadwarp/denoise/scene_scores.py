@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import MEDIAN_WINDOWS
+from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.evaluation_scenes import (
     LEVELS,
     SETTINGS,
@@ -28,7 +28,6 @@ from spadwarp.denoise.evaluation_scenes import (
 )
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
-from spadwarp.denoise.likelihood import CLASSICAL
 from spadwarp.denoise.metrics import staircase_steps
 from spadwarp.denoise.network_files import own_weights
 from spadwarp.errors import ArgumentError

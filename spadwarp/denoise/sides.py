@@ -11,8 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spadwarp.denoise.semi_global import aggregate
-from spadwarp.denoise.volumes import highest
+from spadwarp.denoise.classical import aggregate, highest
 
 __all__ = ["LIKENESS", "REACHES", "beside_edges"]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spadwarp.dataset import read_manifest
-from spadwarp.dataset.shard_file import SceneFile
+from spadwarp.dataset.shards import SceneFile
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.errors import FileError

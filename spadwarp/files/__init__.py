@@ -1,9 +1,12 @@
-"""Any of our files opened: results, frames of a camera or of the analytic simulator, datasets, records."""
+"""Files opened and written: runs, frames, datasets, formats of other programs, JSON Schema of our TOML files."""
 
-from spadwarp.files.depth import gate_of, stored_depth
-from spadwarp.files.describe import summary
-from spadwarp.files.loader import Held, holds_own_file, is_own_file, load, locate
-from spadwarp.files.sequences import open_source, sequence
+from typing import TYPE_CHECKING
 
-__all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "open_source", "sequence"]
-__all__ += ["stored_depth", "summary"]
+from spadwarp.files import formats, loader, run, schema
+from spadwarp.files.formats import *  # noqa: F403
+from spadwarp.files.loader import *  # noqa: F403
+from spadwarp.files.run import *  # noqa: F403
+from spadwarp.files.schema import *  # noqa: F403
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = formats.__all__ + loader.__all__ + run.__all__ + schema.__all__

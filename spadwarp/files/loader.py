@@ -1,25 +1,31 @@
-"""One loader for all files that spadwarp writes as HDF5."""
+"""One loader for all files that spadwarp writes as HDF5, and what they hold: depth, the gate, a summary."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
 from spadwarp.errors import FileError
-from spadwarp.frames import FramesFile
-from spadwarp.frames.sequence_file import SequenceFile
+from spadwarp.frames import FramesFile, Reduction, SequenceFile
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
+from spadwarp.scene import Scene
+from spadwarp.scene.sight import lines_of_sight, port_advance
 from spadwarp.transport import PhotonRecords, load_records
+from spadwarp.units import range_from_time
 
-__all__ = ["Held", "holds_own_file", "is_own_file", "load", "locate"]
+__all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "stored_depth", "summary"]
 
 Held = Result | FramesFile | SequenceFile | AnalyticFile | FrameReader | PhotonRecords
-"""What a file of ours holds."""
+"""Content of a file of ours."""
 
 _NAMES = ("frames.h5", "result.h5", "analytic.h5", "sequence.h5")
 _DATASET, _CHECKPOINT = "manifest.json", "checkpoint.h5"
@@ -33,7 +39,7 @@ _LOADERS: dict[str, Callable[[Path], Held]] = {
 
 
 def load(path: str | os.PathLike[str]) -> Held:
-    """What a file that spadwarp wrote holds.
+    """Loads a file that spadwarp wrote.
 
     - `result.h5`, `checkpoint.h5`: a `Result`.
     - `frames.h5` of `detect`: a `FramesFile`, which reads counts and depth when asked.
@@ -47,17 +53,20 @@ def load(path: str | os.PathLike[str]) -> Held:
         FileError: Not a file of ours, damaged, or a directory that holds none or several of them.
     """
     place = locate(path)
-    if place.is_dir():
-        return FrameReader(place, "all")
-    with read_hdf5(place) as file:
-        kind, shard = file.attribute("format", None), file.attribute("shard", None)
-    if shard is not None:
+    kind, is_shard = (None, True) if place.is_dir() else _format(place)
+    if is_shard:
         return FrameReader(place, "all")
     loader = _LOADERS.get(kind) if isinstance(kind, str) else None
     if loader is None:
         known = ", ".join(_LOADERS)
         raise FileError(f"{place}: an HDF5 file, but none of ours: its format is {kind!r}, not one of {known}")
     return loader(place)
+
+
+def _format(path: Path) -> tuple[Any, bool]:
+    """The format of an HDF5 file, and whether it is a shard of a dataset."""
+    with read_hdf5(path) as file:
+        return file.attribute("format", None), file.attribute("shard", None) is not None
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
@@ -81,10 +90,135 @@ def holds_own_file(folder: str | os.PathLike[str]) -> bool:
 def is_own_file(place: Path) -> bool:
     """Whether a path from `locate` is a dataset's folder, or an HDF5 file that spadwarp wrote; raises `FileError` for a
     damaged one."""
-    if place.is_dir():
-        return True
-    if place.suffix.lower() not in (".h5", ".hdf5"):
-        return False
-    with read_hdf5(place) as file:
-        kind = file.attribute("format", None)
-        return file.attribute("shard", None) is not None or (isinstance(kind, str) and kind.startswith("spadwarp"))
+    if place.is_dir() or place.suffix.lower() not in (".h5", ".hdf5"):
+        return place.is_dir()
+    kind, is_shard = _format(place)
+    return is_shard or (isinstance(kind, str) and kind.startswith("spadwarp"))
+
+
+def stored_depth(held: Held) -> Reduction | None:
+    """The depth frames of an analytic file, a dataset, a shard or a scene that moves; None for what holds histograms.
+
+    The camera of a scene that moves is that of its first frame. `intensity` is that of a dataset's frames, the counts
+    of a scene that moves, and the expected signal of the analytic model.
+    """
+    intensity: NDArray[Any]
+    if isinstance(held, AnalyticFile):
+        depth, scene = held.depth().astype(np.float64), held.scene
+        intensity = np.broadcast_to(np.nan_to_num(held.maps["signal"]), depth.shape)
+    elif isinstance(held, FrameReader):
+        items = [(item["noisy"][0], item["intensity"][0]) for item in held]
+        depth, scene = np.array([noisy for noisy, _ in items], np.float64), held.scene(0)
+        intensity = np.array([counts for _, counts in items])
+    elif isinstance(held, SequenceFile) and held.best_method is not None:
+        depth, scene = held.depth(held.best_method).astype(np.float64), held.scene(0)
+        intensity = held.intensity()
+    else:
+        return None
+    lines = lines_of_sight(scene)
+    return Reduction(
+        quantity="depth",
+        values=depth,
+        range=lines.range_from_depth(depth),
+        intensity=intensity,
+        lines=lines,
+        method="stored",
+        camera=scene.camera,
+    )
+
+
+def gate_of(held: Held) -> tuple[float, float] | None:
+    """Ranges at which the gate of an analytic file, a dataset or a scene that moves opens and closes [m], of all its
+    scenes together."""
+    if isinstance(held, FrameReader):
+        gates = np.array([item["gate"] for item in held.with_fields()])
+        return float(gates[:, 0].min()), float(gates[:, 1].max())
+    if isinstance(held, AnalyticFile):
+        scene, times = held.scene, (held.scene.gate.start, held.scene.gate.stop)
+    elif isinstance(held, SequenceFile):
+        scene, times = held.base, (held.gate_start, held.gate_start + held.bins * held.bin_width)
+    else:
+        return None
+    near, far = (range_from_time(time, scene.medium.group_index) + port_advance(scene) for time in times)
+    return near, far
+
+
+# Summaries
+
+
+def summary(held: Held) -> dict[str, Any]:
+    """Facts about what a loaded file holds, in numbers and text that JSON can hold; `kind` names what it is."""
+    if isinstance(held, Result):
+        return {"kind": "result", **held.summary()}
+    if isinstance(held, FramesFile):
+        return {"kind": "frames", **_of_frames(held)}
+    if isinstance(held, SequenceFile):
+        return {"kind": "sequence", **_of_sequence(held)}
+    if isinstance(held, AnalyticFile):
+        return {"kind": "analytic", **_of_analytic(held)}
+    if isinstance(held, FrameReader):
+        shards, targets = held.shards, list(held.manifest["targets"])
+        facts = {"name": held.manifest["name"], "folder": str(held.path)}
+        facts |= {"shards": shards if len(shards) == 1 else len(shards), "frames": len(held)}
+        return {"kind": "dataset", **facts, **_image(held.shape[1], held.shape[0]), "targets": targets}
+    ended = {name: int(np.count_nonzero(held.reason == number)) for number, name in enumerate(held.reasons)}
+    ended = {name: count for name, count in ended.items() if count}
+    return {"kind": "records", "photons": len(held.id), "ended": ended}
+
+
+def _of_frames(file: FramesFile) -> dict[str, Any]:
+    mean = [float(file.intensity(number).mean()) for number in range(file.frames)]
+    return {
+        **_common(file.scene, file, len(file.edges) - 1),
+        "pulses": file.pulses,
+        "gate_start_ns": 1e9 * file.gate_start,
+        "bin_width_ps": 1e12 * file.bin_width,
+        "period_ns": None if file.period is None else 1e9 * file.period,
+        "counts_per_pixel": float(np.mean(mean)) if mean else None,
+        "depth_by": list(file.methods),
+        "response_fwhm_ps": 1e12 * file.irf.fwhm,
+        **({} if file.channel == "I" else {"channel": file.channel}),
+    }
+
+
+def _of_sequence(file: SequenceFile) -> dict[str, Any]:
+    times = file.trajectory.times
+    return {
+        **_common(file.base, file, file.bins),
+        "pulses": file.pulses,
+        "times_s": [float(times[0]), float(times[-1])],
+        "moving": list(file.trajectory.fields),
+        "depth_by": list(file.methods),
+    }
+
+
+def _of_analytic(file: AnalyticFile) -> dict[str, Any]:
+    estimated, chosen = file.maps["fisher"] > 0, file.scene.analytic
+    medians = {
+        "signal_per_pulse": "signal",
+        "sigma_depth_m": "sigma_depth",
+        "outlier_probability": "outlier_probability",
+    }
+    return {
+        **_common(file.scene, file, file.scene.gate.bins),
+        **{name: getattr(chosen, name) for name in ("form", "backscatter", "count_law")},
+        "pixels_with_estimate": int(np.count_nonzero(estimated)),
+        **{
+            name: float(np.median(file.maps[field][estimated])) if estimated.any() else None
+            for name, field in medians.items()
+        },
+    }
+
+
+def _common(scene: Scene, file: FramesFile | SequenceFile | AnalyticFile, bins: int) -> dict[str, Any]:
+    return {
+        "scene": str(scene.source) if scene.source else None,
+        "frames": file.frames,
+        "seed": file.seed,
+        **_image(scene.camera.width, scene.camera.height),
+        "bins": bins,
+    }
+
+
+def _image(width: int, height: int) -> dict[str, Any]:
+    return {"image": {"width": width, "height": height}}

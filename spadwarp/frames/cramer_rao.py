@@ -26,16 +26,7 @@ spread exp(1.5), the bound is then 10 to 30 % too large, 40 to 80 % where noise 
 
 
 def crlb_from_histogram(
-    signal_cube: ArrayLike,
-    background_cube: ArrayLike,
-    *,
-    bin_width: float,
-    pulses: float,
-    irf: InstrumentResponse | float | ArrayLike | None = None,
-    law: Literal["poisson", "first_photon"] = "poisson",
-    signal_variance: ArrayLike | None = None,
-    signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
-    device: Any = None,
+    signal_cube: ArrayLike, background_cube: ArrayLike, *, bin_width: float, pulses: float, **options: Any
 ) -> Map:
     """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
 
@@ -43,21 +34,8 @@ def crlb_from_histogram(
     count as known.
 
     Args:
-        signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
-        background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
-        bin_width: [s], > 0.
+        signal_cube, background_cube, bin_width, options: See `information_from_histogram`.
         pulses: Of one depth frame, > 0.
-        irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
-            value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
-        law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
-        signal_variance: Square of the standard error of `signal_cube`, of the same shape, where it is a Monte Carlo
-            estimate. Its noise would count as information, and the bound would be too small: a slope that is a sum of
-            bins with weights w has Σ w² var more in the mean of its square, which is subtracted, for independent bins
-            and to first order: the bound comes out too large, by 10 to 30 % where half of the information is noise, by
-            a factor where nearly all of it is.
-        signal_halves: Two independent estimates whose mean is `signal_cube`, in place of `signal_variance`: a product
-            of their slopes has no noise in its mean, whatever the bins share.
-        device: Warp device; default: the first GPU, else the CPU.
 
     Returns:
         float64 `[...]` [s]; NaN where the histogram holds no information, inf where its noise makes up all of it.
@@ -66,17 +44,7 @@ def crlb_from_histogram(
         ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
     """
     pulses = check_real("pulses", pulses, "(0, 1e30]")
-    information, noise = information_from_histogram(
-        signal_cube,
-        background_cube,
-        bin_width=bin_width,
-        irf=irf,
-        law=law,
-        signal_variance=signal_variance,
-        signal_halves=signal_halves,
-        device=device,
-    )
-    return _deviation(information, noise, pulses)
+    return _deviation(*information_from_histogram(signal_cube, background_cube, bin_width=bin_width, **options), pulses)
 
 
 def _deviation(information: Map, noise: Map, pulses: float) -> Map:
@@ -97,11 +65,29 @@ def information_from_histogram(
     signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
     device: Any = None,
 ) -> tuple[Map, Map]:
-    """Fisher information on the delay per pulse, and what of it is noise of a Monte Carlo estimate, float64 `[...]`
+    """Fisher information on the delay per pulse, and its part that is noise of a Monte Carlo estimate, float64 `[...]`
     [1/s²].
 
     The noise is an estimate for all pixels together: in one pixel it may be larger than the information, or negative.
-    Arguments and errors as in `crlb_from_histogram`.
+
+    Args:
+        signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
+        background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
+        bin_width: [s], > 0.
+        irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
+            value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
+        law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
+        signal_variance: Square of the standard error of `signal_cube`, of the same shape, where it is a Monte Carlo
+            estimate. Its noise would count as information, and the bound would be too small: a slope that is a sum of
+            bins with weights w has Σ w² var more in the mean of its square, which is subtracted, for independent bins
+            and to first order: the bound comes out too large, by 10 to 30 % where half of the information is noise, by
+            a factor where nearly all of it is.
+        signal_halves: Two independent estimates whose mean is `signal_cube`, in place of `signal_variance`: a product
+            of their slopes has no noise in its mean, whatever the bins share.
+        device: Warp device; default: the first GPU, else the CPU.
+
+    Raises:
+        ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
     """
     import warp as wp
 
@@ -112,16 +98,16 @@ def information_from_histogram(
     bins = signal.shape[-1] if signal.ndim else 0
     if background.shape not in ((), (bins,), signal.shape) or signal.size == 0:
         raise ArgumentError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
-    for name, cube in (("signal_cube", signal), ("background_cube", background)):
-        _check_cube(name, cube, signal.shape if name == "signal_cube" else background.shape)
+    _check_cube("signal_cube", signal, signal.shape)
+    _check_cube("background_cube", background, background.shape)
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     check_choice("law", law, ("poisson", "first_photon"))
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
-    rows = background.reshape(-1, bins) if background.ndim else background.reshape(1, 1)
+    rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
     information = kernels.histogram_information(
         wp.array(signal.reshape(-1, bins), dtype=wp.float32, device=device),
-        wp.array(np.ascontiguousarray(rows), dtype=wp.float32, device=device),
+        wp.array(rows, dtype=wp.float32, device=device),
         wp.array(taps, dtype=wp.float64, device=device),
         wp.array(slope_taps, dtype=wp.float64, device=device),
         first_photon=law == "first_photon",
@@ -129,30 +115,30 @@ def information_from_histogram(
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:
-        first, second = (np.asarray(half, np.float64) for half in signal_halves)
-        for half in (first, second):
-            _check_cube("signal_halves", half, signal.shape)
+        first, second = (
+            _check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves
+        )
         # The product of two slopes is the square of their mean less the square of half their difference.
         noise = _information_of_noise(0.5 * (first - second).reshape(-1, bins), total, taps, slope_taps, law)
     elif signal_variance is not None:
-        variance = np.asarray(signal_variance, np.float64)
-        _check_cube("signal_variance", variance, signal.shape)
+        variance = _check_cube("signal_variance", np.asarray(signal_variance, np.float64), signal.shape)
         noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law, is_variance=True)
     shape = signal.shape[:-1]
     return information.reshape(shape) / bin_width**2, noise.reshape(shape) / bin_width**2
 
 
-def _check_cube(name: str, cube: NDArray[Any], shape: tuple[int, ...]) -> None:
+def _check_cube(name: str, cube: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     if cube.shape != shape:
         raise ArgumentError(f"{name} has shape {cube.shape}; {shape} is needed")
     if not (np.isfinite(cube).all() and (cube >= 0).all()):
         raise ArgumentError(f"{name} holds a value outside [0, inf)")
+    return cube
 
 
 def _information_of_noise(
     noise: Map, total: Map, taps: Map, slope_taps: Map, law: str, *, is_variance: bool = False
 ) -> Map:
-    """What noise adds to the mean of the Fisher information per pulse, in 1/bins²: noise of the bins, or the variance
+    """Noise in the mean of the Fisher information per pulse, in 1/bins²: noise of the bins, or the variance
     of bins that are independent."""
     from scipy.ndimage import convolve1d
 
@@ -213,7 +199,7 @@ def bound_of_result(
     )
     pulses = check_real("pulses", scene.pulses_per_depth_frame if pulses is None else pulses, "(0, 1e30]")
     known = (information > 0) & np.isfinite(result.truth.depth)
-    part_of_noise, problem = np.nan, None
+    problem, part_of_noise = None, np.nan
     if variance is not None and known.any():
         part_of_noise = float(np.median(noise[known] / information[known]))
     if part_of_noise > MOST_NOISE:

@@ -1,25 +1,193 @@
-"""Depth of histograms of any origin."""
+"""Depth frames: arrival times from histograms of counts, tallies or expected rates, and depth from these."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError
-from spadwarp.frames.estimators import Method, arrival_time
-from spadwarp.frames.measured import Histograms
-from spadwarp.limits import check_choice, check_real
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
+from spadwarp.errors import ArgumentError, kernel_errors
+from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
 from spadwarp.scene import Camera
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
 from spadwarp.units import path_from_time
 
 if TYPE_CHECKING:
+    from spadwarp.frames.measured import Histograms
     from spadwarp.result import Result
 
-__all__ = ["Reduction", "depth_frame", "depth_of"]
+__all__ = ["METHODS", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
+
+Method = Literal["peak", "centroid", "matched", "likelihood"]
+METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
+
+
+@kernel_errors()
+def arrival_time(
+    histogram: Any,
+    *,
+    gate_start: float,
+    bin_width: float,
+    method: Method = "centroid",
+    irf: Any = None,
+    device: Any = None,
+    background: Any = None,
+    gate: tuple[float, float] | None = None,
+) -> NDArray[np.float64]:
+    """Arrival time of the return in every pixel [s].
+
+    From a torch tensor comes a torch tensor, on its device.
+
+    Args:
+        histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
+            rates (float) in any unit, not negative.
+        gate_start: Time of the lower edge of bin 0 [s].
+        bin_width: [s], > 0.
+        method: `"peak"`: centre of the largest bin. `"centroid"`: mean about the peak, over ± 1.5 FWHM of `irf` (± 3
+            bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
+            where there is no background. `"likelihood"`: argmax over μ and the signal S of
+            Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
+        irf: Instrument response: an `InstrumentResponse`, or an array of response per bin, whose time zero is then its
+            mean. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its
+            mode and its mean.
+        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+        background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
+            number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
+            does not use it.
+        gate: (start, stop) [s]: only bins whose centres lie in it are used.
+
+    Returns:
+        float64, `histogram.shape[:-1]`, in the histogram's own time [s]. NaN: nothing returned in the gate, or nothing
+        above the background.
+
+    Raises:
+        ArgumentError: Names the argument, its value and what is allowed.
+    """
+    from spadwarp_kernels import detection as kernels
+
+    check_choice("method", method, METHODS)
+    gate_start = check_real("gate_start", gate_start, TIME)
+    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
+    filtered = method in ("matched", "likelihood")
+    if irf is None and filtered:
+        raise ArgumentError(
+            f"method = {method!r} needs an irf, the instrument response of the histogram: an InstrumentResponse, or an "
+            "array of response per bin. Histograms of `simulate` have none yet: `detect` adds it, or take 'centroid'"
+        )
+
+    with in_torch_order(histogram, background):
+        rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
+        frame, bins = shape[:-1], shape[-1]
+        first, stop = (0, bins) if gate is None else _bins_of_gate(gate, gate_start, bin_width, bins)
+        response, lowest_tap, half_width, offset = None, 0, 3, 0.0
+        if irf is not None:
+            mean, mode, fwhm = _moments(irf, bin_width)
+            half_width = max(1, int(np.ceil(1.5 * fwhm)))
+            offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
+        if filtered:
+            response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
+        bins_from_start = kernels.arrival_bins(
+            rows,
+            method=method,
+            background=None if background is None else _background_rows(background, rows, frame),
+            response=response,
+            lowest_tap=lowest_tap,
+            first=first,
+            stop=stop,
+            half_width=half_width,
+        )
+        position: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
+    position = position.double() if is_torch(position) else position.astype(np.float64)
+    return gate_start + (position.reshape(frame) - offset) * bin_width
+
+
+def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float, bins: int) -> tuple[int, int]:
+    """The bins [first, stop) whose centres lie in the gate."""
+    if not (isinstance(gate, tuple | list) and len(gate) == 2):
+        raise ArgumentError(f"gate = {shown(gate)} is not (start [s], stop [s])")
+    # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
+    edges = [(check_real("gate", time, "[-inf, inf]") - gate_start) / bin_width - 0.5 for time in gate]
+    first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
+    if first >= stop:
+        end = gate_start + bins * bin_width
+        raise ArgumentError(f"gate = {gate} s holds no bin of the histogram's [{gate_start}, {end}) s")
+    return first, stop
+
+
+def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
+    """float32 `[1 or pixels of a frame, 1 or T]` on the histogram's device."""
+    import warp as wp
+
+    bins = rows.shape[1]
+    if not is_torch(background) and not (isinstance(background, wp.array) and background.dtype == wp.float32):
+        background = real_array("background", background.numpy() if isinstance(background, wp.array) else background)
+    shape = tuple(background.shape)
+    if shape not in ((), (bins,), *((*frame[i:], last) for i in range(len(frame)) for last in (bins, 1))):
+        raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
+    flat = background.float() if is_torch(background) else background
+    return histogram_rows(flat.reshape((-1, shape[-1] if shape else 1)), name="background", device=rows.device)[0]
+
+
+def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
+    """Mean, mode and FWHM of the response [bins], relative to its time zero."""
+    if hasattr(irf, "cumulative"):
+        return irf.mean / bin_width, irf.mode / bin_width, irf.fwhm / bin_width
+    weights = _array_response(irf)
+    taps = np.arange(weights.size)
+    mean = float(weights @ taps)
+    top = np.flatnonzero(weights == weights.max())
+    half = np.flatnonzero(weights >= 0.5 * weights.max())
+    return 0.0, float(top.mean()) - mean, float(half[-1] - half[0] + 1)
+
+
+def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
+    """Fraction of the response per bin for returns at every sub-bin phase, and the bin of the first tap."""
+    if hasattr(irf, "cumulative"):
+        lower, upper = (edge / bin_width for edge in irf.support)
+
+        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return irf.cumulative(x * bin_width)
+    else:
+        weights = _array_response(irf)
+        zero = float(weights @ (np.arange(weights.size) + 0.5))
+        lower, upper = -zero, weights.size - zero
+        knots = np.arange(weights.size + 1) - zero
+        curve = _monotone_cubic(knots, np.concatenate([[0.0], np.cumsum(weights)]))
+
+        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return curve(np.clip(x, lower, upper))
+
+    lowest = int(np.floor(lower))
+    taps = int(np.ceil(upper)) + 1 - lowest
+    shift = np.arange(phases)[:, None] / phases
+    edges = lowest + np.arange(taps + 1)[None, :] - shift
+    return np.clip(np.diff(cumulative(edges), axis=1), 0.0, None), lowest
+
+
+def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
+    weights = real_array("irf", irf, np.float64)
+    if weights.ndim != 1 or weights.size == 0:
+        raise ArgumentError(f"irf has shape {weights.shape}; one value per bin is needed")
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+        raise ArgumentError("irf must be finite and not negative, and its sum larger than 0")
+    return weights / weights.sum()
+
+
+def _monotone_cubic(x: NDArray[np.floating], y: NDArray[np.floating]) -> Any:
+    """Cubic Hermite curve through increasing data that stays increasing (Fritsch and Butland 1984)."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    rise = np.diff(y) / np.diff(x)
+    both = rise[:-1] * rise[1:]
+    inner = np.divide(2.0 * both, rise[:-1] + rise[1:], out=np.zeros_like(both), where=both > 0)
+    return CubicHermiteSpline(x, y, np.concatenate([[0.0], inner, [0.0]]))
+
+
+# Depth
 
 
 def depth_frame(
@@ -72,6 +240,12 @@ class Reduction:
     def first(self) -> NDArray[np.float64]:
         """The first frame, `[H, W]` [m]."""
         return self.values[0]
+
+    def plot(self, path: str | Path, **options: Any) -> Path:
+        """Draws the first frame beside its intensity; returns the path; `options` as of `spadwarp.viz.draw_depth`."""
+        import spadwarp
+
+        return spadwarp.viz.draw_depth(self.first, self.intensity[0], path, **options)
 
 
 def depth_of(

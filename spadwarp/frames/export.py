@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
+from spadwarp.io.paths import atomic_path
+from spadwarp.io.text import write_text
+from spadwarp.limits import check_integer
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
+from spadwarp.transport import truth_maps
 from spadwarp.units import time_from_path
 
-__all__ = ["FrameSequence", "SequenceFrame", "exr_metadata", "write_exr_frame", "write_mat", "write_npy", "write_ptu"]
+__all__ = [
+    "FrameSequence",
+    "SequenceFrame",
+    "exr_metadata",
+    "write_exr_frame",
+    "write_mat",
+    "write_npy",
+    "write_ptu",
+    "write_sensor_fusion",
+]
 
 _LARGEST_VARIABLE = 2**31 - 1  # bytes of one array in a MATLAB 5 file
 _LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
@@ -55,8 +68,8 @@ class SequenceFrame:
     def true_bins(self) -> NDArray[np.float64]:
         """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
         assert self.scene is not None and self.depth is not None and self.counts is not None
-        found = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
-        return np.where((found >= 1) & (found <= self.counts.shape[-1]), found, 0.0)
+        bins = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
+        return np.where((bins >= 1) & (bins <= self.counts.shape[-1]), bins, 0.0)
 
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
@@ -77,7 +90,6 @@ class FrameSequence:
         name: What to call the source in an error.
         count: Of the frames.
         frame: Number of a frame, from 0 → the frame.
-        largest_count: Of a pixel in any frame, if that is known.
         same_scene: Number of a frame → numbers of the frames of the same scene, itself included; None where frames have
             counts.
     """
@@ -85,7 +97,6 @@ class FrameSequence:
     name: str
     count: int
     frame: Callable[[int], SequenceFrame]
-    largest_count: int | None = None
     same_scene: Callable[[int], range] | None = None
 
     def at(self, number: int) -> SequenceFrame:
@@ -121,10 +132,9 @@ def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
 
 
 def write_mat(
-    frames: FrameSequence, path: Path, number: int, *, more: Mapping[str, NDArray[Any]] | None = None
+    frames: FrameSequence, path: Path, number: int, *, extra: Mapping[str, NDArray[Any]] | None = None
 ) -> Path:
     """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `more`: further ones."""
-    from scipy.io import savemat
     from scipy.sparse import csc_matrix
 
     frame, counts = frames.with_counts(number, ".mat")
@@ -154,8 +164,14 @@ def write_mat(
         "mean_signal_photons": photons,
         "mean_background_photons": frame.background,
         "pulses": float(frame.pulses),
-        **(more or {}),
+        **(extra or {}),
     }
+    return _save_mat(path, variables)
+
+
+def _save_mat(path: Path, variables: Mapping[str, Any]) -> Path:
+    from scipy.io import savemat
+
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         savemat(file, variables, do_compression=True)
     return path
@@ -174,9 +190,7 @@ def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     height, width, bins = counts.shape
     if bins > _LARGEST_DTIME:
         raise FileError(f"{path}: {bins} bins are more than the {_LARGEST_DTIME} of a T3 record")
-    most = frames.largest_count
-    if most is None:
-        most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
+    most = max(int(frames.with_counts(number, ".ptu")[1].sum(axis=-1).max()) for number in chosen)
     sync = max(first.period or 0.0, bins * first.bin_width)
     # A pixel lasts long enough for its detections, one a sync.
     pixel_time = sync * max(most, 1)
@@ -228,3 +242,67 @@ def exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | flo
     if scene is not None:
         metadata |= {"pixel_tangent": scene.camera.pixel_tangent, "config": scene.to_toml()}
     return metadata
+
+
+# Sensor fusion
+
+
+def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: range, factor: int) -> list[Path]:
+    """Frames with counts, of scenes whose targets are meshes, and their camera images; see `spadwarp.files`'
+    `export_sensor_fusion`."""
+    factor = check_integer("factor", factor, "[1, 64]")
+    listed, written = [], []
+    images: dict[Scene, dict[str, Any]] = {}
+    for number in chosen:
+        frame, _ = frames.with_counts(number, "sensor fusion")
+        if frame.scene is None or not frame.scene.targets:
+            raise ArgumentError(f"{frames.name}: frame {number} has no scene of meshes to take a finer image of")
+        if frame.scene not in images:
+            images = {frame.scene: _camera_image(frame, factor)}  # frames of one scene follow each other
+        image = images[frame.scene]
+        name = f"{stem}-{number:05}"
+        intensity = folder / "intensity" / f"{name}.mat"
+        _save_mat(intensity, {"intensity": image["intensity"]})
+        spad = folder / "spad" / f"{name}_p1.mat"
+        write_mat(frames, spad, number, extra={"bin_hr": image["bin_hr"]})
+        listed.append(os.path.abspath(intensity))
+        written += [intensity, spad]
+    path = folder / f"{stem}.txt"
+    write_text("".join(f"{name}\n" for name in listed), path)
+    return [*written, path]
+
+
+def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
+    """Truth of a camera with `factor`² pixels in each pixel of the frame's."""
+    assert frame.scene is not None and frame.counts is not None
+    scene, bins = _finer(frame.scene, factor), frame.counts.shape[-1]
+    truth = truth_maps(scene, device="cpu")
+    position = frame.bins_of(scene, truth.depth)
+    inside = (position >= 0) & (position < bins)
+    cosine = -np.einsum("hwi,hwi->hw", truth.normal, lines_of_sight(scene).direction)
+    light = np.nan_to_num(truth.reflectance * np.clip(cosine, 0.0, 1.0))
+    return {
+        "bin_hr": np.where(inside, np.clip(position + 0.5, 1.0, bins), 0.0),
+        "intensity": (255.0 * light / max(float(light.max()), 1e-300)).astype(np.float32),
+    }
+
+
+def _finer(scene: Scene, factor: int) -> Scene:
+    """The scene by a camera of the same place and view with `factor` times as many pixels each way."""
+    camera, tables = scene.camera, scene.to_dict()
+    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
+    tables["camera"] = {
+        "width": factor * camera.width,
+        "height": factor * camera.height,
+        "fx": factor * fx,
+        "fy": factor * fy,
+        "cx": factor * column - 0.5,
+        "cy": factor * row - 0.5,
+        "distortion": list(camera.distortion),
+        "position": list(camera.position),
+        "rotation_deg": list(camera.rotation_deg),
+        "pinhole": True,
+        "aperture_diameter": 0.01,
+    }
+    tables.pop("scan", None)
+    return Scene.from_dict(tables, source=scene.source)

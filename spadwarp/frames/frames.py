@@ -1,19 +1,82 @@
-"""Frames of a SPAD camera in memory: counts, what they were drawn from, time tags."""
+"""Frames of a SPAD camera in memory: counts, what they were drawn from, time tags; and the law of their pile-up."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.arrays import is_torch
-from spadwarp.frames.estimators import Method, arrival_time
-from spadwarp.frames.pile_up import coates
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, tensor_of
+from spadwarp.errors import ArgumentError
+from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse
+from spadwarp.interop import Variable, labelled
+from spadwarp.io.hdf5 import PIXELS, image_coordinates
+from spadwarp.limits import check_integer
 
-__all__ = ["Frames", "TimeTags"]
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["Frames", "TimeTags", "coates", "first_photon_probabilities", "to_xarray"]
+
+
+def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np.float64]:
+    """Law of first-photon counting, with pile-up: P(k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)); same shape as `hazard` (λ).
+
+    Args:
+        hazard: Expected detections per pulse and bin `[..., T]`, not negative; NumPy, torch or Warp.
+        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+    """
+    import warp as wp
+
+    from spadwarp_kernels import detection as kernels
+
+    with in_torch_order(hazard):
+        rows, shape = histogram_rows(hazard, name="hazard", device=device)
+        if rows.dtype not in (wp.float32, wp.float64):
+            rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
+        law = kernels.first_photon_probabilities(rows)
+        values: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
+    return values.reshape(shape)
+
+
+def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float64]:
+    """Coates' correction of first-photon counts: λ̂_k = −ln(1 − n_k / (pulses − Σ_{j<k} n_j)), same shape as `counts`.
+
+    NaN from the bin on that takes the last pulse. Source: P. B. Coates, J. Phys. E 1, 878 (1968).
+
+    Args:
+        counts: Integers `[..., T]`, not negative; NumPy, torch or Warp.
+        pulses: Pulses of each histogram, which may hold no more counts than that.
+        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+    """
+    import warp as wp
+
+    from spadwarp_kernels import detection as kernels
+
+    with in_torch_order(counts):
+        rows, shape = histogram_rows(counts, name="counts", device=device)
+        if rows.dtype not in (wp.int32, wp.int64):
+            raise ArgumentError(f"counts are {rows.dtype.__name__}; integers are needed")
+        values = rows.numpy()
+        if values.max() > 2**31 - 1:
+            raise ArgumentError(f"counts = {values.max()} is above {2**31 - 1}")
+        pulses = check_integer("pulses", pulses, "[1, 9007199254740992]")
+        most = int(values.sum(axis=1, dtype=np.int64).max())
+        if most > pulses:
+            raise ArgumentError(
+                f"pulses = {pulses} is below the {most} counts of a histogram: it has seen more than one a pulse"
+            )
+        if rows.dtype != wp.int32:
+            rows = wp.array(values.astype(np.int32), dtype=wp.int32, device=rows.device)
+        corrected = kernels.coates(rows, pulses=pulses)
+        result: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
+    return result.reshape(shape)
+
+
+# Frames
 
 
 class TimeTags(NamedTuple):
@@ -28,7 +91,7 @@ class TimeTags(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Frames:
-    """What the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
+    """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
 
     Attributes:
         counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
@@ -142,3 +205,43 @@ class Frames:
             gate=gate,
             device=device,
         )
+
+
+# Labelled arrays
+
+
+def to_xarray(frames: Frames) -> xarray.Dataset:
+    """Counts, and the expectation that they were drawn from, as an xarray data set with coordinates and units.
+
+    `counts` has the dimensions (frame, y, x, time), without frame where they are added up; `expected` and `background`
+    are detections per pulse and bin before pile-up. Torch tensors are copied to the host.
+
+    Raises:
+        FileError: xarray is not installed.
+    """
+    counts, expected = on_host(frames.counts), on_host(frames.expected)
+    background = np.broadcast_to(on_host(frames.background), expected.shape)
+    height, width, _ = expected.shape
+    cube = ("y", "x", "time")
+    variables: dict[str, Variable] = {
+        "counts": (cube if frames.summed else ("frame", *cube), counts, "1", "detections in the bin"),
+        "expected": (cube, expected, "1", "expected detections per pulse and bin before pile-up"),
+        "background": (cube, background, "1", "the part of `expected` that is not target"),
+    }
+    edges = frames.gate_start + frames.edges
+    coordinates: dict[str, Variable] = {
+        "time": (("time",), 0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
+        "bin_width": (("time",), np.diff(edges), "s", "width of the bin"),
+        **{name: ((name,), *image_coordinates(height, width)[name]) for name in PIXELS},
+    }
+    if not frames.summed:
+        numbers = np.arange(frames.first_frame, frames.first_frame + frames.frames)
+        coordinates["frame"] = (("frame",), numbers, "1", "number of the frame")
+    attributes = {
+        "pulses": frames.exposure,
+        "seed": str(frames.seed),
+        "period": np.inf if frames.period is None else frames.period,
+        "response_fwhm": frames.irf.fwhm,
+        "notes": list(frames.notes),
+    }
+    return labelled(variables, coordinates, attributes)

@@ -5,36 +5,44 @@ What a measured file does not say is asked for by name, or assumed with a warnin
 
 from __future__ import annotations
 
+import logging
 import math
+import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
-from spadwarp.frames.axes import image_shape, to_frames
 from spadwarp.frames.file import FramesFile, is_frames_file
-from spadwarp.frames.ptu import read_ptu
 from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.frames.time_tags import histogram_of_tags, most_values
+from spadwarp.io.arrays import read_npy
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5
-from spadwarp.io.mat import MatEntry, SparseMatrix, mat_entries, read_mat
-from spadwarp.io.npy import read_npy
+from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
-from spadwarp.limits import check_real
+from spadwarp.limits import check_real, shown
 from spadwarp.result.file import load_result
 from spadwarp.result.received import Channel, received
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["ENDINGS", "Histograms", "histograms_in", "is_own", "listed_arrays", "read_histograms", "unnamed_dataset"]
+__all__ = ["Histograms", "read_histograms"]
 
 ENDINGS = (".h5", ".hdf5", ".npy", ".mat", ".ptu")
+"""Of files that may hold histograms."""
+
+_LEAST_BINS = 8  # of a histogram that is worth one
+_CLEARLY = 2.0  # as far from a square as the other order of axes, and the choice is clear
+_MOST_BINS = 1_000_000  # as of a scene's gate
+_MOST_VALUES = 1 << 29  # 2 GiB of counts
+_MARKERS = 16  # of T3 records; four today
+# What ptufile says about a damaged file stands in our errors, too.
+logging.getLogger("ptufile").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,9 +76,8 @@ class Histograms:
         return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """What the caller says about a file, as in `read_histograms`."""
+class _Request(NamedTuple):
+    """Facts that the caller states about a file, as in `read_histograms`."""
 
     dataset: str | None
     axes: str | None
@@ -80,16 +87,15 @@ class _Asked:
     sum_frames: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Raw:
-    """Histograms as they stand in a file, in their own order of axes, with what the file says."""
+class _Raw(NamedTuple):
+    """Histograms as they stand in a file, in their own order of axes, and the facts in the file."""
 
     values: NDArray[Any]
-    bin_width: float | None = None
-    first: float = 0.0  # begin of bin 0 after the time from which the file counts [s]
-    gate_start: float | None = None  # time of flight at that time [s]
-    ordered: bool = False  # whether the axes are `[H, W, T]` or `[frames, H, W, T]`
     notes: tuple[str, ...] = ()
+    bin_width: float | None = None
+    gate_start: float | None = None  # time of flight at the time from which the file counts [s]
+    first: float = 0.0  # begin of bin 0 after that time [s]
+    ordered: bool = False  # whether the axes are `[H, W, T]` or `[frames, H, W, T]`
 
 
 def read_histograms(
@@ -139,27 +145,27 @@ def read_histograms(
             check_real(f"{name} [s]", value, "(0, 0.001)")
     if gate_start is not None:
         check_real("gate_start [s]", gate_start, "[-1, 1]")
-    asked = _Asked(
-        dataset=dataset, axes=axes, image_size=image_size, tag_unit=tag_unit, bin_width=bin_width, sum_frames=sum_frames
-    )
+    request = _Request(dataset, axes, image_size, tag_unit, bin_width, sum_frames)
     ending = path.suffix.lower()
-    if ending in (".h5", ".hdf5") and is_own(path):
-        given = {**vars(asked), "gate_start": gate_start, "irf": irf}
-        if clash := [name.replace("_", " ") for name, value in given.items() if value]:
+    if ending in (".h5", ".hdf5") and _is_own(path):
+        arguments = {**request._asdict(), "gate_start": gate_start, "irf": irf}
+        if clash := [name.replace("_", " ") for name, value in arguments.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    raw = _read(path, ending, asked)
+    raw = _read(path, ending, request)
+    _check(raw.values, path)
     values, notes = raw.values, list(raw.notes)
-    _check(values, path)
     if not raw.ordered:
-        values, said = to_frames(values, axes)
-        notes += [] if said is None else [said]
+        values, note = _ordered(values, axes)
+        notes += note
     elif axes is not None:
         raise ArgumentError(f"{path}: the file has its own axes")
-    values, said = _counts_or_rates(values)
-    notes += [] if said is None else [said]
+    if values.dtype.kind == "f":  # as MATLAB writes counts
+        whole = values.max() < 2**31 and np.array_equal(values, np.rint(values))
+        values = values.astype(np.int32) if whole else values
+        notes.append("counts: every value is whole" if whole else "rates: not every value is whole")
     if values.ndim == 4 and sum_frames:
         values = values.sum(axis=0, dtype=np.int64 if values.dtype.kind in "iu" else np.float64)
     if gate_start is None and raw.gate_start is None:
@@ -176,10 +182,7 @@ def read_histograms(
     )
 
 
-# Kinds of files
-
-
-def is_own(path: Path) -> bool:
+def _is_own(path: Path) -> bool:
     """Whether spadwarp wrote this HDF5 file."""
     return (hdf5_format(path) or "").startswith("spadwarp")
 
@@ -210,127 +213,24 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
     )
 
 
-def _read(path: Path, ending: str, asked: _Asked) -> _Raw:
-    readers: dict[str, Callable[[Path, _Asked], _Raw]] = {
+def _read(path: Path, ending: str, request: _Request) -> _Raw:
+    readers: dict[str, Callable[[Path, _Request], _Raw]] = {
         ".h5": _read_hdf5,
         ".hdf5": _read_hdf5,
-        ".npy": lambda path, asked: _Raw(values=read_npy(path)),
+        ".npy": lambda path, request: _Raw(read_npy(path)),
         ".mat": _read_mat,
         ".ptu": _read_ptu,
     }
     if ending not in readers:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
     try:
-        return readers[ending](path, asked)
+        return readers[ending](path, request)
     except (SpadwarpError, MemoryError):
         raise
     except ModuleNotFoundError as error:
         raise FileError(f"{path}: reading it needs {error.name}: pip install 'spadwarp[formats]'") from error
     except Exception as error:  # what a reader raises depends on the format
         raise FileError(f"{path}: damaged or not readable: {error}") from error
-
-
-def listed_arrays(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> str:
-    """Names and shapes of arrays, as an error lists them."""
-    return ", ".join(f"{name} {shape}" for name, (shape, _) in arrays.items()) or "nothing"
-
-
-def unnamed_dataset(path: Path, listed: str) -> ArgumentError:
-    """The error for a file of several arrays of which none was named."""
-    return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
-
-
-def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
-    with read_hdf5(path) as file:
-        arrays = file.arrays()
-        listed = listed_arrays(arrays)
-        cubes = [name for name, (shape, dtype) in arrays.items() if len(shape) in (3, 4) and dtype.kind in "biuf"]
-    name = asked.dataset or (cubes[0] if len(cubes) == 1 else None)
-    if name is None and not cubes:
-        raise FileError(f"{path}: no array of 3 or 4 dimensions; it holds {listed}")
-    if name is None:
-        raise unnamed_dataset(path, listed)
-    if name not in arrays:
-        raise FileError(f"{path}: no array {name!r}; it holds {listed}")
-    shape, dtype = arrays[name]
-    most_values(shape, "a part of the array")
-    with read_hdf5(path) as file:
-        return _Raw(values=file.array(name, dtype, shape), notes=() if asked.dataset else (f"reads {name}",))
-
-
-def _read_mat(path: Path, asked: _Asked) -> _Raw:
-    entries = mat_entries(path)
-    found = histograms_in(entries)
-    listed = ", ".join(f"{name} {one.shape} {one.kind}" for name, one in entries.items()) or "no numbers"
-    name = asked.dataset or (found[0] if found else None)
-    if name is None:
-        raise FileError(f"{path}: no array of 3 or 4 dimensions, sparse matrix or cells; it holds {listed}")
-    if name not in entries:
-        raise FileError(f"{path}: no array {name!r}; it holds {listed}")
-    entry, notes = (
-        entries[name],
-        [] if asked.dataset or len(found) == 1 else [f"reads {name}, not {', '.join(found[1:])}"],
-    )
-    if entry.kind == "dense":
-        most_values(entry.shape, "a part of the array")
-    value = read_mat(path, name, entry)
-    facts = {
-        key: float(np.asarray(read_mat(path, key, entries[key])).ravel()[0])
-        for key in ("bin_size", "gate_start")
-        if key in entries and entries[key].kind == "dense" and math.prod(entries[key].shape) == 1
-    }
-    width = facts.get("bin_size")
-    width = width if width is not None and 1e-15 < width < 1e-3 else None
-    if entry.kind == "cell":
-        if asked.tag_unit is None:
-            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (--tag-unit-ps)")
-        counts, step, first = histogram_of_tags(np.asarray(value), unit=asked.tag_unit, bin_width=asked.bin_width)
-        notes.append(
-            f"time tags of {counts.shape[1]} x {counts.shape[0]} pixels, bins of {step * 1e12:g} ps from tag {first}"
-        )
-        return _Raw(values=counts, bin_width=step, first=first * asked.tag_unit, ordered=True, notes=tuple(notes))
-    if asked.bin_width is None and width is not None:
-        notes.append(f"bin width {width * 1e12:g} ps from bin_size")
-    common: dict[str, Any] = {"bin_width": width, "gate_start": facts.get("gate_start")}
-    if isinstance(value, SparseMatrix):
-        shapes = [one.shape for one in entries.values() if one.kind == "dense"]
-        height, across = image_shape(value.shape[0], asked.image_size, shapes)
-        notes.append(f"{across} x {height} pixels, column by column")
-        return _Raw(values=_dense(value, height, across), ordered=True, notes=tuple(notes), **common)
-    return _Raw(values=value, notes=tuple(notes), **common)
-
-
-def histograms_in(entries: Mapping[str, MatEntry]) -> list[str]:
-    """Variables that may hold histograms, counts before rates: sparse matrices, cells, arrays by their size."""
-    rank = {"sparse": 0, "cell": 1, "dense": 2}
-    fits = [
-        name
-        for name, (kind, shape) in entries.items()
-        if math.prod(shape) > 1 and (kind != "dense" or len(shape) in (3, 4))
-    ]
-    return sorted(fits, key=lambda name: (rank[entries[name].kind], -math.prod(entries[name].shape)))
-
-
-def _dense(matrix: SparseMatrix, height: int, width: int) -> NDArray[Any]:
-    """`[H, W, T]` of a matrix `[pixels, T]` whose pixels stand column by column, as in MATLAB."""
-    bins = matrix.shape[1]
-    most_values((height, width, bins), "a part of the image")
-    whole = bool((matrix.value == np.rint(matrix.value)).all() and (np.abs(matrix.value) < 2**31).all())
-    cube = np.zeros((height, width, bins), np.int32 if whole else np.float32)
-    column, row = np.divmod(matrix.row, height)
-    cube[row, column, matrix.column] = matrix.value
-    return cube
-
-
-def _read_ptu(path: Path, asked: _Asked) -> _Raw:
-    counts, width, start, text = read_ptu(path, image_size=asked.image_size, sum_frames=asked.sum_frames)
-    notes = [text]
-    if counts.ndim == 4:
-        notes.append(f"{len(counts)} frames; --sum-frames adds them up")
-    return _Raw(values=counts, bin_width=width, gate_start=start, ordered=True, notes=tuple(notes))
-
-
-# Values
 
 
 def _check(values: NDArray[Any], path: Path) -> None:
@@ -344,10 +244,346 @@ def _check(values: NDArray[Any], path: Path) -> None:
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
 
 
-def _counts_or_rates(values: NDArray[Any]) -> tuple[NDArray[Any], str | None]:
-    """Integers of floats that are all whole, as MATLAB writes counts; what was found, in words."""
-    if values.dtype.kind != "f":
-        return values, None
-    if values.max() < 2**31 and np.array_equal(values, np.rint(values)):
-        return values.astype(np.int32), "counts: every value is whole"
-    return values, "rates: not every value is whole"
+def _check_size(shape: Sequence[int], instead: str) -> None:
+    """Refuses histograms that would not fit: `ArgumentError` that says what would help."""
+    if math.prod(shape) > _MOST_VALUES:
+        sizes = " x ".join(map(str, shape))
+        raise ArgumentError(f"{sizes} counts are more than {_MOST_VALUES}, which can be held; {instead} would help")
+
+
+# The order of the axes: given, or inferred where there is one answer alone
+
+
+def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list[str]]:
+    """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred.
+
+    Raises `ArgumentError` for letters that do not fit, or an order that is missing because two are plausible.
+    """
+    letters, notes = "yxt" if values.ndim == 3 else "nyxt", []
+    if axes is None:
+        axes = _inferred(values.shape, letters)
+        notes = [f"axes: {_in_words(values.shape, axes)} (--axes {axes})"]
+    elif sorted(axes) != sorted(letters):
+        raise ArgumentError(f"axes = {axes!r} are not the letters of {letters} in any order, for shape {values.shape}")
+    return np.transpose(values, [axes.index(letter) for letter in letters]), notes
+
+
+def _inferred(shape: tuple[int, ...], letters: str) -> str:
+    """Bins last or, before the image, first: the order whose image is clearly nearer to a square."""
+    orders = (letters, letters.replace("yxt", "tyx"))
+    plausible = {}
+    for order in orders:
+        sizes = dict(zip(order, shape, strict=True))
+        if sizes["t"] >= _LEAST_BINS:
+            plausible[order] = max(sizes["y"], sizes["x"]) / max(min(sizes["y"], sizes["x"]), 1)
+    best = sorted(plausible, key=lambda order: plausible[order])
+    if len(best) == 1 or (best and plausible[best[0]] * _CLEARLY <= plausible[best[1]]):
+        return best[0]
+    raise ArgumentError(
+        f"the order of the axes is missing (--axes): shape {shape} may be "
+        + " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
+    )
+
+
+def _in_words(shape: tuple[int, ...], axes: str) -> str:
+    size = dict(zip(axes, shape, strict=True))
+    frames = f"{size['n']} frames of " if "n" in size else ""
+    return f"{frames}{size['x']} x {size['y']} pixels, {size['t']} bins"
+
+
+# Arrays by their names, in HDF5 files of others and in MATLAB's
+
+
+def _named(path: Path, dataset: str | None, names: Sequence[str], candidates: Sequence[str], listed: str) -> str:
+    """The dataset that was asked for, else the first that was found. Raises `FileError` if it is not there."""
+    if dataset is None and not candidates:
+        others = ", sparse matrix or cells" if path.suffix.lower() == ".mat" else ""
+        raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {listed}")
+    name = dataset or candidates[0]
+    if name not in names:
+        raise FileError(f"{path}: no array {name!r}; it holds {listed}")
+    return name
+
+
+def _unnamed(path: Path, listed: str) -> ArgumentError:
+    """The error for a file of several arrays of which none was named."""
+    return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
+
+
+def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
+
+
+def _numeric_shapes(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> dict[str, tuple[int, ...]]:
+    return {name: shape for name, (shape, dtype) in arrays.items() if dtype.kind in "biuf"}
+
+
+def _read_hdf5(path: Path, request: _Request) -> _Raw:
+    with read_hdf5(path) as file:
+        arrays = file.arrays()
+    listed = _listed({name: shape for name, (shape, _) in arrays.items()})
+    cubes = [name for name, shape in _numeric_shapes(arrays).items() if len(shape) in (3, 4)]
+    if request.dataset is None and len(cubes) > 1:
+        raise _unnamed(path, listed)
+    name = _named(path, request.dataset, list(arrays), cubes, listed)
+    shape, dtype = arrays[name]
+    _check_size(shape, "a part of the array")
+    with read_hdf5(path) as file:
+        return _Raw(file.array(name, dtype, shape), () if request.dataset else (f"reads {name}",))
+
+
+def _read_mat(path: Path, request: _Request) -> _Raw:
+    with open_mat(path) as variables:
+        listed = (
+            ", ".join(f"{name} {variable.shape} {variable.kind}" for name, variable in variables.items())
+            or "no numbers"
+        )
+        candidates = _histograms_in(variables)
+        name = _named(path, request.dataset, list(variables), candidates, listed)
+        chosen = variables[name]
+        if chosen.kind == "dense":
+            _check_size(chosen.shape, "a part of the array")
+        value = chosen.read()
+        facts = {
+            key: float(np.asarray(variables[key].read()).ravel()[0])
+            for key in ("bin_size", "gate_start")
+            if key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
+        }
+        shapes = [variable.shape for variable in variables.values() if variable.kind == "dense"]
+    notes = [] if request.dataset or len(candidates) == 1 else [f"reads {name}, not {', '.join(candidates[1:])}"]
+    if chosen.kind == "cell":
+        if request.tag_unit is None:
+            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (--tag-unit-ps)")
+        return _of_tags(value, request.tag_unit, request.bin_width, notes)
+    width = facts.get("bin_size")
+    width = width if width is not None and 1e-15 < width < 1e-3 else None
+    if request.bin_width is None and width is not None:
+        notes.append(f"bin width {width * 1e12:g} ps from bin_size")
+    if isinstance(value, SparseMatrix):
+        height, across = _image_shape(value.shape[0], request.image_size, shapes)
+        notes.append(f"{across} x {height} pixels, column by column")
+        cube = _dense(value, height, across)
+        return _Raw(cube, tuple(notes), width, facts.get("gate_start"), ordered=True)
+    return _Raw(value, tuple(notes), width, facts.get("gate_start"))
+
+
+def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
+    """Variables that may hold histograms, counts before rates: sparse matrices, cells, arrays by their size."""
+    rank = {"sparse": 0, "cell": 1, "dense": 2}
+    fits = {
+        name: (rank[variable.kind], -math.prod(variable.shape))
+        for name, variable in variables.items()
+        if math.prod(variable.shape) > 1 and (variable.kind != "dense" or len(variable.shape) in (3, 4))
+    }
+    return sorted(fits, key=lambda name: fits[name])
+
+
+def _image_shape(pixels: int, image_size: tuple[int, int] | None, shapes: list[tuple[int, ...]]) -> tuple[int, int]:
+    """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many.
+
+    Raises `ArgumentError` where none or several do.
+    """
+    if image_size is not None:
+        height, width = image_size
+        if height * width != pixels:
+            raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
+        return image_size
+    fitting = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
+    if len(fitting) != 1:
+        raise ArgumentError(f"the image's size is missing (--image-size): {pixels} pixels, one after the other")
+    (height, width), *_ = fitting
+    return height, width
+
+
+def _dense(matrix: SparseMatrix, height: int, width: int) -> NDArray[Any]:
+    """`[H, W, T]` of a matrix `[pixels, T]` whose pixels stand column by column, as in MATLAB."""
+    bins = matrix.shape[1]
+    _check_size((height, width, bins), "a part of the image")
+    whole = bool((matrix.value == np.rint(matrix.value)).all() and (np.abs(matrix.value) < 2**31).all())
+    cube = np.zeros((height, width, bins), np.int32 if whole else np.float32)
+    column, row = np.divmod(matrix.row, height)
+    cube[row, column, matrix.column] = matrix.value
+    return cube
+
+
+def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: list[str]) -> _Raw:
+    """Counts from the tags of each pixel `[H, W]`, whole numbers of the unit [s], from the first tag of the image to
+    the last, in bins of a multiple of the unit, by default the unit."""
+    width = unit if bin_width is None else bin_width
+    step = round(width / unit)
+    if step < 1 or abs(step * unit - width) > 1e-6 * width:
+        raise ArgumentError(f"bin width = {width * 1e12:g} ps is not a multiple of the tags' unit, {unit * 1e12:g} ps")
+    sizes = np.array([cell.size for cell in cells.flat])
+    if not sizes.any():
+        raise FileError("no pixel has a time tag")
+    tags = np.concatenate([cell for cell in cells.flat if cell.size])
+    if tags.dtype.kind not in "fiu":
+        raise FileError(f"time tags are {tags.dtype}, not whole numbers")
+    if tags.dtype.kind == "f" and not ((tags == np.rint(tags)).all() and np.abs(tags).max() < 2**53):  # no NaN, no inf
+        raise FileError("time tags are not all whole numbers")
+    if not -(2**62) < int(tags.min()) <= int(tags.max()) < 2**62:
+        raise FileError(f"time tags from {tags.min()} to {tags.max()} are beyond 2^62")
+    tags = tags.astype(np.int64)
+    first = int(tags.min()) // step * step
+    bins = (int(tags.max()) - first) // step + 1
+    wider = f"a wider bin than {step * unit * 1e12:g} ps (--bin-width-ps)"
+    if bins > _MOST_BINS:
+        raise ArgumentError(
+            f"time tags from {tags.min()} to {tags.max()} are {bins} bins, more than {_MOST_BINS}; {wider} would help,"
+            " unless a tag is wrong"
+        )
+    height, across = cells.shape
+    _check_size((height, across, bins), wider)
+    counts = np.zeros(cells.size * bins, np.int32)
+    np.add.at(counts, np.repeat(np.arange(cells.size), sizes) * bins + (tags - first) // step, 1)
+    text = f"time tags of {across} x {height} pixels, bins of {step * unit * 1e12:g} ps from tag {first}"
+    cube = counts.reshape(height, across, bins)
+    return _Raw(cube, (*notes, text), step * unit, first=first * unit, ordered=True)
+
+
+# PicoQuant's files of T3 records: images, and other scans by their markers
+
+
+def _read_ptu(path: Path, request: _Request) -> _Raw:
+    """Counts of all channels. Raises `ArgumentError` for a size that is missing or does not fit the markers."""
+    import ptufile
+
+    with ptufile.PtuFile(path) as file:
+        _check_ptu(file, path)
+        if file.is_image and request.image_size is None:
+            counts, text = _ptu_image(file, request.sum_frames), "pixels by the image in its header"
+        else:
+            counts, text = _ptu_scan(file, request.image_size)
+        if (channels := file.number_channels) > 1:
+            text += f"; {channels} channels, added up"
+        notes = [text, f"{len(counts)} frames; --sum-frames adds them up"][: counts.ndim - 2]
+        # Time of flight at the start of bin 0, which `spadwarp export` writes in the comment.
+        is_ours = file.tags.get("CreatorSW_Name") == "spadwarp"
+        gate = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if is_ours else None
+        start = 1e-9 * float(gate[1]) if gate else None
+        return _Raw(counts, tuple(notes), float(file.tcspc_resolution), start, ordered=True)
+
+
+def _check_ptu(file: Any, path: Path) -> None:
+    """Refuses numbers of the header that its reader would compute with for minutes, and records that are not there."""
+    for name in ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame"):  # a marker, a power of two of it
+        if not 0 <= (marker := file.tags.get(name) or 0) <= _MARKERS:
+            raise FileError(f"{path}: {name} = {shown(marker)} is outside [0, {_MARKERS}], the markers of a record")
+    count, size = file.tags.get("TTResult_NumberOfRecords") or 0, path.stat().st_size
+    if not 4 * count <= size:
+        raise FileError(f"{path}: TTResult_NumberOfRecords = {shown(count)} is more than a file of {size} bytes holds")
+    if not file.is_t3:
+        raise FileError(f"{path}: T2 records have no time since the pulse; T3 records are needed")
+    file.cache_records = True
+    if (readable := len(file.read_records())) < file.number_records:
+        raise FileError(f"{path}: cut: of {file.number_records} records {readable} are there")
+    if not 1e-15 < (width := float(file.tcspc_resolution)) < 1e-3:
+        raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")
+
+
+def _ptu_image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
+    frames, height, width, _, bins = file.shape
+    _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (--sum-frames)")
+    options: dict[str, Any] = {"channel": -1, "dtype": np.uint32, "keepdims": False}
+    counts = file.decode_image(frame=-1 if sum_frames or frames == 1 else None, **options)
+    return np.ascontiguousarray(counts).view(np.int32)
+
+
+def _ptu_scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np.int32], str]:
+    """A point, or a scan with a marker at the start of each pixel or line, and maybe one more at its end."""
+    records = file.decode_records()
+    photon = records["channel"] >= 0
+    dtime = records["dtime"][photon].astype(np.int64)
+    marks = np.flatnonzero(~photon & (records["marker"] > 0))
+    bins = int(dtime.max(initial=0)) + 1
+    if image_size is None:
+        if marks.size:
+            raise ArgumentError(f"the image's size is missing (--image-size): a scan of {marks.size} markers")
+        return np.bincount(dtime, minlength=bins).astype(np.int32)[None, None], "one point"
+    height, width = image_size
+    _check_size((height, width, bins), "a smaller image")
+    start, text = _ptu_starts(records, marks, height, width)
+    pixel = np.searchsorted(start, records["time"][photon].astype(np.float64), side="right") - 1
+    inside = (pixel >= 0) & (pixel < height * width)
+    counts = np.zeros(height * width * bins, np.int32)
+    np.add.at(counts, pixel[inside] * bins + dtime[inside], 1)
+    return counts.reshape(height, width, bins), text
+
+
+def _ptu_starts(records: Any, marks: NDArray[np.intp], height: int, width: int) -> tuple[NDArray[np.float64], str]:
+    """Times at which the pixels begin, and the last one ends: by the kind of marker that fits."""
+    kinds = records["marker"][marks]
+    times = {int(kind): records["time"][marks[kinds == kind]].astype(np.float64) for kind in np.unique(kinds)}
+    lines = "a line at each marker {}, its pixels equally long"
+    for pieces, text in ((height * width, "a pixel at each marker {}"), (height, lines)):
+        for kind, time in times.items():
+            if time.size not in (pieces, pieces + 1):
+                continue
+            step = float(np.median(np.diff(time))) if time.size > 1 else np.inf
+            ends = np.append(time, time[-1] + step)[: pieces + 1]
+            if pieces != height * width:
+                start = (ends[:-1, None] + np.arange(width) / width * np.diff(ends)[:, None]).ravel()
+                ends = np.append(start, ends[-1])
+            return ends, text.format(kind)
+    markers = ", ".join(f"{time.size} of kind {kind}" for kind, time in times.items()) or "none"
+    raise ArgumentError(
+        f"image size = {width} x {height}: {height * width} markers of one kind, or {height}, are needed; "
+        f"the file has {markers}"
+    )
+
+
+# Images
+
+
+def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[NDArray[Any], str] | None:
+    """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
+    the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
+    of a `.h5` without them the only one. With it a text that names the image taken and those left; "" without a choice.
+
+    Raises `FileError`, and `ArgumentError` where several of a `.mat` are the largest, or a `.h5` has several.
+    """
+    ending, sides = path.suffix.lower(), (2, 3) if several else (2,)
+    if ending == ".npy":
+        array = read_npy(path)
+        return (array, "") if array.ndim in sides else None
+    if ending == ".mat":
+        with open_mat(path) as variables:
+            images = {
+                name: variable
+                for name, variable in variables.items()
+                if variable.kind == "dense" and len(variable.shape) in (2, 3)
+            }
+            name, choice = dataset, ""
+            if name is None and (several or not _histograms_in(variables)):
+                sizes = {name: variable.shape for name, variable in images.items() if math.prod(variable.shape) > 1}
+                name, choice = _largest(path, sizes)
+            if name not in images or len(images[name].shape) not in sides:
+                return None
+            return np.asarray(images[name].read()), choice
+    if ending in (".h5", ".hdf5") and not _is_own(path):
+        with read_hdf5(path) as file:
+            arrays = file.arrays()
+        shapes = _numeric_shapes(arrays)
+        cubes = [name for name, shape in shapes.items() if len(shape) in (3, 4)]
+        images_found = [name for name in cubes if several and len(shapes[name]) == 3]
+        if not cubes:
+            images_found = [name for name, shape in shapes.items() if len(shape) == 2 and math.prod(shape) > 1]
+        if dataset is None and len(images_found) > 1:
+            raise _unnamed(path, _listed({name: shape for name, (shape, _) in arrays.items()}))
+        name = images_found[0] if dataset is None and images_found else dataset
+        shape, dtype = arrays.get(name or "", ((), np.dtype(float)))
+        if name is not None and len(shape) in sides:
+            with read_hdf5(path) as file:
+                return file.array(name, dtype, shape), ""
+    return None
+
+
+def _largest(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str | None, str]:
+    """Name of the largest image, None without any, and a text that names it and the others, "" without others. Raises
+    `ArgumentError` where several are the largest."""
+    most = max(map(math.prod, shapes.values()), default=0)
+    largest = [name for name, shape in shapes.items() if math.prod(shape) == most]
+    if len(largest) > 1:
+        raise _unnamed(path, _listed(shapes))
+    others = [name for name in shapes if name not in largest]
+    return (largest[0] if largest else None), f"{largest[0]}, not {', '.join(others)}" if others else ""

@@ -1,4 +1,4 @@
-"""The camera before it counts: light through the response, wrapping, dark counts, ambient light and crosstalk.
+"""The camera before it counts: its time window; light through the response, wrapping, noise and crosstalk.
 
 Expected detections per pulse, `[H, W, T]`, in unwrapped time → hazard λ per detector bin, and derivatives of both.
 """
@@ -7,22 +7,78 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
-from spadwarp.frames.window import Window, detector_window
+from spadwarp.limits import TIME, check_integer, check_real, shown
 from spadwarp.scene import Detector, Laser
 
 __all__ = ["Receiver"]
 
 
+class Window(NamedTuple):
+    """Bins in which the detector is on; the first `recorded` of them are histogrammed.
+
+    Attributes:
+        start: [s].
+        edges: From the start [s].
+        recorded: Bins of the histograms.
+        period: From one window to the next [s].
+    """
+
+    start: float
+    edges: NDArray[np.float64]
+    recorded: int
+    period: float
+
+
+def _window(
+    detector: Detector, laser: Laser | None, window: tuple[float, int], bin_width: float, tdc_widths: ArrayLike | None
+) -> Window:
+    """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
+    if not (isinstance(window, tuple | list) and len(window) == 2):
+        raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
+    start = check_real("start of window", window[0], TIME)
+    bins = check_integer("bins of window", window[1], "[1, 1000000]")
+    wrap, period = detector.wrap, math.inf if laser is None else 1.0 / laser.repetition_rate
+    if wrap:
+        # The detector knows no time beyond that from one pulse to the next.
+        bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
+        if bins < 1:
+            raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
+    widths = np.ones(bins) if tdc_widths is None else np.asarray(tdc_widths, np.float64)
+    if widths.shape != (bins,):
+        raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
+    if not (np.isfinite(widths).all() and (widths > 0).all()):
+        raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+    edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
+    period = period if wrap else max(period, edges[-1])
+    rest = period - edges[-1]
+    if detector.mode == "free_running" and rest > 1e-9 * period:
+        # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
+        extra = math.ceil(rest / bin_width) if wrap else 1
+        edges = np.append(edges, edges[-1] + rest * np.arange(1, extra + 1) / extra)
+    return Window(start, edges, bins, period)
+
+
+def missing_light(window: Window, gate_start: float) -> tuple[str, ...]:
+    """A note if light from before the source's first bin would fall into the window, one or more periods later."""
+    wrap = math.ceil((gate_start - window.start) / window.period - 1e-9) - 1
+    if gate_start <= 0 or window.start + wrap * window.period + window.edges[-1] <= 0:
+        return ()
+    return (
+        f"the source begins at {gate_start * 1e9:.6g} ns: earlier light of later pulses, near-range backscatter above "
+        "all, is missing in the window (start the source at 0 and give `window`)",
+    )
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Receiver:
-    """What a detector makes of expected light.
+    """Expected detections of a detector, from expected light.
 
     Attributes:
         detector: The section of a scene.
@@ -61,14 +117,7 @@ class Receiver:
         """
         from spadwarp_kernels import detection as kernels
 
-        own = detector_window(
-            window or (axis[0], shape[2]),
-            axis[1],
-            tdc_widths,
-            period=math.inf if laser is None else 1.0 / laser.repetition_rate,
-            wrap=detector.wrap,
-            free_running=detector.mode == "free_running",
-        )
+        time_window = _window(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
         noise = kernels.dark_count_rates(
             shape[0] * shape[1],
             median=detector.dark_count_rate,
@@ -81,7 +130,7 @@ class Receiver:
         )
         return cls(
             detector=detector,
-            window=own,
+            window=time_window,
             image=(shape[0], shape[1]),
             noise=noise if ambient is None else _with_ambient(noise, ambient, shape),
             matrix=response_matrix(
@@ -89,8 +138,8 @@ class Receiver:
                 source_start=axis[0],
                 source_width=axis[1],
                 source_bins=shape[2],
-                edges=own.start + own.edges,
-                period=own.period if detector.wrap else None,
+                edges=time_window.start + time_window.edges,
+                period=time_window.period if detector.wrap else None,
             ),
             equal_bins=tdc_widths is None,
         )

@@ -13,23 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import real_array
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.npy import read_npy
-from spadwarp.io.parsing import read_columns, read_text
+from spadwarp.io.arrays import read_npy
 from spadwarp.io.paths import file_problem
+from spadwarp.io.text import read_columns, read_text
 from spadwarp.limits import BIN_WIDTH, TIME, check_integer, check_real, shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
 
-__all__ = [
-    "FWHM_PER_SIGMA",
-    "InstrumentResponse",
-    "SparseResponse",
-    "detector_response",
-    "instrument_response",
-    "read_response",
-    "response_matrix",
-]
+__all__ = ["InstrumentResponse", "detector_response", "instrument_response", "read_response", "response_matrix"]
 
 Floats = NDArray[np.float64]
 

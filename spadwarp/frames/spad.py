@@ -1,4 +1,4 @@
-"""The camera: counts and time tags of a SPAD array from expected detections.
+"""The camera: counts and time tags of a SPAD array from expected detections, and the noise they have of a simulation.
 
 Expected detections per pulse, `[H, W, T]`, in unwrapped time → response (pulse ⊗ jitter), wrapping at the pulse period,
 dark counts, ambient light, crosstalk → hazard λ per detector bin → counts, drawn exactly.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,16 +17,104 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, output_tensor, tensor_of
 from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
-from spadwarp.frames.monte_carlo_noise import UNKNOWN, monte_carlo_noise
-from spadwarp.frames.receiver import Receiver
+from spadwarp.frames.receiver import Receiver, missing_light
 from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.frames.window import Window, missing_light
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real, shown
 from spadwarp.result.file import as_result
-from spadwarp.result.result import Truth
+from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 
-__all__ = ["detect"]
+__all__ = ["MonteCarloNoise", "detect", "monte_carlo_noise"]
+
+LIMIT = 0.5
+"""Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""
+
+_PART = 0.95  # of the pixels that have to be below the limit
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonteCarloNoise:
+    """The standard error of a result against the shot noise of one frame, both of the counts of a pixel.
+
+    Attributes:
+        pulses: Of the frame.
+        ratio: Standard error over shot noise, at the 95th percentile of the pixels.
+        pixels: Part of the pixels in which it is above 0.5.
+        photons: That were traced.
+        photons_needed: That would bring `ratio` to 0.5, from its fall with the square root of their number.
+    """
+
+    pulses: int
+    ratio: float
+    pixels: float
+    photons: int
+    photons_needed: float
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether the frames show it."""
+        return self.ratio > LIMIT
+
+    def __str__(self) -> str:
+        return (
+            f"Monte Carlo noise, the same in every frame: the standard error of the simulation is above {LIMIT:g} of "
+            f"the shot noise of {self.pulses} pulses in {100 * self.pixels:.3g} % of the pixels, and {self.ratio:.2g} "
+            f"of it at the 95th percentile; about {self.photons_needed:.1e} photons instead of {self.photons:.1e} "
+            f"would make that {LIMIT:g}"
+        )
+
+
+UNKNOWN = (
+    "Monte Carlo noise is unknown: the result keeps no standard errors (simulate with --uncertainty); the noise of its "
+    "histograms is drawn as if it were light, the same in every frame, and counts as information in the Cramér–Rao "
+    "bound, which is too small where few photons were traced"
+)
+
+
+def noise_caption(ratio: float | None) -> str:
+    """For the caption of a picture of frames that show the noise of the simulation; else empty."""
+    if ratio is None or ratio <= LIMIT:
+        return ""
+    return f"; too few photons traced: Monte Carlo noise of expected and counts {ratio:.2g} times the shot noise"
+
+
+def monte_carlo_noise(
+    result: Any, *, pulses: int, detector: Detector | None = None, laser: Laser | None = None
+) -> MonteCarloNoise | None:
+    """The noise that frames of so many pulses inherit from a result; None where it keeps no standard errors.
+
+    Args:
+        result: A `Result`.
+        pulses: Of one frame.
+        detector, laser: Sections of a scene; default: those of the result's.
+    """
+    if not isinstance(result, Result) or result.second_moment is None or result.photons < 2 * result.batch_size:
+        return None
+    scene = result.scene
+    detector, laser = detector or scene.detector, laser or scene.laser
+    scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
+    # Bins are nearly independent: a history adds to few of those of one pixel.
+    error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
+    seen = scene.model_copy(update={"detector": detector, "laser": laser})
+    noise = noise_rate(seen, result.truth)
+    expected = result.intensity * scale + (noise[..., 0] if np.ndim(noise) else noise) * (
+        scene.gate.stop - scene.gate.start
+    )
+    # A first-photon detector counts one a pulse at most, of light and error in the same measure.
+    counted = pulses * (-np.expm1(-expected) if detector.mode == "first_photon" else expected)
+    ratios = np.sqrt(counted) * np.divide(error, expected, out=np.zeros_like(error), where=expected > 0)
+    ratio = float(np.quantile(ratios, _PART))
+    return MonteCarloNoise(
+        pulses=pulses,
+        ratio=ratio,
+        pixels=float(np.mean(ratios > LIMIT)),
+        photons=result.photons,
+        photons_needed=result.photons * (ratio / LIMIT) ** 2,
+    )
+
+
+# Frames
+
 
 _LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]"}
 
@@ -90,6 +179,8 @@ def detect(
     Raises:
         ArgumentError: Names the argument, its value and what is allowed.
     """
+    import warp as wp
+
     source = as_result(source) if isinstance(source, str | os.PathLike) else source
     result, scene = source, getattr(source, "scene", None)
     for name, value, kind in (("detector", detector, Detector), ("laser", laser, Laser)):
@@ -112,8 +203,8 @@ def detect(
         source = source.histogram * detections_per_photon
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
-    given = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
-    numbers = {name: check_integer(name, value, _LIMITS.get(name, SEED)) for name, value in given.items()}
+    arguments = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
+    numbers = {name: check_integer(name, value, _LIMITS.get(name, SEED)) for name, value in arguments.items()}
     camera_seed = check_integer("camera_seed", camera_seed, SEED)
     if summed and (total := numbers["pulses"] * numbers["frames"]) > 2**31 - 1:
         raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
@@ -124,129 +215,70 @@ def detect(
     if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     irf = detector_response(detector, laser) if irf is None else irf
-    camera = _Camera(detector, laser, irf, window, tdc_widths, camera_seed, ambient)
+    options: dict[str, Any] = {"irf": irf, "window": window, "tdc_widths": tdc_widths, "ambient": ambient}
+    form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
     with in_torch_order(source, background, out):
-        light = _expected(source, background, camera, (gate_start, bin_width), device)
-        drawn = _draw(light, detector, is_torch(source), numbers, summed=summed, tags=tags, out=out)
-    time_axis, recorded = light.window, light.window.recorded
-    noise, unknown = (None, ()) if scene is None else _noise_of_simulation(result, pulses, detector, laser)
+        rows, shape = histogram_rows(source, name="source", device=device, **form)
+        axis = (gate_start, bin_width)
+        receiver = Receiver.of(
+            detector, laser, shape=shape, axis=axis, device=rows.device, camera_seed=camera_seed, **options
+        )
+        hazard, known = receiver.hazard(rows), receiver.noise_alone()
+        if background is not None:
+            rows, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
+            if known_shape != shape:
+                raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
+            known = receiver.light(rows)
+        as_torch = is_torch(source) or out is not None
+        if as_torch:
+            out_shape = (*(() if summed else (numbers["frames"],)), *receiver.image, receiver.window.recorded)
+            out = output_tensor(out, name="out", shape=out_shape, device=hazard.device)
+        counts, events = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
+        to_caller: Any = tensor_of if as_torch else wp.array.numpy
+        expected, known = to_caller(hazard), to_caller(known)
+    recorded = receiver.window.recorded
+    notes = missing_light(receiver.window, gate_start) if detector.wrap else ()
+    noise = None if scene is None else monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
+    if noise is not None and noise.exceeds:
+        warnings.warn(str(noise), SpadwarpWarning, stacklevel=3)
     return Frames(
-        counts=drawn.counts,
-        expected=drawn.expected[:, :recorded].reshape(*light.image, -1),
-        background=drawn.background[:, :recorded].reshape(*light.image, -1),
-        gate_start=time_axis.start,
+        counts=counts,
+        expected=expected[:, :recorded].reshape(*receiver.image, -1),
+        background=known[:, :recorded].reshape(*receiver.image, -1),
+        gate_start=receiver.window.start,
         bin_width=bin_width,
-        edges=time_axis.edges[: recorded + 1],
-        period=time_axis.period if detector.wrap else None,
+        edges=receiver.window.edges[: recorded + 1],
+        period=receiver.window.period if detector.wrap else None,
         irf=irf,
-        tags=None if drawn.events is None else _time_tags(drawn.events, light.image, first_frame),
-        notes=(
-            *(missing_light(time_axis, gate_start) if detector.wrap else ()),
-            *unknown,
-        ),
-        monte_carlo_noise=noise,
+        tags=None if events is None else _time_tags(events, receiver.image, first_frame),
+        notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
+        monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,
     )
 
 
-def _noise_of_simulation(
-    result: Any, pulses: int, detector: Detector, laser: Laser | None
-) -> tuple[float | None, tuple[str, ...]]:
-    """Noise over shot noise, with a warning where frames show it, and a note where nobody knows whether they do."""
-    noise = monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
-    if noise is None:
-        return None, (UNKNOWN,)
-    if noise.exceeds:
-        warnings.warn(str(noise), SpadwarpWarning, stacklevel=4)
-    return noise.ratio, ()
-
-
-# Expected detections
-
-
-class _Camera(NamedTuple):
-    detector: Detector
-    laser: Laser | None
-    irf: InstrumentResponse
-    window: tuple[float, int] | None
-    tdc_widths: ArrayLike | None
-    seed: int
-    ambient: ArrayLike | None
-
-
-class _Light(NamedTuple):
-    """Expected detections per pulse before pile-up, in the bins of the window: Warp rows `[pixel, bin]`."""
-
-    hazard: Any
-    background: Any
-    window: Window
-    image: tuple[int, int]
-
-
-def _expected(source: Any, background: Any, camera: _Camera, axis: tuple[float, float], device: Any) -> _Light:
-    """Light through the response, noise and crosstalk; `axis`: start and bin width of the source [s]."""
-    form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
-    rows, shape = histogram_rows(source, name="source", device=device, **form)
-    receiver = Receiver.of(
-        camera.detector,
-        camera.laser,
-        shape=shape,
-        axis=axis,
-        device=rows.device,
-        irf=camera.irf,
-        window=camera.window,
-        tdc_widths=camera.tdc_widths,
-        ambient=camera.ambient,
-        camera_seed=camera.seed,
-    )
-    hazard = receiver.hazard(rows)
-    if background is None:
-        expected_background = receiver.noise_alone()
-    else:
-        known, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
-        if known_shape != shape:
-            raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
-        expected_background = receiver.light(known)
-    return _Light(hazard, expected_background, receiver.window, (shape[0], shape[1]))
-
-
-# Counts
-
-
-class _Drawn(NamedTuple):
-    """Arrays for the caller, NumPy or torch; `events`: detections one by one, or None."""
-
-    counts: Any
-    expected: Any
-    background: Any
-    events: dict[str, NDArray] | None
-
-
 def _draw(
-    light: _Light, detector: Detector, as_torch: bool, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
-) -> _Drawn:
+    receiver: Receiver, hazard: Any, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
+) -> tuple[Any, dict[str, NDArray[Any]] | None]:
+    """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
     import warp as wp
 
     from spadwarp_kernels import detection as kernels
 
-    window, free_running, frames = light.window, detector.mode == "free_running", numbers["frames"]
-    by_event = free_running or tags or detector.afterpulsing_probability > 0
-    shape = (*(() if summed else (frames,)), *light.image, window.recorded)
+    detector, window, frames = receiver.detector, receiver.window, numbers["frames"]
+    by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
-    as_torch = as_torch or out is not None
-    if as_torch:
-        out = output_tensor(out, name="out", shape=shape, device=light.hazard.device)
-    in_place = as_torch and not add_frames
+    in_place = out is not None and not add_frames
     common: dict[str, Any] = {**numbers, "counter_depth": detector.counter_depth}
     common["counts"] = wp.from_torch(out).flatten() if in_place else None
     events = None
     if by_event:
         counts, events = kernels.event_counts(
-            light.hazard,
+            hazard,
             edges=window.edges,
             recorded=window.recorded,
             period=window.period,
-            gated=not free_running,
+            gated=detector.mode != "free_running",
             dead_time=detector.dead_time_ns * 1e-9,
             afterpulsing_probability=detector.afterpulsing_probability,
             afterpulsing_time_constant=detector.afterpulsing_time_constant_ns * 1e-9,
@@ -254,13 +286,13 @@ def _draw(
             **common,
         )
     else:
-        counts = kernels.first_photon_counts(light.hazard, summed=summed, **common)
-    to_caller: Any = tensor_of if as_torch else wp.array.numpy
-    counts = out if in_place else to_caller(counts)
-    if add_frames:
-        counts = counts.reshape(frames, *shape).sum(0, dtype=counts.dtype)
-        counts = out.copy_(counts) if as_torch else counts
-    return _Drawn(counts.reshape(shape), to_caller(light.hazard), to_caller(light.background), events)
+        counts = kernels.first_photon_counts(hazard, summed=summed, **common)
+    if in_place:
+        return out, events
+    every: Any = counts.numpy() if out is None else tensor_of(counts)
+    every = every.reshape(*(() if summed and not add_frames else (frames,)), *receiver.image, window.recorded)
+    every = every.sum(0, dtype=every.dtype) if add_frames else every
+    return (every if out is None else out.copy_(every)), events
 
 
 def _time_tags(events: dict[str, NDArray], image: tuple[int, int], first_frame: int) -> TimeTags:

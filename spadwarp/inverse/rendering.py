@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.frames import InstrumentResponse, Receiver, detector_response
-from spadwarp.frames.window import Window
+from spadwarp.frames.receiver import Window
 from spadwarp.inverse.derivatives import DepthDifference
 from spadwarp.inverse.shifting import shifted
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.frames.monte_carlo_noise import LIMIT
+from spadwarp.frames.spad import LIMIT
 from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
 from spadwarp.inverse.unknowns import DEPTH, Unknown, with_values
 from spadwarp.units import percent

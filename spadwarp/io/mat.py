@@ -1,30 +1,41 @@
-"""MATLAB files, versions 4 to 7.3: what they hold, and dense arrays, sparse matrices and cells of numbers in them."""
+"""MATLAB files, versions 4 to 7.3: arrays, sparse matrices and cells of numbers.
+
+SciPy's reader follows types and sizes of a damaged file into memory that is not its own; here they are compared with
+the file first, and what remains is a view of its bytes. Layout: MATLAB, "MAT-File Format" (R2023a).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import mmap
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.io.hdf5 import read_hdf5
-from spadwarp.io.hdf5_file import Hdf5File
-from spadwarp.io.mat5 import Kind, open_variables
+from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.hdf5 import Hdf5File, open_hdf5
 
-__all__ = ["MatEntry", "SparseMatrix", "mat_entries", "read_mat"]
+__all__ = ["SparseMatrix", "Variable", "open_mat"]
 
-
-class MatEntry(NamedTuple):
-    """A variable of a file: "dense", "sparse" or "cell", and its shape as MATLAB shows it."""
-
-    kind: Kind
-    shape: tuple[int, ...]
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _SPARSE = 1, 5
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_OLD_KINDS = ("f8", "f4", "i4", "i2", "u2", "u1")
+_COMPLEX, _LOGICAL = 0x0800, 0x0200
+_HEAD = 1 << 16  # bytes of a compressed array that hold its name and shape
 
 
 class SparseMatrix(NamedTuple):
-    """A sparse matrix by its entries, which are not zero."""
+    """A sparse matrix by its entries."""
 
     shape: tuple[int, int]
     row: NDArray[np.int64]
@@ -32,57 +43,206 @@ class SparseMatrix(NamedTuple):
     value: NDArray[Any]
 
 
-def mat_entries(path: Path) -> dict[str, MatEntry]:
-    """The numeric variables of a file by name; text and structures are left out. Raises `FileError`."""
-    if _is_hdf5(path):
-        with read_hdf5(path) as file:
-            return dict(_hdf5_entries(file))
-    with open_variables(path) as found:
-        return {name: MatEntry(variable.kind, variable.shape) for name, variable in found.items()}
+@dataclass(frozen=True)
+class Variable:
+    """A variable whose numbers are not yet read.
+
+    Attributes:
+        kind: "dense", "sparse" or "cell".
+        shape: As MATLAB shows it.
+        read: The array; a `SparseMatrix`; or for cells an object array of arrays, one dimension each.
+    """
+
+    kind: Literal["dense", "sparse", "cell"]
+    shape: tuple[int, ...]
+    read: Callable[[], Any]
 
 
-def read_mat(path: Path, name: str, entry: MatEntry) -> NDArray[Any] | SparseMatrix:
-    """A variable from `mat_entries`: an array; a `SparseMatrix`; or for cells an object array of arrays, one
-    dimension each. Raises `FileError`."""
-    if _is_hdf5(path):
-        return _read_hdf5(path, name, entry)
-    with open_variables(path) as found:
-        value = found[name].read()
-    return SparseMatrix((entry.shape[0], entry.shape[1]), *value) if entry.kind == "sparse" else value
+@contextmanager
+def open_mat(path: Path) -> Iterator[dict[str, Variable]]:
+    """The numeric variables of a file by name, which can be read within the block; text and structures are left out.
 
-
-def _is_hdf5(path: Path) -> bool:
+    Raises `FileError`, also within the block.
+    """
     import h5py
 
-    return h5py.is_hdf5(path)
+    try:
+        if h5py.is_hdf5(path):
+            with closing(open_hdf5(path)) as file:
+                yield dict(_version_7(file))
+        else:
+            with open(path, "rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                yield dict(_version_4(content) if 0 in content[:4] else _version_5(content))
+    except (SpadwarpError, MemoryError):
+        raise
+    except (OSError, ValueError, TypeError, LookupError, struct.error, zlib.error, OverflowError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def _sparse(shape: tuple[int, ...], row: NDArray[Any], start: NDArray[Any], value: NDArray[Any]) -> SparseMatrix:
+    """A matrix by the rows of its entries, column by column, and where each column begins among them."""
+    count = int(start[-1])
+    if len(shape) != 2 or start[0] != 0 or (np.diff(start) < 0).any() or count > min(row.size, value.size):
+        raise ValueError("a sparse matrix whose columns do not fit its entries")
+    row = row[:count].astype(np.int64)
+    if count and not 0 <= row.min() <= row.max() < shape[0]:
+        raise ValueError(f"a sparse matrix with entries outside its {shape[0]} rows")
+    column = np.repeat(np.arange(shape[1]), np.diff(start))
+    return SparseMatrix((shape[0], shape[1]), row, column, value[:count].copy())
 
 
 # Version 7.3, which is HDF5: dimensions are reversed, cells are references, sparse matrices groups
 
 
-def _hdf5_entries(file: Hdf5File) -> Iterator[tuple[str, MatEntry]]:
-    arrays = {name: found for name, found in file.arrays().items() if not name.startswith("#")}
+def _version_7(file: Hdf5File) -> Iterator[tuple[str, Variable]]:
+    arrays = {name: array for name, array in file.arrays().items() if not name.startswith("#")}
     for name, (shape, dtype) in arrays.items():
         if "/" not in name and file.attribute("MATLAB_class", b"", of=name) == b"cell":
-            yield name, MatEntry("cell", shape[::-1])
+            yield name, Variable("cell", shape[::-1], partial(_cells_7, file, name, shape))
         elif "/" not in name and dtype.kind in "biuf":
-            yield name, MatEntry("dense", shape[::-1])
-        elif name.endswith("/jc") and f"{name[:-3]}/ir" in arrays:
-            rows = int(file.attribute("MATLAB_sparse", of=name[:-3]))
-            yield name[:-3], MatEntry("sparse", (rows, shape[0] - 1))
+            yield name, Variable("dense", shape[::-1], partial(_dense_7, file, name, dtype, shape))
+        elif name.endswith("/jc") and {f"{name[:-2]}ir", f"{name[:-2]}data"} <= arrays.keys():
+            sides = (int(file.attribute("MATLAB_sparse", of=name[:-3])), shape[0] - 1)
+            parts = {part: arrays[name[:-2] + part] for part in ("ir", "jc", "data")}
+            yield name[:-3], Variable("sparse", sides, partial(_sparse_7, file, name[:-2], sides, parts))
 
 
-def _read_hdf5(path: Path, name: str, entry: MatEntry) -> NDArray[Any] | SparseMatrix:
-    with read_hdf5(path) as file:
-        if entry.kind == "cell":
-            return file.referenced(name).reshape(entry.shape[::-1]).T
-        dtype = file.arrays()[name if entry.kind == "dense" else f"{name}/jc"][1]
-        if entry.kind == "dense":
-            return file.array(name, dtype, entry.shape[::-1]).T
-        starts = file.array(f"{name}/jc", dtype, (entry.shape[1] + 1,)).astype(np.int64)
-        row = file.array(f"{name}/ir", dtype, (None,)).astype(np.int64)
-        value = file.array(f"{name}/data", file.arrays()[f"{name}/data"][1], (row.size,))
-        if starts[0] != 0 or starts[-1] != row.size or (np.diff(starts) < 0).any() or (row >= entry.shape[0]).any():
-            file.refuse(name, "is no sparse matrix: its rows and columns do not fit each other")
-        column = np.repeat(np.arange(entry.shape[1]), np.diff(starts))
-        return SparseMatrix((entry.shape[0], entry.shape[1]), row, column, value)
+def _cells_7(file: Hdf5File, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    return file.referenced(name).reshape(shape).T
+
+
+def _dense_7(file: Hdf5File, name: str, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    return file.array(name, dtype, shape).T
+
+
+def _sparse_7(file: Hdf5File, group: str, shape: tuple[int, int], parts: Mapping[str, Any]) -> SparseMatrix:
+    row, start, value = (file.array(group + part, dtype, size) for part, (size, dtype) in parts.items())
+    return _sparse(shape, row, start.astype(np.int64), value)
+
+
+# Version 5
+
+
+def _version_5(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
+    if content[126:128] not in (b"IM", b"MI"):
+        raise ValueError("not a file of MATLAB")
+    order = "<" if content[126:128] == b"IM" else ">"
+    place = 128
+    while place + 8 <= len(content):
+        kind, size = struct.unpack_from(order + "II", content, place)
+        start, stop = place + 8, place + 8 + size
+        if stop > len(content):
+            raise ValueError(f"cut: {size} bytes are missing at byte {place}")
+        if kind not in (_COMPRESSED, _MATRIX):
+            raise ValueError(f"type {kind} at byte {place}")
+        if kind == _COMPRESSED:
+            variable, place = _compressed(content[start:stop], order), stop
+        else:
+            variable, place = _matrix(content[start:stop], order, size), stop + -size % 8
+        if variable is not None:
+            yield variable
+
+
+def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
+    head = zlib.decompressobj().decompress(packed, _HEAD)
+    kind, size = struct.unpack_from(order + "II", head)
+    if kind != _MATRIX or size > 1100 * len(packed) + _HEAD:  # zlib makes nothing smaller than this
+        raise ValueError(f"a compressed array of type {kind} and {size} bytes")
+    variable = _matrix(head[8:], order, size)
+    if variable is None:
+        return None
+
+    def read() -> Any:
+        whole = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
+        assert whole is not None
+        return whole[1].read()
+
+    return variable[0], Variable(variable[1].kind, variable[1].shape, read)
+
+
+def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
+    """Name and variable of a matrix of `size` bytes that begins with `content`; None for other than numbers."""
+    (flags, _), place = _field(content, 0, order, {6: "u4"}, 2)
+    (*shape,), place = _field(content, place, order, {5: "i4"})
+    letters, place = _field(content, place, order, {1: "u1", 2: "u1", 16: "u1"})
+    name = bytes(letters.astype(np.uint8)).decode("utf-8", "replace")
+    class_, sides = int(flags) & 0xFF, tuple(map(int, shape))
+    if len(sides) < 2 or min(sides) < 0:
+        raise ValueError(f"array {name!r} has shape {sides}")
+    if int(flags) & _COMPLEX or class_ not in (_CELL, _SPARSE, *_CLASSES):
+        return None
+    if class_ == _SPARSE:
+        return name, Variable("sparse", sides, partial(_sparse_5, content, place, order, sides))
+    # A cell takes at least a tag; numbers may be stored in fewer bytes than their class has, but not in less than one.
+    if math.prod(sides) * (8 if class_ == _CELL else 1) > max(size - place, 4):
+        raise ValueError(f"array {name!r} of shape {sides} is not in {size} bytes")
+    if class_ == _CELL:
+        return name, Variable("cell", sides, partial(_cells_5, content, place, order, sides))
+    kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
+    return name, Variable("dense", sides, partial(_dense_5, content, place, order, sides, kind))
+
+
+def _dense_5(content: bytes, place: int, order: str, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+    values, _ = _field(content, place, order, _STORED, math.prod(shape))
+    return values.astype(kind).reshape(shape, order="F")
+
+
+def _sparse_5(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> SparseMatrix:
+    rows, place = _field(content, place, order, {5: "i4"})
+    starts, place = _field(content, place, order, {5: "i4"}, shape[1] + 1)
+    return _sparse(shape, rows, starts, _field(content, place, order, _STORED)[0])
+
+
+def _cells_5(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    cells = np.empty(math.prod(shape), object)
+    for index in range(cells.size):
+        kind, size = struct.unpack_from(order + "II", content, place)
+        start, stop = place + 8, place + 8 + size
+        cell = _matrix(content[start:stop], order, size) if kind == _MATRIX and stop <= len(content) and size else None
+        if size and (cell is None or cell[1].kind != "dense"):
+            raise ValueError(f"cell {index} holds no array of numbers")
+        cells[index] = np.ravel(cell[1].read()) if cell is not None else np.zeros(0)
+        place = stop + -size % 8
+    return cells.reshape(shape, order="F")
+
+
+def _field(
+    content: bytes, place: int, order: str, kinds: Mapping[int, str], count: int | None = None
+) -> tuple[NDArray[Any], int]:
+    """The numbers of a data element, `count` of them if that is given, and where the next element begins."""
+    kind, size = struct.unpack_from(order + "II", content, place)
+    start, following = place + 8, place + 8 + size + -size % 8
+    if kind >> 16:  # an element of at most four bytes in its own tag
+        kind, size, start, following = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+    if kind not in kinds or start + size > len(content) or (start == place + 4 and size > 4):
+        raise ValueError(f"an element of type {kind} and {size} bytes at byte {place}")
+    dtype = np.dtype(order + kinds[kind])
+    if size % dtype.itemsize or count not in (None, size // dtype.itemsize):
+        raise ValueError(f"{size} bytes of {dtype} where {count} numbers are needed")
+    return np.frombuffer(content, dtype, size // dtype.itemsize, start), following
+
+
+# Version 4
+
+
+def _version_4(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
+    order = "<" if struct.unpack_from("<i", content)[0] < 5000 else ">"
+    place = 0
+    while place < len(content):
+        code, rows, columns, imaginary, letters = struct.unpack_from(order + "5i", content, place)
+        kind, type_ = code // 10 % 10, code % 10
+        if min(code, rows, columns) < 0 or kind >= len(_OLD_KINDS) or not 1 <= letters <= 1000:
+            raise ValueError(f"no array of MATLAB at byte {place}")
+        dtype = np.dtype(order + _OLD_KINDS[kind])
+        start = place + 20 + letters
+        place = start + rows * columns * dtype.itemsize * (2 if imaginary else 1)
+        if place > len(content):
+            raise ValueError(f"cut: {place - len(content)} bytes are missing")
+        name = content[start - letters : start].rstrip(b"\0").decode("latin-1")
+        if type_ == 0 and not imaginary:
+            sides = (rows, columns)
+            yield name, Variable("dense", sides, partial(_dense_4, content, start, place, dtype, sides))
+
+
+def _dense_4(content: mmap.mmap, start: int, stop: int, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    return np.frombuffer(content[start:stop], dtype).reshape(shape, order="F")

@@ -1,47 +1,77 @@
-"""What is at a path: a file, the only one of some names in a folder, a pipe or a device."""
+"""Files by their paths: examples that come with the package, files that are there, files written whole, locks."""
 
 from __future__ import annotations
 
+import difflib
 import os
+import secrets
+import shutil
 import stat
-from collections.abc import Sequence
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from spadwarp.errors import FileError
-from spadwarp.io.examples import examples
+from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.limits import suggestion
 
-__all__ = [
-    "MESH_ENDINGS",
-    "check_apart",
-    "existing_file",
-    "file_problem",
-    "file_within",
-    "is_stream",
-    "similar",
-    "used",
-]
+__all__ = ["MESH_ENDINGS", "atomic_path", "check_apart", "example_or_path", "examples", "existing_file", "file_problem"]
+__all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "similar", "used"]
+
+KINDS = ("scenes", "datasets", "training")
+"""Kinds of examples."""
 
 MESH_ENDINGS = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 """Of files that are meshes."""
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
+_LONGEST_PREFIX = 100  # bytes of a file's name in that of its temporary file; file systems allow 255 in all
+_PAUSE = 0.1  # seconds between two attempts to obtain a lock
+
+
+def examples(kind: str) -> dict[str, Path]:
+    """Files of a kind, "scenes", "datasets" or "training", by name.
+
+    In a checkout those of `configs/`, else the copies in the package.
+    """
+    package = Path(__file__).parents[1]
+    folder = next((place for place in (package / "configs", package.parent / "configs") if place.is_dir()), package)
+    return {path.stem: path for path in sorted((folder / kind).glob("*.toml"))}
+
+
+def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
+    """A path as it is; but a bare name for which there is no file is that of an example.
+
+    Raises `FileError` for a bare name that is neither.
+    """
+    place = Path(path)
+    if place.suffix or place.name != str(path) or os.path.exists(place):
+        return place
+    known = examples(kind)
+    if place.name not in known:
+        named = f"{place.name}.toml"
+        close = [named] if os.path.exists(named) else difflib.get_close_matches(place.name, known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+        raise FileError(f"{place}: neither a file nor one of the {kind} that come with spadwarp; {hint}")
+    return known[place.name]
 
 
 def similar(path: str | os.PathLike[str]) -> str:
-    """What to add to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
+    """Addition to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
     it."""
     place = Path(path)
     try:
-        beside = [one for one in os.listdir(place.parent) if one.endswith(place.suffix)]
+        beside = [name for name in os.listdir(place.parent) if name.endswith(place.suffix)]
     except (OSError, ValueError):
         return ""
     return suggestion(place.name, beside)
 
 
 def used(path: str | os.PathLike[str]) -> str:
-    """What to add to an error about a file of another kind: how a scene, a mesh or a result is used."""
+    """Addition to an error about a file of another kind: how a scene, a mesh or a result is used."""
     ending = Path(path).suffix.lower()
     if ending == ".toml":
         return f"; if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it"
@@ -76,11 +106,11 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
     folder = Path(path)
     if not os.path.isdir(folder):
         return folder
-    found = [folder / name for name in names if (folder / name).is_file()]
-    if len(found) != 1:
-        held = " and ".join(path.name for path in found) if found else f"no {' and no '.join(names)}"
-        raise FileError(f"{path}: holds {held}; name the file")
-    return found[0]
+    files = [folder / name for name in names if (folder / name).is_file()]
+    if len(files) != 1:
+        text = " and ".join(path.name for path in files) if files else f"no {' and no '.join(names)}"
+        raise FileError(f"{path}: holds {text}; name the file")
+    return files[0]
 
 
 def check_apart(output: str | Path, source: Any) -> None:
@@ -101,3 +131,98 @@ def is_stream(path: str | Path) -> bool:
     # Also where the shell has opened a file for it, such as that of `--json /dev/stdout > file`.
     opened = place.parts[1:2] == ("proc",) or place.parts[:3] == ("/", "dev", "fd") or str(place) in _STANDARD
     return opened or not (os.path.isfile(place) or os.path.isdir(place))
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A new empty file beside `path` that takes its name when the block ends well, and is removed when it does not.
+
+    What was at `path` stays untouched until then; a symbolic link is replaced, not what it leads to. No other process,
+    on this machine or another, gets the same temporary name. A pipe or a device is written to at the end. Raises
+    `FileError` where the folder or the file cannot be written.
+    """
+    target = Path(path)
+    if not target.name:
+        raise FileError(f"{target}: is no name of a file")
+    try:
+        with _stream(target) if is_stream(target) else _beside(target) as temporary:
+            yield temporary
+    except SpadwarpError:
+        raise
+    except (OSError, RuntimeError) as error:  # h5py and OpenEXR report a full disk as either
+        raise FileError(f"{target}: cannot be written: {error}") from error
+
+
+@contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+@contextmanager
+def _stream(target: Path) -> Iterator[Path]:
+    """A temporary file whose content goes to a pipe or a device when the block ends well."""
+    with tempfile.TemporaryDirectory() as folder:
+        temporary = Path(folder) / target.name
+        temporary.touch()
+        yield temporary
+        sys.stdout.flush()  # what was printed before comes first
+        with temporary.open("rb") as source, target.open("ab") as stream:
+            shutil.copyfileobj(source, stream)
+
+
+def remove_temporaries(path: str | Path) -> None:
+    """Removes the temporary files of `path` that killed processes have left; nobody may be writing it."""
+    target = Path(path)
+    with suppress(OSError):
+        for other in list(target.parent.iterdir()):
+            if other.name.startswith(_prefix(target)) and other.suffix == ".tmp":
+                other.unlink(missing_ok=True)
+
+
+def _prefix(target: Path) -> str:
+    return f".{os.fsdecode(os.fsencode(target.name)[:_LONGEST_PREFIX])}."
+
+
+@contextmanager
+def lock(path: str | Path, *, wait: Callable[[], bool] = lambda: False) -> Iterator[bool]:
+    """Holds a lock between processes that share a file system for the length of a block; yields whether it did so.
+
+    The system releases the lock of a process that ends, however it ends: none is left behind.
+
+    Args:
+        path: The lock's file, removed at the end.
+        wait: Asked again and again, while another process holds the lock, whether to wait for it.
+
+    Raises:
+        FileError: The file cannot be made.
+    """
+    from filelock import FileLock, Timeout
+
+    held = FileLock(path, mode=0o666)
+    try:
+        while not held.is_locked:
+            try:
+                held.acquire(timeout=0)
+            except Timeout:
+                if not wait():
+                    break
+                time.sleep(_PAUSE)
+    except OSError as error:
+        raise FileError(f"{Path(path).parent}: cannot be written: {error.strerror}") from error
+    try:
+        yield held.is_locked
+    finally:
+        with suppress(OSError):
+            if held.is_locked:
+                Path(path).unlink()
+        held.release()

@@ -1,18 +1,162 @@
-"""Text files written: JSON and CSV."""
+"""Text files: TOML, JSON and columns of numbers, read with limits to what a small file can cost, and written."""
 
 from __future__ import annotations
 
 import csv
+import datetime
+import io
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spadwarp.io.atomic import atomic_path
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["json_text", "write_csv", "write_json", "write_text"]
+from spadwarp.errors import ConfigError, FileError
+from spadwarp.io.paths import atomic_path, similar, used
+from spadwarp.limits import Interval, parse_number, shown
+from spadwarp.units import UNITS
+
+__all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
+__all__ += ["write_text"]
+
+_LARGEST_TEXT = 4 << 20  # bytes; a table of 100 000 rows has 2 MiB
+_DEEPEST = 32  # tables and lists in each other; a recipe has 6
+# More parts than a key of ours has, in front of which no other part stands: the time to read one grows as their square.
+_LONG_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){64}""")
+
+
+def read_text(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> str:
+    """The text of a UTF-8 file of `largest` bytes at most; raises `FileError` if it cannot be read or is no text."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(largest + 1)
+    except OSError as error:
+        hint = similar(path) if isinstance(error, FileNotFoundError) else ""
+        raise FileError(f"{path}: cannot be read: {error.strerror}{hint}") from None
+    except ValueError:  # a NUL in the name
+        raise FileError(f"{str(path)!r} is no name of a file") from None
+    if len(content) > largest:
+        raise FileError(f"{path}: has more than {largest} bytes, the most that is read of such a file")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not a text file: {error}{used(path)}") from None
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The tables of a TOML file. Raises `FileError` if it cannot be read, `ConfigError` as `parse_toml` does."""
+    return parse_toml(read_text(path), source=str(path))
+
+
+def parse_toml(text: str, *, source: str | None = None) -> dict[str, Any]:
+    """The tables of a TOML text: numbers, words, lists and tables; `source` is its file, for errors.
+
+    Raises `ConfigError` for what is not TOML, nested too deeply, or of a kind that no field takes: dates, integers
+    beyond 64 bits, text with NUL.
+    """
+    try:
+        if (key := _LONG_KEY.search(text)) is not None:
+            raise ValueError(f"a key in line {text.count(chr(10), 0, key.start()) + 1} has 64 parts or more")
+        tables = tomllib.loads(text, parse_float=_parse_float)
+    except ValueError as error:
+        raise ConfigError(f"not valid TOML: {error}{_bare_unit(text, str(error))}", source=source) from None
+    except RecursionError:
+        raise ConfigError("not valid TOML: lists or tables are nested too deeply", source=source) from None
+    if problems := list(_problems(tables)):
+        raise ConfigError(problems, source=source)
+    return tables
+
+
+# A number and what follows it, outside quotes.
+_WITH_UNIT = re.compile(r"""(?<![\w.+"'-])([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d,"'#[\]]+)""", re.I | re.A)
+
+
+def _bare_unit(text: str, error: str) -> str:
+    """Addition to the error of a line such as `aperture_diameter = 20 mm`."""
+    if (place := re.search(r"at line (\d+)", error)) is None:
+        return ""
+    line = text.split("\n")[int(place[1]) - 1][:200]
+    for number, unit in _WITH_UNIT.findall(line.partition("=")[2]):
+        if unit in UNITS:
+            return f'; a number with a unit needs quotes: "{number} {unit}"'
+    return ""
+
+
+def _parse_float(text: str) -> float:
+    """TOML's floats; NaN is left to the fields, which name themselves."""
+    if text.lstrip("+-") == "nan":
+        return math.nan
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise ValueError(f"{shown(text)} {error}") from None
+
+
+def _problems(tables: dict[str, Any]) -> Iterator[str]:
+    """Values that no field takes, each by its key."""
+    left: list[tuple[str, int, Any]] = [("", 0, tables)]
+    while left:
+        name, depth, value = left.pop()
+        if depth > _DEEPEST:
+            yield f"{name[:60]}... is nested more than {_DEEPEST} deep"
+        elif isinstance(value, dict):
+            left += [(f"{name}.{key}" if name else key, depth + 1, item) for key, item in reversed(value.items())]
+        elif isinstance(value, list):
+            left += [(f"{name}[{index}]", depth + 1, item) for index, item in reversed(list(enumerate(value)))]
+        elif isinstance(value, datetime.date | datetime.time):
+            yield f"{name} = {value} is a date or a time of day; text stands in quotes"
+        elif isinstance(value, int) and not -(2**63) <= value < 2**64:
+            yield f"{name} = {shown(value)} is outside [-2^63, 2^64)"
+        elif isinstance(value, str) and "\0" in value:
+            yield f"{name} = {shown(value)} holds a NUL character"
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text. Raises `ValueError` for what is not JSON, or nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("lists or tables are nested too deeply") from None
+
+
+def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> NDArray[np.float64]:
+    """The first columns of a .csv file, `[rows, columns]`; `columns`: name → range, such as "[0, 180]".
+
+    Lines that begin with # and one line of names are passed over. Raises `FileError` if it cannot be read,
+    `ConfigError` for a line that is not so many numbers in their ranges.
+    """
+    rows: list[list[float]] = []
+    named = False
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
+    try:
+        for cells in lines:
+            if not cells or cells[0].lstrip().startswith("#"):
+                continue
+            try:
+                row = [parse_number(cell) for cell, _ in zip(cells, columns, strict=False)]
+            except ValueError:
+                row = []
+            if len(row) < len(columns):
+                if rows or named:
+                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
+                named = True
+                continue
+            for value, (name, within) in zip(row, columns.items(), strict=True):
+                if value not in Interval.read(within):
+                    raise ValueError(f"{name} = {value:g} is outside {within}")
+            rows.append(row)
+    except (ValueError, csv.Error) as error:  # the latter: a cell of more than 131 072 characters
+        raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
+    return np.array(rows, np.float64).reshape(-1, len(columns))
+
+
+# Writing
 
 
 def json_text(value: Any, *, indent: int = 2) -> str:

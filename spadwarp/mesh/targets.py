@@ -1,11 +1,13 @@
-"""Targets: mesh files and built-in shapes, placed in the world and seen from the camera."""
+"""Targets: built-in shapes and mesh files, placed in the world and seen from the camera, and where it is focused."""
 
 from __future__ import annotations
 
 import logging
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,18 +16,115 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.mesh.builtins import SIZED_BUILTINS, make_builtin
-from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
-from spadwarp.mesh.files import check_sizes, check_triangles
-from spadwarp.mesh.usd import USD_ENDINGS, read_usd
+from spadwarp.limits import suggestion
+from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
+from spadwarp.scene import Scene, Target
+from spadwarp.scene.frustum import points_inside, view_planes
+from spadwarp.scene.port_rays import PortGeometry, camera_port
 from spadwarp.scene.pose import rotation_matrix, to_camera
+
+__all__ = [
+    "BUILTINS",
+    "SIZED_BUILTINS",
+    "MeshSummary",
+    "TriangleMesh",
+    "build_mesh",
+    "builtin_names",
+    "describe_mesh",
+    "focus_distance",
+    "guess_unit",
+    "load_target",
+    "make_builtin",
+]
 
 if TYPE_CHECKING:
     import trimesh
 
-    from spadwarp.scene import Scene, Target
 
-__all__ = ["TriangleMesh", "build_mesh", "load_target"]
+SIZED_BUILTINS = ("plane", "box", "sphere")
+"""Built-ins of 1 m that `size` stretches; the others have sizes of their own."""
+
+
+def builtin_names() -> tuple[str, ...]:
+    """Names that `builtin` can take."""
+    from spadwarp.mesh.shapes import SHAPES
+
+    return (*BUILTINS, *SHAPES)
+
+
+def make_builtin(name: str) -> trimesh.Trimesh:
+    """The built-in `name` as a mesh in its own frame [m], built once and copied for each caller.
+
+    Raises `ArgumentError` for a name that is not among `builtin_names()`.
+    """
+    if name not in (known := builtin_names()):
+        raise ArgumentError(f"builtin = {name!r} is not one of {', '.join(map(repr, known))}{suggestion(name, known)}")
+    return _built(name).copy()
+
+
+@cache
+def _built(name: str) -> trimesh.Trimesh:
+    if name in BUILTINS:
+        return BUILTINS[name]()
+    from spadwarp.mesh.shapes import SHAPES
+    from spadwarp.mesh.solids import to_trimesh
+
+    return to_trimesh(SHAPES[name]())
+
+
+def _staircase() -> trimesh.Trimesh:
+    """The paper's staircase (a 4 m plate with nine bars): one closed mesh, face at z = 0, bars towards −z.
+
+    Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal
+    bars, the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half
+    free, the strip is at the middle of the plate, as in the depth maps that the paper's authors published.
+    """
+    plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
+    left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]
+    upper = [((0.0, y, -proud), (2.0, y + 0.6, 0.1)) for y, proud in ((-2.0, 0.3), (-1.3, 0.2), (-0.6, 0.1))]
+    lower = [((x, 0.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((0.03, 0.3), (0.7, 0.2), (1.37, 0.1))]
+    return _union([plate, *left, *upper, *lower])
+
+
+def _union(boxes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> trimesh.Trimesh:
+    """One closed mesh of axis-aligned boxes, each given by its lowest and its highest corner."""
+    import trimesh
+
+    mesh = trimesh.boolean.union([trimesh.creation.box(bounds=bounds) for bounds in boxes], engine="manifold")
+    mesh.vertices = np.round(mesh.vertices, 6)  # the union came back in float32
+    return mesh
+
+
+def _plane() -> trimesh.Trimesh:
+    """A square of side 1 m at z = 0 that faces −z, two triangles."""
+    import trimesh
+
+    corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
+    return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
+
+
+def _box() -> trimesh.Trimesh:
+    """A cube of side 1 m about the origin, twelve triangles."""
+    import trimesh
+
+    return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+
+
+def _sphere() -> trimesh.Trimesh:
+    """A ball of diameter 1 m about the origin: an icosahedron subdivided three times, 1280 triangles, corners on it."""
+    import trimesh
+
+    return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+
+
+BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
+    "staircase": _staircase,
+    "plane": _plane,
+    "box": _box,
+    "sphere": _sphere,
+}
+"""The geometric built-ins: functions without arguments that make a new mesh in its own frame [m]."""
+
 
 # What trimesh says about a damaged file, with a stack, is for those who have set up logging; an error says the rest.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -175,12 +274,14 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
 
 def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[trimesh.Trimesh, Images]:
     """`load_target`, and the images of a file that gives the reflectance."""
+    import trimesh
+
     images: Images = ()
     if target.mesh is not None:
         name, path = f"{field}.mesh = {target.mesh!r}" if field else target.mesh, Path(target.mesh)
         if (problem := file_problem(path)) is not None:
             raise MeshError(f"{name}: {problem}{similar(path) if problem == 'no such file' else ''}")
-        if path.suffix.lower() not in MESH_ENDINGS and path.suffix[1:].lower() not in _other_endings():
+        if path.suffix.lower() not in MESH_ENDINGS and path.suffix[1:].lower() not in trimesh.available_formats():
             raise MeshError(f"{name}: {path.suffix!r} is no ending of a mesh file; {', '.join(MESH_ENDINGS)} are read")
         if target.reflectance == "from_file":
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
@@ -195,8 +296,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
             raise ConfigError(f"{field}.{error}") from error
         if target.size is not None and target.builtin not in SIZED_BUILTINS:
             raise ConfigError(
-                f"{field}.size = {list(target.size)} does not go with builtin = {target.builtin!r}, which has its own;"
-                f" it goes with {', '.join(SIZED_BUILTINS)}, and scale with all"
+                f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
+                f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
             )
     if len(mesh.faces) == 0:
         raise MeshError(f"{name}: the mesh has no faces")
@@ -242,13 +343,6 @@ def placement(
     return matrix
 
 
-def _other_endings() -> set[str]:
-    """Endings, without the dot, of the formats that trimesh reads."""
-    import trimesh
-
-    return trimesh.available_formats()
-
-
 def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     """A mesh file in the file's own axes, several objects in it as one; in metres where the format has units."""
     import trimesh
@@ -267,3 +361,161 @@ def _read_mesh(path: Path, name: str) -> trimesh.Trimesh:
     if (np.abs(mesh.vertices) < 1e15).all():  # else merging would leave the range of integers
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
+
+
+# What a mesh file holds, before it stands in a scene
+
+# Units of mesh files in the order of likelihood, and the longest sides of things under water [m].
+_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "µm": 1e-6}
+_SIDES = (0.03, 30.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshSummary:
+    """A mesh file.
+
+    Attributes:
+        path: The file.
+        faces: Triangles with an area.
+        extent: Size along x, y, z, in the file's unit.
+        centre: Centre of the bounding box, in the file's unit.
+        unit: The unit in which it has the size of a thing under water: m, mm, cm or µm; None if there is none.
+        scale: For `targets.scale`: this unit in metres; 1 without one.
+        longest: Longest side with this scale [m].
+        is_watertight: Whether every edge belongs to two faces, so that there is an inside.
+        is_inside_out: Whether the faces of a closed mesh are wound inwards. It makes no difference here.
+        bodies: Parts that do not touch.
+    """
+
+    path: Path
+    faces: int
+    extent: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    unit: str | None
+    scale: float
+    longest: float
+    is_watertight: bool
+    is_inside_out: bool
+    bodies: int
+
+    @property
+    def hints(self) -> tuple[str, ...]:
+        """Advice for its target in a scene."""
+        found = []
+        if self.scale != 1.0:
+            found.append(f"scale = {self.scale:g} if the unit is {self.unit}: {self.longest:.3g} m long")
+        if self.unit is None:
+            found.append(f"{max(self.extent):.3g} long: neither m, mm nor cm makes it the size of a thing under water")
+        offset = max(abs(place) for place in self.centre)
+        if offset > 0.5 * max(self.extent):
+            place = ", ".join(f"{self.scale * x:.3g}" for x in self.centre)
+            found.append(f"its centre is at ({place}) m, not at the origin: translation has to allow for that")
+        if self.extent[2] > 1.5 * max(self.extent[:2]):
+            found.append(
+                "longest along z, the direction of view: rotation_deg = [90, 0, 0] stands a mesh upright whose z is "
+                "up, [0, 90, 0] shows its side"
+            )
+        if not self.is_watertight:
+            found.append("not closed: light may pass through gaps; faces reflect on both sides")
+        return tuple(found)
+
+
+def describe_mesh(path: str | Path) -> MeshSummary:
+    """Size, unit, orientation and closedness of a mesh file (STL, OBJ, PLY, OFF, GLB, USD). Raises `MeshError`."""
+    mesh = load_target(Target(mesh=str(path)), field="")
+    low, high = np.asarray(mesh.bounds, np.float64)
+    extent, centre = high - low, 0.5 * (low + high)
+    guess = guess_unit(float(extent.max()))
+    closed = bool(mesh.is_watertight)
+    return MeshSummary(
+        path=Path(path),
+        faces=len(mesh.faces),
+        extent=(float(extent[0]), float(extent[1]), float(extent[2])),
+        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
+        unit=None if guess is None else guess[0],
+        scale=1.0 if guess is None else guess[1],
+        longest=float(extent.max()) * (1.0 if guess is None else guess[1]),
+        is_watertight=closed,
+        is_inside_out=closed and float(mesh.volume) < 0.0,
+        bodies=_bodies(mesh),
+    )
+
+
+def guess_unit(longest: float) -> tuple[str, float] | None:
+    """Name and metres of the likeliest unit of a mesh whose longest side is `longest`; None if none fits."""
+    fitting = [(name, metres) for name, metres in _UNITS.items() if _SIDES[0] <= longest * metres <= _SIDES[1]]
+    return fitting[0] if fitting else None
+
+
+def _bodies(mesh: trimesh.Trimesh) -> int:
+    import trimesh
+
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    return int(labels.max()) + 1 if len(labels) else 0
+
+
+# Focus
+
+# Stands for infinity behind a port [m].
+_FAR = 1e6
+
+
+def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
+    """Depth that the scene's camera images sharply [m]; None for a pinhole, which images all depths sharply.
+
+    `camera.focus_distance`, or for "target" the depth of the first face on the optical axis; without one there, that of
+    the point in view which is seen closest to the axis; without any, infinity. Nothing nearer than the focal length and
+    the aperture's radius counts: no lens can be focused there. Behind a port, it is the depth in air at which the lens
+    sees that point: 0.75 of it behind a flat one, some radii behind a dome.
+
+    Args:
+        scene: Whose camera.
+        mesh: From `spadwarp.mesh.build_mesh`.
+    """
+    camera, port = scene.camera, camera_port(scene)
+    if camera.pinhole:
+        return None
+    if camera.focus_distance != "target":
+        return camera.focus_distance
+    if port is not None:
+        return _apparent_distance(scene, port, mesh)
+    if mesh is None:
+        return math.inf
+    triangles = mesh.vertices[mesh.faces].astype(np.float64)
+    nearest = max(camera.focal_length or 0.0, camera.aperture_radius)
+    return _first_depth(triangles, lambda: points_inside(triangles, view_planes(camera)), nearest) or math.inf
+
+
+def _apparent_distance(scene: Scene, port: PortGeometry, mesh: TriangleMesh | None) -> float:
+    """Depth in air at which the lens sees the first target on its axis, or what is seen closest to that."""
+    start, axis, _, _ = port.enter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    depth = None
+    if mesh is not None:
+        frame = np.linalg.svd(axis[None])[2]
+        frame = np.stack([frame[1], frame[2], axis])
+        triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
+        depth = _first_depth(triangles, lambda: triangles.reshape(-1, 3), 0.0)
+    return port.apparent_distance(start + (depth or _FAR) * axis)
+
+
+def _first_depth(
+    triangles: NDArray[np.float64], points: Callable[[], NDArray[np.float64]], nearest: float
+) -> float | None:
+    """Depth beyond `nearest` of the first of the triangles `[F, 3, 3]` on the z axis, else that of the point which is
+    seen closest to the axis; None without any."""
+    depth = _axis_depths(triangles)
+    if (depth > nearest).any():
+        return float(depth[depth > nearest].min())
+    seen = points()
+    seen = seen[seen[:, 2] > nearest]
+    return float(seen[np.argmin(np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]), 2]) if len(seen) else None
+
+
+def _axis_depths(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depths at which the z axis meets triangles `[F, 3, 3]`, edges included."""
+    x, y, z = np.moveaxis(triangles, 2, 0)
+    # Twice the signed areas between the axis and each edge, as seen along it: the corners' weights.
+    weights = np.roll(x, -1, axis=1) * np.roll(y, -2, axis=1) - np.roll(x, -2, axis=1) * np.roll(y, -1, axis=1)
+    met = ((weights >= 0.0).all(axis=1) | (weights <= 0.0).all(axis=1)) & (weights != 0.0).any(axis=1)
+    weights, z = weights[met], z[met]
+    return (weights * z).sum(axis=1) / weights.sum(axis=1)

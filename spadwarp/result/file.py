@@ -12,11 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.io.exr import read_exr, write_exr
-from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
-from spadwarp.io.hdf5_file import Hdf5File
-from spadwarp.io.hdf5_packing import write_packed
+from spadwarp.io.arrays import read_exr, write_exr
+from spadwarp.io.hdf5 import (
+    PIXELS,
+    Coordinate,
+    Hdf5File,
+    image_coordinates,
+    name_dimensions,
+    read_hdf5,
+    write_hdf5,
+    write_packed,
+)
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
 from spadwarp.result.batch_moments import moments_of

@@ -158,7 +158,7 @@ def _normals(
 
 def _channel(path: str | Path, names: Sequence[str], shape: tuple[int, ...]) -> NDArray[Any]:
     """The first of the named channels, or the only one that ends in `.name`; float, `[H, W]`."""
-    from spadwarp.io.exr import read_exr
+    from spadwarp.io.arrays import read_exr
 
     channels, _ = read_exr(_existing(path))
     for name in names:

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spadwarp.io.hdf5_dimensions import PIXELS
-from spadwarp.io.hdf5_file import Hdf5File
-from spadwarp.io.hdf5_packing import write_packed
+from spadwarp.io.hdf5 import PIXELS, Hdf5File, write_packed
 from spadwarp.result.signed_tallies import SignedTallies
 
 __all__ = ["SIGNED_DIMENSIONS", "read_signed", "write_signed"]

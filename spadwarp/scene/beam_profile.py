@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.io.exr import read_exr
-from spadwarp.io.npy import read_npy
+from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 import yaml
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.parsing import parse_json, read_text
-from spadwarp.io.text import write_text
+from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.limits import check_integer, check_real, parse_number, shown
 
 if TYPE_CHECKING:

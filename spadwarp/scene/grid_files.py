@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
-from spadwarp.io.npy import read_npz
 from spadwarp.io.paths import existing_file
 
 __all__ = ["GRID_ARRAYS", "LARGEST_CELL_COUNT", "GridFile", "read_grid"]

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.parsing import parse_toml
+from spadwarp.io.text import parse_toml
 from spadwarp.limits import parse_number, shown, suggestion
 from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
 from spadwarp.scene.phase_fields import PHASE_FIELDS

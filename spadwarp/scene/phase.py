@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.parsing import read_columns
+from spadwarp.io.text import read_columns
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.preset import PHASE_TABLES
 from spadwarp.water import molecular_density

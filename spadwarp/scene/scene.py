@@ -12,9 +12,8 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.examples import example_or_path
-from spadwarp.io.parsing import parse_toml, read_toml
-from spadwarp.io.paths import MESH_ENDINGS, used
+from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
+from spadwarp.io.text import parse_toml, read_toml
 from spadwarp.limits import shown
 from spadwarp.scene import load
 from spadwarp.scene.analytic import Analytic

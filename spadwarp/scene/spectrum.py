@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.parsing import read_columns
+from spadwarp.io.text import read_columns
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser, Scene

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.io.parsing import read_text
+from spadwarp.io.text import read_text
 from spadwarp.limits import check_integer, check_real, parse_number, shown
 from spadwarp.scene.scene import Scene
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError
-from spadwarp.io.hdf5 import read_hdf5, write_hdf5
-from spadwarp.io.hdf5_dimensions import Coordinate, name_dimensions
+from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.result.file import read_ledger

@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from spadwarp.viz.panels import mark_pixels
 from spadwarp.viz.style import (
     BLUE,
     DEPTH_MAP,
@@ -29,15 +28,15 @@ from spadwarp.viz.style import (
     colour_map,
     columns_that_fit,
     log_axis,
+    mark_pixels,
+    middle_text,
     new_figure,
+    panel_grid,
     paper,
     plain_axis,
     save,
     wrapped,
 )
-
-__all__ = ["METHODS", "SCORES", "TITLES", "draw_photon_sweep", "draw_ranking", "draw_reliability", "draw_samples"]
-__all__ += ["draw_scores"]
 
 METHODS = {
     "input": ("noisy input", "0.5", "x", "--"),
@@ -161,7 +160,7 @@ def draw_samples(
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_color("0.8")
             if image is None:
-                axis.text(0.5, 0.5, "not run", ha="center", va="center", color="0.5", transform=axis.transAxes)
+                middle_text(axis, "not run", color="0.5")
                 continue
             shown = np.where(target, image, np.nan)[part]
             drawn = axis.imshow(shown, cmap=colour_map(DEPTH_MAP), vmin=low, vmax=high)
@@ -200,10 +199,9 @@ def draw_ranking(
     """
     fields = ("psnr", "ssim", "rmse_mm", "edge_mm")
     order = list(means)[::-1]
-    columns = columns_that_fit(len(fields), width, 1.6)
-    lines = len(fields) // columns
-    figure = new_figure(width, lines * (0.24 * len(order) + 0.65) + 0.45)
-    for axis, field in zip(figure.subplots(lines, columns, sharey=True).ravel(), fields, strict=True):
+    figure, axes = panel_grid(4, width, least=1.6, height=0.24 * len(order) + 0.65, more=0.45, sharey=True)
+    for axis, field in zip(axes, fields, strict=True):
+        axis.grid(False)
         values = [means[method][field] for method in order]
         axis.barh(range(len(order)), values, color=[METHODS[method][1] for method in order], height=0.7)
         for y, value in enumerate(values):
@@ -213,7 +211,6 @@ def draw_ranking(
         axis.locator_params(axis="x", nbins=3)
         better = "more is better" if larger_is_better[field] else "less is better"
         axis.set_xlabel(f"{SCORES[field][0]}\n({better})")
-        axis.spines[["top", "right"]].set_visible(False)
     return save(figure, path, note=note)
 
 
@@ -232,26 +229,22 @@ def draw_photon_sweep(
 
     One panel for each signal-to-background ratio (SBR), `[S]`. `width`: of the picture [inch]. Returns the path.
     """
-    columns = columns_that_fit(len(sbr), width, 1.6)
-    lines = -(-len(sbr) // columns)
     in_line = columns_that_fit(len(rmse) + 1, width, 1.75)
-    figure = new_figure(width, 2.3 * lines + 0.7 + 0.14 * (len(rmse) // in_line))
-    axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=False)):
+    more = 0.7 + 0.14 * (len(rmse) // in_line)
+    figure, axes = panel_grid(len(sbr), width, least=1.6, height=2.3, more=more, sharex=True, sharey=True)
+    for row, (axis, ratio) in enumerate(zip(axes, sbr, strict=True)):
         for name, values in rmse.items():
             label = "likelihood of each pixel" if name == "input" else TITLES[name]
             axis.plot(photons, 1e3 * values[row], label=label, **_line(name, name == "histograms"))
         axis.plot(photons, 1e3 * bound[row], color="black", linestyle=":", label="Cramér–Rao bound of a pixel")
         axis.set(xscale="log", yscale="log", title=f"signal to background {ratio:g}")
+        columns = axis.get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
         if row % columns == 0:
             axis.set_ylabel("RMSE of depth [mm]")
         if row >= len(sbr) - columns:
             axis.set_xlabel("signal photons per pixel")
             axis.tick_params(labelbottom=True)
-        plain_axis(axis)
-    for axis in axes[len(sbr) :]:
-        axis.remove()
-    for axis in axes[: len(sbr)]:
+    for axis in axes:
         log_axis(axis, "x", most=4)
         log_axis(axis, "y")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -268,9 +261,7 @@ def draw_reliability(
     `tables`: by method and what the probability is of, pixels and those of which it was true, `[10, 2]`. A bar is the
     standard error of a part of so many pixels, taken as independent. `width`: of the picture [inch].
     """
-    columns = columns_that_fit(2, width, 2.8)
-    figure = new_figure(width, 3.3 if columns == 2 else 5.6)
-    axes = figure.subplots(2 // columns, columns, sharex=True, sharey=True).ravel()
+    figure, axes = panel_grid(2, width, least=2.8, height=2.3, more=1.0, sharex=True, sharey=True)
     kinds = {"target": "the pixel sees a target", "confidence": "its depth is right to 1 % of the gate"}
     for axis, (kind, title) in zip(axes, kinds.items(), strict=True):
         axis.plot([0, 1], [0, 1], color="0.7", linestyle=":", label="exactly right")
@@ -283,11 +274,9 @@ def draw_reliability(
                 axis.errorbar(middle[some], part[some], yerr=error[some], label=TITLES[method], **line)
         axis.set(title=title, xlim=(0, 1), ylim=(0, 1), ylabel="part of the pixels of which it is true")
         axis.minorticks_on()
+        axis.set_xlabel("probability given")
         axis.legend(loc="upper left")
-        plain_axis(axis)
         axis.label_outer()
-    axes[-1].set_xlabel("probability given")
-    axes[0].set_xlabel("probability given" if columns == 2 else "")
     return save(figure, path, note=note)
 
 

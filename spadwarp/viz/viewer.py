@@ -1,32 +1,40 @@
-"""A run as one HTML file that any browser shows without a network: `view`."""
+"""A run as one HTML file that any browser shows without a network, `view`, or as a moving picture, `video`."""
 
 from __future__ import annotations
 
 import base64
+import shutil
+import subprocess
 import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.export import FrameSequence
-from spadwarp.frames.monte_carlo_noise import noise_caption
-from spadwarp.frames.sequence_file import SequenceFile
-from spadwarp.io.paths import check_apart
+from spadwarp.frames.file import SequenceFile
+from spadwarp.frames.spad import noise_caption
+from spadwarp.io.paths import atomic_path, check_apart
+from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Channel, Result, received
 from spadwarp.scene import Scene
-from spadwarp.scene.sight import LinesOfSight, lines_of_sight
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz import style
-from spadwarp.viz.pages import write_page
-from spadwarp.viz.panels import median_pixel
 from spadwarp.viz.result import channel_text
+from spadwarp.viz.style import DEPTH_MAP, INTENSITY_MAP, LIGHT_MAP, colour_map, median_pixel, new_figure, paper
 
-__all__ = ["HISTOGRAM_BYTES", "reported_depths", "view"]
+__all__ = ["video", "view"]
 
 HISTOGRAM_BYTES = 5_000_000
 """Largest size of the packed histograms [bytes]; with plotly and the images a page stays below 15 MB."""
@@ -52,19 +60,18 @@ class _Layer:
 class _Page:
     """The content of a page, from a result or from frames of a camera."""
 
-    title: str
     caption: str
     scene: Scene
-    depth: NDArray[np.float64]
+    depth: NDArray[Any]
     method: str
-    truth: NDArray[np.float64]
-    reflectance: NDArray[np.float64] | None
-    intensity: NDArray[np.float64]
+    truth: NDArray[Any]
+    intensity: NDArray[Any]
     intensity_label: str
     layers: list[_Layer]
     edges: NDArray[np.float64]
     unit: str
     response: InstrumentResponse
+    reflectance: NDArray[Any] | None = None
 
 
 def view(
@@ -111,7 +118,8 @@ def view(
         raise ArgumentError(f"channel = {channel!r}: only results have channels")
     else:
         page = _of_frames(held, method, frame) if isinstance(held, FramesFile) else _of_depth(held, method, frame)
-    write_page(path, "viewer.html", title=page.title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
+    title = "spadwarp" if page.scene.source is None else Path(page.scene.source).stem
+    write_page(path, "viewer.html", title=title, caption=page.caption, data=_data(page), plotly=get_plotlyjs())
     return Path(path)
 
 
@@ -125,7 +133,6 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
     return _Page(
-        title=_name(scene),
         caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
         + (", interrupted" if result.partial else "")
         + channel_text(result.provenance.get("channel"))
@@ -133,8 +140,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         scene=scene,
         depth=result.depth(method=chosen, device=device),
         method=chosen,
-        truth=result.truth.depth.astype(np.float64),
-        reflectance=result.truth.reflectance.astype(np.float64),
+        truth=result.truth.depth,
+        reflectance=result.truth.reflectance,
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
         layers=[
@@ -157,15 +164,13 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     background = np.broadcast_to(file.background, counts.shape)
     mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
-        title=_name(file.scene),
         caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
         f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
         scene=file.scene,
-        depth=file.depth(chosen, frame).astype(np.float64),
+        depth=file.depth(chosen, frame),
         method=chosen,
-        truth=file.truth_depth.astype(np.float64),
-        reflectance=None,
-        intensity=file.intensity(frame).astype(np.float64),
+        truth=file.truth_depth,
+        intensity=file.intensity(frame),
         intensity_label="counts in the frame",
         layers=[
             _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
@@ -187,15 +192,13 @@ def _of_depth(held: Held, method: str | None, frame: int) -> _Page:
     assert shown.scene is not None and shown.depth is not None
     cube, edges = reported_depths(frames, frame)
     return _Page(
-        title=_name(shown.scene),
         caption=f"frame {frame} of {frames.count}: {shown.content}; histograms are of the depths that the frames of "
         "this scene report",
         scene=shown.scene,
-        depth=shown.images["Z"].astype(np.float64),
+        depth=shown.images["Z"],
         method="stored",
-        truth=shown.depth.astype(np.float64),
-        reflectance=None,
-        intensity=shown.images.get("intensity", shown.images["background"]).astype(np.float64),
+        truth=shown.depth,
+        intensity=shown.images.get("intensity", shown.images["background"]),
         intensity_label="recorded photons" if "intensity" in shown.images else "background photon (1) or return (0)",
         layers=[_Layer(label="frames", colour="#999999", cube=cube, factor=1.0, filled=True)],
         edges=edges,
@@ -221,44 +224,37 @@ def reported_depths(frames: FrameSequence, frame: int) -> tuple[NDArray[np.int64
     return cube.reshape(scene.camera.height, scene.camera.width, bins), edges
 
 
-def _name(scene: Scene) -> str:
-    return "spadwarp" if scene.source is None else Path(scene.source).stem
-
-
 # The page's data
-
-
-def _port_shifts(lines: LinesOfSight) -> list[float]:
-    """Of the axis of ranges: what ports add to a path, and to a range [m]; for a laser close to the lens."""
-    if not lines.bent:
-        return [0.0, 0.0]
-    both = 2.0 if lines.laser_port is not None else 1.0
-    return [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
 
 
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
     scene = page.scene
+    depth, truth, intensity = (np.asarray(image, np.float64) for image in (page.depth, page.truth, page.intensity))
     lines = lines_of_sight(scene)
     laser = np.zeros(3) if lines.bent else lines.laser
-    path = lines.path_from_range(lines.range_from_depth(page.truth))
+    path = lines.path_from_range(lines.range_from_depth(truth))
     arrival = path / scene.medium.pulse_speed
-    cloud = lines.points(lines.range_from_depth(page.depth))
+    port = [0.0, 0.0]  # what ports add to a path, and to a range [m]; for a laser close to the lens
+    if lines.bent:
+        both = 2.0 if lines.laser_port is not None else 1.0
+        port = [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
+    cloud = lines.points(lines.range_from_depth(depth))
     histograms, block, merged = _histograms(page.layers)
     edges = page.edges[::merged]
     if edges[-1] != page.edges[-1]:
         edges = np.append(edges, page.edges[-1])
-    images = {"depth": page.depth, "truth": page.truth, "error": page.depth - page.truth, "intensity": page.intensity}
+    images = {"depth": depth, "truth": truth, "error": depth - truth, "intensity": intensity}
     if page.reflectance is not None:
         images["reflectance"] = page.reflectance
     return {
-        "shape": list(page.depth.shape),
-        "images": {name: _packed(image, "<f4") for name, image in images.items()},
-        "cloud": [_packed(cloud[..., axis], "<f4") for axis in range(3)],
-        "arrival": _packed(1e9 * arrival, "<f4"),
-        "towards": _packed(lines.direction @ laser, "<f4"),
+        "shape": list(depth.shape),
+        "images": {name: _packed(image) for name, image in images.items()},
+        "cloud": [_packed(cloud[..., axis]) for axis in range(3)],
+        "arrival": _packed(1e9 * arrival),
+        "towards": _packed(lines.direction @ laser),
         "laser": float(laser @ laser),
-        "port": _port_shifts(lines),
+        "port": port,
         "speed": 1e-9 * scene.medium.pulse_speed,
         "method": page.method,
         "intensityLabel": page.intensity_label,
@@ -269,7 +265,7 @@ def _data(page: _Page) -> dict[str, Any]:
         "unit": page.unit,
         "sparse": not any(layer.filled for layer in page.layers),
         "response": _response(page.response),
-        "first": median_pixel(page.intensity, np.isfinite(page.depth) & np.isfinite(page.truth)),
+        "first": median_pixel(intensity, np.isfinite(depth) & np.isfinite(truth)),
     }
 
 
@@ -299,20 +295,17 @@ def _pack(values: NDArray[Any], layer: _Layer) -> dict[str, Any]:
     metadata = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
     high = float(values.max())
     if layer.filled and high < 65536:
-        return {**metadata, "kind": "whole", "codes": _deflated(values.astype("<u2"))}
+        return {**metadata, "kind": "whole", "codes": _packed(values, "<u2")}
     lowest = high * 10.0**-_DECADES
     codes = np.zeros(values.shape, dtype=np.uint8)
     valid = values > lowest
     codes[valid] = 1 + np.round(254.0 / _DECADES * np.log10(values[valid] / lowest)).astype(np.uint8)
-    return {**metadata, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _deflated(codes)}
+    return {**metadata, "kind": "log", "lowest": lowest, "decades": _DECADES, "codes": _packed(codes, "u1")}
 
 
-def _packed(values: NDArray[Any], kind: str) -> str:
-    return _deflated(values.astype(kind))
-
-
-def _deflated(values: NDArray[Any]) -> str:
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 6)).decode("ascii")
+def _packed(values: NDArray[Any], kind: str = "<f4") -> str:
+    """The values, deflated, as text."""
+    return base64.b64encode(zlib.compress(values.astype(kind).tobytes(), 6)).decode("ascii")
 
 
 def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
@@ -327,3 +320,229 @@ def _response(response: InstrumentResponse) -> dict[str, list[float]] | None:
         "delay": [round(1e9 * float(delay), 6) for delay in delays[kept]],
         "value": [round(float(value), 5) for value in density[kept] / density.max()],
     }
+
+
+def write_page(path: str | Path, template: str, **values: Any) -> None:
+    """Writes a page of its own: values are escaped except where the template says `safe`. Raises `FileError`."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined)
+    pages.policies["json.dumps_kwargs"] = {}  # keys stay in their order
+    text = pages.get_template(template).render(values)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+# Moving pictures
+
+
+_VIDEO_DECADES = 4.0  # of the logarithmic colour scale
+_DPI = 140
+
+
+def video(
+    source: Held | str | Path,
+    path: str | Path = "light.gif",
+    *,
+    window_ns: tuple[float, float] | None = None,
+    pictures: int = 120,
+    fps: float = 12.0,
+    scale: Literal["log", "linear"] = "log",
+    frame: int = 0,
+) -> Path:
+    """Writes what each pixel receives, bin after bin, as an animated GIF or an MP4; returns its path.
+
+    Every picture is a time of flight: first backscatter, then the target from near to far. All pictures have one colour
+    scale, whose upper end is the 99.9th percentile of the values above zero.
+
+    Args:
+        source: What `spadwarp.load` returns, or a path that it takes. Of an analytic file or a dataset, the frames of
+            one scene that report a time. Of a scene that moves, true depth, measured depth and counts, frame by frame.
+        path: Ends in `.gif`, or in `.mp4`, which needs ffmpeg: on the PATH, or by `pip install 'spadwarp[video]'`.
+        window_ns: Times of flight from and to [ns]; default: from the first to the last light of the gate.
+        pictures: Largest number of pictures; bins are merged where there are more.
+        fps: Pictures per second.
+        scale: "log" over four decades, or "linear".
+        frame: Number of the frame, from 0, where the source holds frames.
+
+    Raises:
+        ArgumentError: An argument out of range, or another ending.
+        FileError: A file cannot be read or written, or ffmpeg is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise ArgumentError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
+    pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
+    check_choice("scale", scale, ("log", "linear"))
+    check_apart(path, source)
+    source = source if isinstance(source, Held) else load(source)
+    if isinstance(source, SequenceFile):
+        _write(_of_sequence(source, pictures), path, fps)
+        return path
+    cube, edges, label, metres_per_ns = _light(source, frame)
+    kept = _window(cube, edges, window_ns)
+    cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
+    merged = -(-cube.shape[2] // pictures)
+    starts = np.arange(0, cube.shape[2], merged)
+    cube = np.add.reduceat(cube, starts, axis=2)
+    edges = np.append(edges[starts], edges[-1])
+    label += " and picture" if merged > 1 else " and bin"
+    _write(_of_light(cube, edges, label, metres_per_ns, scale), path, fps)
+    return path
+
+
+def _write(drawn: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    with atomic_path(path) as temporary:
+        write(drawn, temporary, fps)
+
+
+def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
+    """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
+    if isinstance(run, Result):
+        return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
+    if not isinstance(run, FramesFile):
+        frames = sequence(run)
+        reported, times = reported_depths(frames, frame)
+        scene = frames.at(frame).scene
+        assert scene is not None
+        return reported.astype(np.float64), 1e9 * times, "frames per pixel", 1e-9 * scene.medium.pulse_speed
+    counts, edges = run.counts(frame).astype(np.float64), 1e9 * (run.gate_start + run.edges)
+    return counts, edges, "counts per pixel", 1e-9 * run.scene.medium.pulse_speed
+
+
+def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
+    """The bins of a window [ns], or those from the first to the last with light in them."""
+    if window_ns is not None:
+        window_ns = (check_real("window_ns", window_ns[0]), check_real("window_ns", window_ns[1]))
+        first, last = (int(np.searchsorted(edges, time, side="right")) - 1 for time in window_ns)
+        first, last = max(first, 0), min(max(last, 0), len(edges) - 2)
+        if not window_ns[0] < window_ns[1] or window_ns[0] >= edges[-1] or window_ns[1] <= edges[0]:
+            raise ArgumentError(
+                f"window_ns = {window_ns} has no part of the gate, {edges[0]:.5g} to {edges[-1]:.5g} ns"
+            )
+        return slice(first, last + 1)
+    filled = np.flatnonzero(cube.any(axis=(0, 1)))
+    return slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, cube.shape[2])
+
+
+def _pictures(figure: Figure, count: int, show: Callable[[int], None]) -> Iterator[NDArray[np.uint8]]:
+    """RGB pictures, one after the other; `show` puts into the figure what changes."""
+    figure.set_dpi(_DPI)
+    canvas = FigureCanvasAgg(figure)
+    for index in range(count):
+        show(index)
+        canvas.draw()
+        if index == 0:
+            figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _of_light(
+    cube: NDArray[np.float64], edges: NDArray[np.float64], label: str, metres_per_ns: float, scale: str
+) -> Iterator[NDArray[np.uint8]]:
+    """A picture for each bin."""
+    figure, image, title = _light_figure(cube, label, scale)
+
+    def show(index: int) -> None:
+        image.set_data(cube[:, :, index])
+        middle = 0.5 * (edges[index] + edges[index + 1])
+        title.set_text(f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+
+    return _pictures(figure, cube.shape[2], show)
+
+
+@paper()
+def _light_figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, AxesImage, Text]:
+    """The figure of all pictures, with what changes between them."""
+    height, width = cube.shape[:2]
+    values = cube[cube > 0]
+    top = float(np.percentile(values, 99.9)) if values.size else 1.0
+    norm = LogNorm(top * 10.0**-_VIDEO_DECADES, top) if scale == "log" else Normalize(0.0, top)
+    colours = colour_map(LIGHT_MAP).with_extremes(bad="black", under="black")
+    image_height = float(np.clip(3.6 * height / width, 1.1, 6.5))
+    figure = new_figure(3.9, image_height + 0.95)
+    axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.1])
+    axes.set(xticks=[], yticks=[])
+    image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm)
+    figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
+    return figure, image, axes.set_title(" ")
+
+
+@paper()
+def _of_sequence(file: SequenceFile, most: int) -> Iterator[NDArray[np.uint8]]:
+    """True depth, measured depth and counts of evenly chosen frames, at most `most`; all have the same scales."""
+    method = file.best_method
+    chosen = range(0, file.frames, -(-file.frames // most))
+    truth = [file.truth(number).depth for number in chosen]
+    counts = [file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen]
+    known = np.concatenate([image[np.isfinite(image)] for image in truth])
+    near, far = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
+    margin = 0.1 * (far - near) + 0.05
+    depth = Normalize(near - margin, far + margin)
+    light = Normalize(0.0, max(1.0, float(np.percentile(counts, 99.5))))
+    height, width = truth[0].shape[:2]
+    image_height = float(np.clip(2.3 * height / width, 0.9, 4.5))
+    figure = new_figure(7.2, image_height + 1.0)
+    axes, bars = figure.subplots(2, 3, height_ratios=[image_height, 0.1])
+    images = []
+    kinds = (("true depth", depth, DEPTH_MAP), ("measured depth", depth, DEPTH_MAP), ("counts", light, INTENSITY_MAP))
+    for axis, bar, (name, scale, colours) in zip(axes, bars, kinds, strict=True):
+        axis.set(xticks=[], yticks=[], title=name)
+        images.append(axis.imshow(np.zeros((height, width)), cmap=colour_map(colours), norm=scale))
+        label = "counts per pixel" if name == "counts" else "depth z [m]"
+        figure.colorbar(images[-1], cax=bar, orientation="horizontal", label=label)
+    title = figure.suptitle(" ")
+
+    def show(index: int) -> None:
+        number = chosen[index]
+        measured = np.full(truth[index].shape, np.nan) if method is None else file.depth(method, number)
+        for image, values in zip(images, (truth[index], measured, counts[index]), strict=True):
+            image.set_data(values)
+        title.set_text(f"frame {number}, {file.trajectory.times[number]:.4g} s")
+
+    return _pictures(figure, len(chosen), show)
+
+
+def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    from PIL import Image
+
+    frames: list[Any] = []
+    palette = None
+    for picture in pictures:
+        image = Image.fromarray(picture)
+        # One palette for all pictures, from the colour bar in the first, so that colours do not flicker.
+        palette = image.quantize(255) if palette is None else palette
+        frames.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
+    frames[0].save(
+        path, format="GIF", save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, optimize=False
+    )
+
+
+def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    program = shutil.which("ffmpeg")
+    if program is None:
+        try:
+            from imageio_ffmpeg import get_ffmpeg_exe
+        except ModuleNotFoundError as error:
+            raise FileError("an MP4 needs ffmpeg: pip install 'spadwarp[video]', or write a .gif") from error
+        program = get_ffmpeg_exe()
+    first = next(pictures)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps)]
+    # Players need even sides and colours at half resolution.
+    command += ["-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-pix_fmt", "yuv420p"]
+    command += ["-movflags", "+faststart", "-f", "mp4", str(path)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None and process.stderr is not None
+    try:
+        process.stdin.write(first.tobytes())
+        for picture in pictures:
+            process.stdin.write(picture.tobytes())
+        process.stdin.close()
+    except BrokenPipeError:
+        pass  # ffmpeg's message follows
+    message = process.stderr.read().decode(errors="replace").strip()
+    process.stderr.close()
+    if process.wait() != 0:
+        raise FileError(f"{path}: ffmpeg failed: {message}")

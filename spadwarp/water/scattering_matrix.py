@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.parsing import read_columns
+from spadwarp.io.text import read_columns
 from spadwarp.limits import check_real
 
 __all__ = [

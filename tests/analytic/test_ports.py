@@ -11,7 +11,7 @@ from spadwarp.analytic import pixel_maps, scene_eye_limit
 from spadwarp.analytic.optics import as_if_bare
 from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.files.depth import gate_of, stored_depth
+from spadwarp.files.loader import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.port_rays import camera_port

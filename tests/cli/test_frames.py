@@ -6,7 +6,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, run, tables
-from spadwarp.io.exr import read_exr
+from spadwarp.io.arrays import read_exr
 
 # The shared run has few photons on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")

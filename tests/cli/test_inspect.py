@@ -32,7 +32,7 @@ def test_validation_says_what_failed(tmp_path, monkeypatch):
 
 
 def test_targets_are_listed_and_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr("spadwarp.viz.targets.builtin_names", lambda: ("plane", "staircase"))
+    monkeypatch.setattr("spadwarp.viz.scenes.builtin_names", lambda: ("plane", "staircase"))
     printed = run("targets", "--out", tmp_path / "out", "--json", tmp_path / "printed.json", *DEVICE)
     assert "staircase" in printed.stdout and "4.00 x 4.00 x 0.70 m" in printed.stdout
     assert (tmp_path / "out" / "targets.png").read_bytes().startswith(b"\x89PNG")

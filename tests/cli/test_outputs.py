@@ -8,7 +8,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, ENVIRONMENT, run, tables
-from spadwarp.io.lock import lock
+from spadwarp.io.paths import lock
 
 
 def refused(*arguments, words=()):

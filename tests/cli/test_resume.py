@@ -10,7 +10,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, start, tables
-from spadwarp.run import load_resumable
+from spadwarp.files import load_resumable
 
 
 def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):

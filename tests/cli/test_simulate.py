@@ -11,10 +11,10 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, tables
-from spadwarp.io.atomic import atomic_path
-from spadwarp.io.exr import read_exr
+from spadwarp.files import write_run
+from spadwarp.io.arrays import read_exr
+from spadwarp.io.paths import atomic_path
 from spadwarp.result.file import load_truth_maps
-from spadwarp.run import write_run
 from spadwarp.transport.records import load_records
 
 
@@ -191,7 +191,7 @@ def test_result_survives_pictures_that_cannot_be_loaded(scene, tmp_path, monkeyp
     def missing(*_):
         raise ImportError("matplotlib is broken")
 
-    monkeypatch.setattr("spadwarp.run.directory._pictures", missing)
+    monkeypatch.setattr("spadwarp.files.run._pictures", missing)
     result = spadwarp.simulate(scene, photons=1000, device="cpu")
     with pytest.raises(ImportError, match="broken"):
         write_run(result, tmp_path)
@@ -209,8 +209,8 @@ def test_an_interrupt_leaves_no_parts_of_pictures(scene, tmp_path, monkeypatch):
             time.sleep(0.01)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spadwarp.run.directory._pictures", lambda *_: [draw])
-    monkeypatch.setattr("spadwarp.run.directory._save", interrupted)
+    monkeypatch.setattr("spadwarp.files.run._pictures", lambda *_: [draw])
+    monkeypatch.setattr("spadwarp.files.run._save", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_run(spadwarp.simulate(scene, photons=1000, device="cpu"), tmp_path)
     assert not any(tmp_path.iterdir())

@@ -29,8 +29,8 @@ from spadwarp.dataset import (
     load_recipe,
     verify_dataset,
 )
-from spadwarp.dataset.histograms import HISTOGRAM_FIELDS
-from spadwarp.io.exr import write_exr
+from spadwarp.dataset.shards import HISTOGRAM_FIELDS
+from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.units import SPEED_OF_LIGHT
 
@@ -402,10 +402,10 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
     tables = {**TABLES, "targets": {"exports": ["exports"]}}
     path = written(Recipe.from_dict(tables), tmp_path)
     make(path, tmp_path / "data")
-    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "albedo", "label")):
+    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "reflectance", "label")):
         clean, valid = item["clean"][0], depth < 60000
         assert (np.isfinite(clean) == valid).all() and item["distance"] == 15.0
-        assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["albedo"][0][valid] == 0.25).all()
+        assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["reflectance"][0][valid] == 0.25).all()
         right = valid & (item["label"][0] == 0)
         assert np.abs(item["noisy"][0][right] - 15.0).max() < 0.05
     traced = load_recipe(path).with_overrides({"monte_carlo.share": 0.5})
@@ -537,18 +537,3 @@ def test_plan_needs_no_order():
     assert plan.scene(3).scene == plan.scene(3).scene != plan.scene(2).scene
     assert plan.scene(3).fractions == tuple(plan.fraction(9 + k) for k in range(3))
     assert not math.isnan(plan.scene(0).fractions[0])
-
-
-def test_older_words_in_a_recipe_mean_and_draw_the_same():
-    pulses = {"low": 1000.0, "high": 9000.0}
-    words = (("pulses", "detector.fold", "paper"), ("pulses_per_depth_frame", "detector.wrap", "lu2024"))
-    tables = (
-        {**TABLES, "exposure": {name: pulses}, "vary": {path: [True, False], "analytic.form": [form, "radiometric"]}}
-        for name, path, form in words
-    )
-    older, now = (Plan(Recipe.from_dict(table)) for table in tables)
-    drawn = [older.scene(index).scene for index in range(older.scene_count)]
-    assert drawn == [now.scene(index).scene for index in range(now.scene_count)]
-    assert {scene.detector.wrap for scene in drawn} == {True, False}
-    changed = now.recipe.with_overrides({"exposure.pulses": 7.0})
-    assert changed.exposure.pulses_per_depth_frame.choices == (7.0,)

@@ -12,7 +12,7 @@ import spadwarp
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader, export_dataset
-from spadwarp.dataset.features import FEATURE_NAMES, histogram_features
+from spadwarp.dataset.export import FEATURE_NAMES, histogram_features
 from spadwarp.errors import ArgumentError, FileError
 
 FIELDS = ("noisy", "clean", "label", "intensity", "bound")

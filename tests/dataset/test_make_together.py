@@ -12,7 +12,7 @@ from helpers.cli import ENVIRONMENT
 from helpers.datasets import checksums, make, recipe, written
 from spadwarp.dataset import make as making
 from spadwarp.dataset import verify_dataset
-from spadwarp.io.lock import lock
+from spadwarp.io.paths import lock
 
 SMALL = {"frames.per_scene": 1}
 MAKE = """

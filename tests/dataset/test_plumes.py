@@ -4,7 +4,7 @@ import pytest
 
 import spadwarp
 from spadwarp.dataset import Recipe, load_recipe
-from spadwarp.dataset.sampling import Plan
+from spadwarp.dataset.plan import Plan
 
 PLUME = {"probability": 0.5, "optical_depth": {"low": 0.5, "high": 2.0}, "cells": 12, "size": 1.5}
 
@@ -47,5 +47,5 @@ def test_plumes_and_layers_exclude_each_other(small):
     tables = small.to_dict()
     layers = [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]
     tables["scene"] = {**tables["scene"], "medium": {**tables["scene"]["medium"], "layers": layers}}
-    with pytest.raises(spadwarp.ConfigError, match="does not go with layers"):
+    with pytest.raises(spadwarp.ConfigError, match="cannot be combined with layers"):
         Recipe.from_dict({**tables, "plume": PLUME}, source=small.source)

@@ -8,10 +8,8 @@ import torch
 from scipy.stats import norm
 
 from spadwarp import ArgumentError
-from spadwarp.denoise.belief_propagation import beliefs
-from spadwarp.denoise.likelihood import CLASSICAL, classical_depth
-from spadwarp.denoise.semi_global import aggregate
-from spadwarp.denoise.total_variation import total_variation
+from spadwarp.denoise.baselines import CLASSICAL, classical_depth
+from spadwarp.denoise.classical import aggregate, beliefs, total_variation
 
 pytestmark = pytest.mark.fast
 

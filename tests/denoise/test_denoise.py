@@ -33,7 +33,7 @@ from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
 from spadwarp.denoise.training_run import read_scenes
 from spadwarp.frames import instrument_response, record_frames
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
 
 
 def invoke(*arguments, code=0):

@@ -11,7 +11,7 @@ from scipy.stats import exponnorm, norm
 from helpers.stepped_frames import denoised
 from spadwarp import ArgumentError, DeviceError
 from spadwarp.denoise import apply, estimate, histogram_inputs, synthetic_noise
-from spadwarp.denoise.guide import GUIDES
+from spadwarp.denoise.classical import GUIDES
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features, log_likelihood
 from spadwarp.denoise.recipe import Noise
 

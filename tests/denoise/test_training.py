@@ -12,11 +12,10 @@ from spadwarp import ConfigError, FileError
 from spadwarp.denoise import network_files, networks, pyramid, selection, training
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.histogram_features import FEATURES
-from spadwarp.denoise.losses import loss_of
 from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training import fit
-from spadwarp.denoise.training_steps import Workers
+from spadwarp.denoise.training_steps import Workers, loss_of
 
 
 def scenes(count=4, size=64):

@@ -13,10 +13,10 @@ from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth, water_profile
 from spadwarp.denoise.frames import depth_frames
 from spadwarp.denoise.gates import bins_of_target, gates_of_target
+from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import WEIGHTS
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.denoise.target_probability import corrected_target
-from spadwarp.io.exr import read_exr
+from spadwarp.io.arrays import read_exr
 
 OF_DEPTH = [name for name in MODELS if name != "histograms"]
 of_depth = pytest.mark.parametrize("model", OF_DEPTH)

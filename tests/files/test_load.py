@@ -152,8 +152,7 @@ def test_sequences_of_all_kinds(files):
             frames.at(99)
     with pytest.raises(spadwarp.ArgumentError, match="source is a int"):
         sequence(3)
-    with open_source(files["dataset"], split="test") as frames:
-        assert frames.count == 6
+    assert open_source(files["dataset"], split="test").count == 6
 
 
 def test_checkpoints_and_results_are_told_apart(files):

@@ -1,7 +1,8 @@
-"""Files of other programs: what they say is read, what they do not say is asked for or said."""
+"""Files of other programs: what they say is read, what they do not say is asked for, what is damaged is refused."""
 
 import inspect
 import os
+import struct
 from pathlib import Path
 
 import h5py
@@ -259,3 +260,45 @@ def test_captures_of_others(name, shape, options, metres):
     assert found.values.shape[:2] == shape and found.values.dtype == np.int32
     depth = spadwarp.frames.depth_of(found, method="peak", group_index=1.0, device="cpu").values
     assert metres[0] < np.nanmedian(depth) < metres[1]
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    pytest.importorskip("ptufile")
+    result = make_result(make_scene(width=6, height=4, bins=16))
+    frames = spadwarp.detect(result, pulses=1000, frames=2, seed=1, device="cpu")
+    path = tmp_path_factory.mktemp("ptu") / "frames.ptu"
+    spadwarp.export(frames, path, result=result)
+    return path.read_bytes()
+
+
+def changed(content, tag, value):
+    """The file with another value of a tag: its name in 32 bytes, an index and a type, then the value."""
+    place = content.index(tag.encode() + b"\0") + 40
+    packed = struct.pack("<d" if isinstance(value, float) else "<q", value)
+    return content[:place] + packed + content[place + 8 :]
+
+
+MARKERS = ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame")
+DAMAGED = [(tag, value, f"{tag} = ") for tag in MARKERS for value in (2**62, 2**31, 10**9, -1)]  # powers of two of them
+DAMAGED += [
+    ("MeasDesc_Resolution", value, r"frames\.ptu: ") for value in (0.0, -1.0, 1e300, float("nan"), float("inf"))
+]
+DAMAGED += [("TTResult_NumberOfRecords", 2**40, "TTResult_NumberOfRecords"), ("ImgHdr_PixX", 10**9, ".")]
+DAMAGED += [("ImgHdr_PixY", 10**9, ".")]
+
+
+@pytest.mark.parametrize(("tag", "value", "words"), DAMAGED)
+def test_a_ptu_of_which_one_number_was_changed_is_refused_soon(content, tag, value, words, tmp_path):
+    (tmp_path / "frames.ptu").write_bytes(changed(content, tag, value))
+    with pytest.raises(spadwarp.SpadwarpError, match=words):
+        read_histograms(tmp_path / "frames.ptu")
+
+
+def test_channels_are_added_up_and_named(tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    counts = np.random.default_rng(1).poisson(1.0, (4, 5, 3, 16)).astype(np.uint8)
+    ptufile.imwrite(tmp_path / "three.ptu", counts, global_resolution=50e-9, tcspc_resolution=1e-10)
+    read = read_histograms(tmp_path / "three.ptu", gate_start=0.0)
+    np.testing.assert_array_equal(read.values, counts.sum(2))
+    assert "3 channels, added up" in "; ".join(read.notes)

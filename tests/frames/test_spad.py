@@ -1,15 +1,19 @@
-"""The camera: from expected detections to frames of counts and depth."""
+"""The camera: from expected detections to frames of counts and depth; the noise of the simulation in them."""
 
 import math
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
+import spadwarp
+from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp import ArgumentError
-from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities
+from spadwarp.errors import SpadwarpWarning
+from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities, monte_carlo_noise
 from spadwarp.scene import Detector, Laser
 
 BIN = 100e-12
@@ -229,6 +233,8 @@ def test_a_shallow_counter_is_full():
         ({"source": np.full((2, 2, 5), -1.0)}, r"source holds a negative or non-finite value in pixel \(0, 0\)"),
         ({"source": np.full((2, 2, 5), np.nan)}, "source holds"),
         ({"source": np.zeros((2, 5))}, r"source has shape \(2, 5\)"),
+        ({"detector": {}}, "detector = .* is not the section detector of a scene"),
+        ({"laser": {}}, "laser = .* is not the section laser of a scene"),
         ({"background": np.zeros((2, 2, 5))}, r"background has shape \(2, 2, 5\)"),
         ({"background": np.full((2, 3, 500), -1.0)}, "background holds"),
         ({"pulses": 0}, "pulses = 0"),
@@ -255,9 +261,6 @@ def test_wrong_input_is_named(changes, message):
 def test_a_result_has_its_own_time_axis():
     with pytest.raises(ArgumentError, match="gate_start and bin_width are for arrays"):
         detect(SimpleNamespace(scene=object()), pulses=10, seed=1, gate_start=0.0)
-    for name in ("detector", "laser"):
-        with pytest.raises(ArgumentError, match=f"{name} = .* is not the section {name} of a scene"):
-            detect(_spike(3), pulses=10, seed=1, **{**CALL, name: {}})
 
 
 def test_wrong_counts_are_named():
@@ -272,3 +275,40 @@ def test_wrong_counts_are_named():
             coates(np.array([[3, 4]]), pulses=pulses)
     with pytest.raises(ValueError, match="hazard holds a negative"):
         first_photon_probabilities(np.array([[0.1, -0.2]]))
+
+
+WEAK = Laser(pulse_energy=1e-15)  # far from pile-up
+
+
+def test_frames_of_two_runs_differ_by_what_is_said(whole):
+    """Pixel by pixel, the mean over frames is off by the standard error, in units of the shot noise of a frame."""
+    result = whole[True]
+    pulses = 100_000
+    noise = monte_carlo_noise(result, pulses=pulses, laser=WEAK)
+    part = 10  # runs of a tenth of the photons, whose spread is larger by its root
+    others = [spadwarp.simulate(scene(), photons=result.photons // part, seed=k, device="cpu") for k in range(100, 124)]
+    scale = pulses * WEAK.photons_per_pulse * result.scene.detector.pde
+    spread = np.std([other.intensity for other in others], axis=0, ddof=1) * scale / np.sqrt(part)
+    dark = pulses * result.scene.detector.noise_rate * (result.scene.gate.stop - result.scene.gate.start)
+    ratio = spread / np.sqrt(result.intensity * scale + dark)
+    # Each spread has a relative standard error of 1/sqrt(2 * 23), and so has the standard error from the batches.
+    assert noise.ratio == pytest.approx(np.quantile(ratio, 0.95), rel=0.3)
+    assert noise.photons_needed == pytest.approx(noise.photons * (noise.ratio / 0.5) ** 2)
+
+
+def test_longer_exposures_show_more_of_it(whole):
+    one, hundred = (monte_carlo_noise(whole[True], pulses=pulses, laser=WEAK) for pulses in (10**4, 10**6))
+    # Shot noise of a pixel grows with the square root of the pulses, the standard error with their number.
+    assert hundred.ratio == pytest.approx(10 * one.ratio)
+    assert hundred.photons_needed == pytest.approx(100 * one.photons_needed)
+
+
+def test_a_warning_with_numbers_or_a_note_that_nobody_knows(whole):
+    keywords = {"laser": WEAK, "seed": 1, "device": "cpu"}
+    with pytest.warns(SpadwarpWarning, match=r"Monte Carlo noise.* of the pixels, and .* photons instead of") as caught:
+        frames = spadwarp.detect(whole[True], pulses=10**8, **keywords)
+    assert len(caught) == 1 and frames.notes == ()
+    with warnings.catch_warnings(action="error"):
+        quiet = spadwarp.detect(whole[True], pulses=1000, **keywords)
+        unknown = spadwarp.detect(whole[False], pulses=1000, **keywords)
+    assert quiet.notes == () and "Monte Carlo noise is unknown" in unknown.notes[0]

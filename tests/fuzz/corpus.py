@@ -10,7 +10,7 @@ import trimesh
 
 import spadwarp
 from helpers.datasets import recipe
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
 from spadwarp.transport import save_records, trace
 
 SCENE = b"""[medium]

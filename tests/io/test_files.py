@@ -13,10 +13,9 @@ from hypothesis.extra import numpy as arrays
 
 from helpers.cli import ENVIRONMENT
 from spadwarp.errors import FileError
-from spadwarp.io.atomic import atomic_path, remove_temporaries
-from spadwarp.io.exr import read_exr, write_exr
+from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import write_hdf5
-from spadwarp.io.lock import lock
+from spadwarp.io.paths import atomic_path, lock, remove_temporaries
 
 
 def test_a_write_that_fails_midway_says_where_and_cleans_up(tmp_path):
@@ -103,13 +102,14 @@ def test_a_lock_has_one_holder_and_leaves_no_file(tmp_path):
     with lock(path) as again:
         assert again
     assert not list(tmp_path.iterdir())
-    with pytest.raises(FileError, match="cannot be written"), lock(tmp_path / "none" / "lock"):
+    (tmp_path / "file").touch()
+    with pytest.raises(FileError, match="cannot be written"), lock(tmp_path / "file" / "lock"):
         pass
 
 
 HOLD = """
 import sys
-from spadwarp.io.lock import lock
+from spadwarp.io.paths import lock
 with lock(sys.argv[1]):
     print(flush=True)
     sys.stdin.read()

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.exr import write_exr
-from spadwarp.io.parsing import parse_json, parse_toml, read_columns, read_text
+from spadwarp.io.arrays import write_exr
 from spadwarp.io.paths import file_problem
+from spadwarp.io.text import parse_json, parse_toml, read_columns, read_text
 from spadwarp.limits import Interval, check_integer, check_real, parse_number, shown
 
 

@@ -218,19 +218,6 @@ def test_every_format_gives_the_same_cube(tmp_path: Path, ending: str, upper: bo
     np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.1, 4.85], [0.05, 0.1, 5.15]], atol=1e-7)
 
 
-def test_objects_of_a_glb_scene_are_joined_where_they_stand(tmp_path: Path) -> None:
-    path = tmp_path / "two.glb"
-    parts = trimesh.Scene()
-    parts.add_geometry(trimesh.creation.box(extents=(1, 1, 1)))
-    parts.add_geometry(
-        trimesh.creation.box(extents=(1, 1, 1)), transform=trimesh.transformations.translation_matrix([4, 0, 0])
-    )
-    parts.export(path)
-    mesh = load_target(Target(mesh=str(path)))
-    assert len(mesh.faces) == 24
-    np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.5, -0.5], [4.5, 0.5, 0.5]])
-
-
 # What is refused
 
 
@@ -267,8 +254,6 @@ def test_the_scene_file_is_named(tmp_path: Path) -> None:
         ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
                        b"property float z\nend_header\n0 0 0\n"),
         ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
-        ("out_of_range.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-        ("out_of_range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"),
     ],
 )  # fmt: skip
 def test_files_without_a_mesh_are_refused_by_name(tmp_path: Path, name: str, content: bytes) -> None:
@@ -277,30 +262,11 @@ def test_files_without_a_mesh_are_refused_by_name(tmp_path: Path, name: str, con
     assert error_of({"mesh": str(path)}).startswith(f"targets[1].mesh = {str(path)!r}: ")
 
 
-@pytest.mark.parametrize("value", ["nan", "inf"])
+@pytest.mark.parametrize("value", ["nan", "inf", "1e39"])
 def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path, value: str) -> None:
     path = tmp_path / "bad.off"
     path.write_text(f"OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n1 {value} 0\n3 0 1 2\n3 1 3 2\n")
     assert "1 of 2 faces have coordinates that are not finite" in error_of({"mesh": str(path)})
-
-
-def test_meshes_beyond_float32_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "huge.off"
-    path.write_text("OFF\n3 1 0\n0 0 0\n1e39 0 0\n0 1 0\n3 0 1 2\n")
-    assert "not finite" in error_of({"mesh": str(path)})
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "problem"),
-    [
-        ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", ""),
-        ("material.obj", "mtllib\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "without the name of a material file"),
-    ],
-)
-def test_incomplete_mesh_files_are_refused(tmp_path: Path, name: str, text: str, problem: str) -> None:
-    path = tmp_path / name
-    path.write_text(text)
-    assert problem in error_of({"mesh": str(path), "reflectance": "from_file" if problem else 0.5})
 
 
 @pytest.mark.parametrize(("name", "text"), [("empty.obj", "# nothing\n"), ("text.stl", "hello")])
@@ -338,7 +304,7 @@ def test_built_ins_that_do_not_exist_are_refused_with_the_names_of_those_that_do
 
 def test_size_goes_with_those_that_have_none_of_their_own() -> None:
     with pytest.raises(
-        ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] does not go with builtin = 'staircase'"
+        ConfigError, match=r"targets\[0\]\.size = \[2\.0, 2\.0\] cannot be combined with builtin = 'staircase'"
     ):
         build_mesh(scene_of({"builtin": "staircase", "size": [2.0, 2.0]}))
 
@@ -378,22 +344,3 @@ def test_an_open_mesh_and_one_of_no_likely_unit_are_told(tmp_path):
     assert found.unit is None and found.scale == 1.0 and any("neither" in hint for hint in found.hints)
     with pytest.raises(MeshError, match="no such file"):
         describe_mesh(tmp_path / "nothing.stl")
-
-
-def test_a_damaged_image_is_an_error_of_the_mesh(tmp_path, capfd) -> None:
-    """Pillow opens it and fails when the pixels are read; trimesh's own warnings do not reach the terminal."""
-    from PIL import Image
-
-    pixels = np.random.default_rng(1).integers(0, 255, (32, 32, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    whole = (tmp_path / "a.png").read_bytes()
-    middle = len(whole) // 2
-    (tmp_path / "a.png").write_bytes(whole[:middle] + bytes(200) + whole[middle + 200 :])
-    (tmp_path / "a.mtl").write_text("newmtl one\nmap_Kd a.png\n")
-    (tmp_path / "a.obj").write_text(
-        "mtllib a.mtl\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl one\nf 1/1 2/2 3/3\n"
-    )
-    scene = scene_of({"mesh": str(tmp_path / "a.obj"), "translation": [0.0, 0.0, 5.0], "reflectance": "from_file"})
-    with pytest.raises(MeshError, match="an image that is damaged"):
-        build_mesh(scene)
-    assert "Traceback" not in capfd.readouterr().err

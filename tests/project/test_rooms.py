@@ -11,7 +11,6 @@ KERNELS = Path(__file__).parents[2] / "kernels" / "spadwarp_kernels"
 LEVELS = (
     ("cli",),
     ("benchmark", "doctor", "validate"),
-    ("run",),
     ("denoise",),
     ("viz",),
     ("files",),

@@ -11,7 +11,7 @@ import pytest
 
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.exr import read_exr
+from spadwarp.io.arrays import read_exr
 from spadwarp.result import (
     Result,
     load_result,

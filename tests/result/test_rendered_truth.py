@@ -8,7 +8,7 @@ import pytest
 
 from helpers.scenes import scene
 from spadwarp.errors import FileError
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
 from spadwarp.result.rendered_truth import load_truth_exr
 from spadwarp.scene.geometry import pixel_directions
 

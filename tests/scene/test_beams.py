@@ -13,7 +13,7 @@ import spadwarp
 import spadwarp.checks.checks
 from helpers.scenes import scene
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.exr import write_exr
+from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import beam_profile
 from spadwarp.scene.pose import rotation_matrix

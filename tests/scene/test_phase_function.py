@@ -10,7 +10,7 @@ from helpers.scenes import scene
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.parsing import read_columns
+from spadwarp.io.text import read_columns
 from spadwarp.scene import Medium
 from spadwarp.scene.phase import PHASE_COLUMNS
 from spadwarp.scene.preset import PHASE_TABLES

@@ -17,7 +17,7 @@ from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
 from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
-from spadwarp.mesh.colours import srgb_to_linear
+from spadwarp.mesh.files import srgb_to_linear
 from spadwarp.scene import Target
 
 pytestmark = pytest.mark.physics
@@ -216,7 +216,7 @@ PLAIN_PLY = (
     ("name", "content", "message"),
     [
         ("plain.ply", None, "neither colours nor materials"),
-        ("plain.stl", None, "does not go with .stl; PLY, OBJ, GLB and OFF files can hold colours"),
+        ("plain.stl", None, "cannot be combined with .stl; PLY, OBJ, GLB and OFF files can hold colours"),
         ("uv.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n", "coordinates and no image"),
         ("lost.obj", "mtllib lost.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "lost.mtl' is missing"),
         ("noise.off", "OFF\nnothing\n", "not a readable mesh file"),

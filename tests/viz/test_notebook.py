@@ -91,7 +91,7 @@ def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
 
 def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
     display = pytest.importorskip("IPython.display")
-    from spadwarp.viz import progress
+    from spadwarp.viz import notebook
 
     shown = []
 
@@ -105,7 +105,7 @@ def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
         return Handle()
 
     monkeypatch.setattr(display, "display", first)
-    monkeypatch.setattr(progress, "_in_notebook", lambda: True)
+    monkeypatch.setattr(notebook, "_in_notebook", lambda: True)
     bar = spadwarp.viz.progress_bar("frames")
     for stage, done, total in (("compile", 0, 0), ("<note>", 0, 0), ("frames", 1, 4), ("frames", 4, 4)):
         bar(stage, done, total)
@@ -150,12 +150,12 @@ def test_labelled_arrays_go_into_a_file(result, tmp_path):
 
 def test_tables_as_data_frames():
     rows = spadwarp.budget(SCENE, [1.0, 2.0])
-    table = spadwarp.data_frame(rows)
+    table = spadwarp.to_pandas(rows)
     assert list(table.range) == [1.0, 2.0] and "sigma_depth" in table.columns
     curves = spadwarp.sweep(SCENE, vary="medium.extinction=0.1:0.3:3", device="cpu")
-    swept = spadwarp.data_frame(curves)
+    swept = spadwarp.to_pandas(curves)
     assert swept.index.name == "medium.extinction" and list(swept.index) == pytest.approx([0.1, 0.2, 0.3])
     assert np.array_equal(swept.signal, curves.column("signal"))
-    assert spadwarp.data_frame(spadwarp.scene.presets("medium")).name[0] == "petzold-autec-8"
+    assert spadwarp.to_pandas(spadwarp.scene.presets("medium")).name[0] == "petzold-autec-8"
     with pytest.raises(spadwarp.ArgumentError, match="data classes or dicts"):
-        spadwarp.data_frame([1, 2])
+        spadwarp.to_pandas([1, 2])

@@ -47,17 +47,13 @@ def test_previews_show_the_target(tmp_path: Path) -> None:
     [
         make_result(make_scene(targets=[]), empty=True),
         dataclasses.replace(make_result(make_scene(distance=1000.0)), partial=True, seed=2**64 - 1),
+        make_result(make_scene(width=1, height=1, bins=8)),
+        make_result(make_scene(width=48, height=1, bins=8)),
     ],
-    ids=["empty", "far away"],
+    ids=["empty", "far away", "a pixel", "a line"],
 )
-def test_frames_without_returns_or_targets_are_shown(result: Result, tmp_path: Path) -> None:
+def test_every_result_is_shown(result: Result, tmp_path: Path) -> None:
     check_pictures(result, tmp_path, method="peak")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 1)])
-def test_every_image_shape_is_shown(width: int, height: int, tmp_path: Path) -> None:
-    check_pictures(make_result(make_scene(width=width, height=height, bins=8)), tmp_path, method="peak")
 
 
 @pytest.mark.slow

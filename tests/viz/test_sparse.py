@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spadwarp.viz.sparse import merged_edges, merged_means, shared_edges, typical_weight
+from spadwarp.viz.result import merged_edges, merged_means, shared_edges, typical_weight
 
 
 @pytest.mark.parametrize("seed", range(3))

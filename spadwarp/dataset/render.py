@@ -1,0 +1,289 @@
+"""One scene of a dataset rendered by the analytic model or by photon transport: its maps, and its frames as they are
+stored."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.analytic.model import pixel_maps
+from spadwarp.analytic.optics import scene_optics
+from spadwarp.dataset.plan import Plan, SceneDraw
+from spadwarp.device import pick_device
+from spadwarp.errors import ConfigError, kernel_errors
+from spadwarp.frames import Frames, crlb, detect
+from spadwarp.result import Truth, degree_of_polarisation, received
+from spadwarp.scene import Scene
+from spadwarp.scene.geometry import gate_deviation, pixel_directions
+from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight
+from spadwarp.transport import simulate, truth_maps
+from spadwarp.units import path_from_time
+
+PROFILE_BINS = 64
+"""Bins of `backscatter_profile`."""
+
+Profile = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrames:
+    """Frames as they are stored.
+
+    Attributes:
+        depth, intensity: Codes, uint16 and uint8 `[K, H, W]`.
+        label: Packed bits, uint8 `[K, H, ceil(W/8)]`.
+        intensity_step: Recorded photons per unit of intensity.
+        counts: Of a traced scene, int32 `[K, H, W, T]`.
+    """
+
+    depth: NDArray[np.uint16]
+    intensity: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+    intensity_step: float
+    counts: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedScene:
+    """A scene's maps and its frames.
+
+    Attributes:
+        draw: What was drawn for it.
+        scene: The scene with its final number of pulses.
+        truth: What the camera would see through clear water.
+        bound: Cramér–Rao bound of the depth in one frame, float32 `[H, W]` [m]; NaN for no estimate.
+        profile: Density of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`, and the edges of its
+            bins [m].
+        signal, backscatter: Expected detections per pulse, median over the target's pixels and over all.
+        frames: Codes of depth and intensity, labels, counts.
+        expected: Expected counts of a frame before pile-up, float16 `[H, W, T]`; None for a scene that was not traced.
+        polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
+    """
+
+    draw: SceneDraw
+    scene: Scene
+    truth: Truth
+    bound: NDArray[np.float32]
+    profile: Profile
+    signal: float
+    backscatter: float
+    frames: StoredFrames
+    expected: NDArray[np.float16] | None = None
+    polarisation: NDArray[np.float16] | None = None
+
+
+def intensity_step(brightest: float) -> float:
+    """Photons per unit with which the brightest pixel, fluctuations included, fits into 8 bits; a whole number."""
+    return max(1.0, math.ceil((brightest + 6.0 * math.sqrt(brightest)) / 255.0))
+
+
+def backscatter_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> Profile:
+    """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
+    axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
+    gate = path_from_time(np.array([scene.gate.start, scene.gate.stop]), scene.medium.group_index)
+    ends = axis.depth_from_range(axis.range_from_path(gate))
+    edges = np.linspace(ends[0], ends[1], PROFILE_BINS + 1)
+    below = np.interp(edges, axis.depth_from_range(axis.range_from_path(paths)), cumulative)
+    return (np.diff(below) / np.diff(edges)).astype(np.float32), edges.astype(np.float32)
+
+
+def with_exposure(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64], *, most: int) -> Scene:
+    """The scene with as many pulses, at most `most`, as give the median pixel the signal photons that were drawn.
+
+    `detections`: of the return per pulse, in the pixels that see it. None drawn: the scene as it is. Raises
+    `ConfigError` where nothing returns.
+    """
+    if draw.signal_photons is None:
+        return scene
+    if not detections.size:
+        raise ConfigError(
+            f"scene {draw.index}: no return within the gate; the target's distance is {draw.distance:.4g} m"
+        )
+    pulses = min(max(1, round(draw.signal_photons / float(np.median(detections)))), most)
+    return scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
+
+
+_MOST_PULSES = 2**40
+_COARSE = 8  # every eighth pixel of every eighth row decides the exposure
+
+
+def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
+    """Truth, bound and frames of a drawn scene. Raises `ConfigError` for one without a return."""
+    scene, target = draw.scene, plan.targets[draw.target]
+    truth = truth_maps(scene, device=device) if target.export is None else target.truth(scene.camera)
+    view = pixel_directions(scene.camera)
+    by_rates = math.isnan(draw.fractions[0])
+
+    def maps_of(scene: Scene, part: Any, *, outliers: bool = False) -> Any:
+        return pixel_maps(
+            scene,
+            view=view[part].reshape(-1, 3),
+            distance=truth.range[part].reshape(-1),
+            normal=truth.normal[part].reshape(-1, 3),
+            reflectance=truth.reflectance[part].reshape(-1),
+            device=device,
+            outliers=outliers,
+        )
+
+    if draw.signal_photons is not None:
+        middle = slice(_COARSE // 2, None, _COARSE)
+        coarse = maps_of(scene, (middle, middle))[0]
+        # Of the recorded photons, the share signal / alpha comes from the target.
+        signal = coarse["signal"] / coarse["alpha"] * -np.expm1(-coarse["alpha"])
+        scene = with_exposure(scene, draw, signal[coarse["fisher"] > 0], most=_MOST_PULSES)
+    maps, table = maps_of(scene, ..., outliers=by_rates)
+    seen = maps["fisher"] > 0
+    # No bound is worse than a guess anywhere in the gate.
+    guess = gate_deviation(scene, lines_of_sight(scene).direction.reshape(-1, 3))
+    bound = np.where(seen, np.minimum(maps["sigma_depth"], guess), np.nan)
+    axis = np.array([[0.0, 0.0, 1.0]])
+    paths, cumulative = pixel_maps(
+        scene, view=axis, distance=[np.nan], normal=axis, reflectance=[0.0], device=device, outliers=False
+    )[1]
+    return RenderedScene(
+        draw=draw,
+        scene=scene,
+        truth=truth,
+        bound=bound.reshape(truth.depth.shape).astype(np.float32),
+        profile=backscatter_profile(scene, paths[0], cumulative[0]),
+        signal=float(np.median(maps["signal"][seen])) if seen.any() else 0.0,
+        backscatter=float(np.median(maps["backscatter"])),
+        frames=_draw_frames(plan, draw, scene, truth, maps, table, bound, device=device),
+    )
+
+
+@kernel_errors()
+def _draw_frames(
+    plan: Plan,
+    draw: SceneDraw,
+    scene: Scene,
+    truth: Truth,
+    maps: dict[str, NDArray[np.float64]],
+    table: tuple[NDArray[Any], NDArray[Any]],
+    bound: NDArray[np.float64],
+    *,
+    device: str | None,
+) -> StoredFrames:
+    import warp as wp
+
+    from spadwarp_kernels.analytic import FrameCoding, draw_frames
+
+    on = pick_device(device)
+    shape, view = truth.depth.shape, pixel_directions(scene.camera).reshape(-1, 3)
+    probability, flat, fractions = _background(scene, draw, maps)
+    speed, pulses = scene.medium.pulse_speed, scene.pulses_per_depth_frame
+
+    def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=on)
+
+    coding: Any = FrameCoding()
+    optics, ports = scene_optics(scene)
+    coding.laser = wp.vec3(*scene.beam.position)
+    coding.nearest, coding.farthest = scene.gate.start * speed, scene.gate.stop * speed
+    coding.width, coding.pixels = shape[1], truth.depth.size
+    coding.seed = wp.uint64(plan.split_seeds[plan.split_of(draw.index)])
+    coding.first_sample = wp.int64(draw.index * plan.frames_per_scene)
+    coding.depth_offset, coding.depth_step = plan.depth_offset, plan.depth_step
+    coding.pulses = float(pulses)
+    coding.intensity_step = intensity_step(float((pulses * -np.expm1(-maps["alpha"])).max()))
+    depth, intensity, labels = draw_frames(
+        coding,
+        put(view, wp.vec3),
+        put(np.where(np.isnan(bound), np.nan, truth.depth.reshape(-1))),
+        *map(put, (bound, maps["alpha"], probability, flat, *table, fractions)),
+        optics=optics,
+        ports=ports,
+    )
+    count = len(draw.fractions)
+    return StoredFrames(
+        depth=depth.numpy().reshape(count, *shape),
+        intensity=intensity.numpy().reshape(count, *shape),
+        label=labels.numpy().reshape(count, shape[0], -1),
+        intensity_step=coding.intensity_step,
+    )
+
+
+def _background(
+    scene: Scene, draw: SceneDraw, maps: dict[str, NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Per pixel the probability to report background and the share of it that is even over the gate; factors of the
+    frames."""
+    backscatter = maps["backscatter"]
+    if not math.isnan(draw.fractions[0]):
+        # The backscatter fraction counts all pixels, those that look into open water as well.
+        return np.where(backscatter > 0, 1.0, 0.0), np.zeros_like(backscatter), np.array(draw.fractions)
+    dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
+    noise = backscatter + dark
+    # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
+    alone = -np.expm1(-scene.pulses_per_depth_frame * noise)
+    probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
+    flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
+    return probability, flat, np.ones(len(draw.fractions))
+
+
+_MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
+
+
+def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
+    """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
+    assert draw.photons is not None
+    scene = draw.scene
+    result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
+    if result.partial:
+        raise KeyboardInterrupt
+    polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
+    result = received(result, plan.recipe.monte_carlo.channel)
+    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
+    water = result.component("backscatter")
+    returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
+    seen = (returned > 0) & np.isfinite(result.truth.depth)
+    scene = with_exposure(scene, draw, returned[seen], most=_MOST_COUNTED_PULSES)
+    pulses = min(scene.pulses_per_depth_frame, _MOST_COUNTED_PULSES)
+    frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
+    time_bound = crlb(result, pulses=pulses, device=device)
+    per_time = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
+    profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
+    return RenderedScene(
+        draw=draw,
+        scene=scene,
+        truth=result.truth,
+        bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
+        profile=backscatter_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
+        signal=float(np.median(returned[seen])) if seen.any() else 0.0,
+        backscatter=float(np.median(water.sum(axis=-1))) * scale,
+        frames=_stored(plan, scene, frames, device=device),
+        expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
+        polarisation=polarisation,
+    )
+
+
+def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> StoredFrames:
+    """Codes of the depth and the intensity of the counts; labels of the pixels that most likely report background."""
+    time = frames.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
+    start, stop = frames.gate_start, frames.gate_start + frames.expected.shape[-1] * frames.bin_width
+    depth = depth_from_time(np.clip(time, start, stop), scene=scene)
+    code = np.rint((depth - plan.depth_offset) / plan.depth_step)
+    codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
+    counts = frames.counts.sum(axis=-1, dtype=np.int64)
+    step = intensity_step(float((frames.expected.sum(axis=-1) * frames.pulses).max()))
+    return StoredFrames(
+        depth=codes,
+        intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
+        label=np.packbits(_reports_background(frames, time), axis=-1),
+        intensity_step=step,
+        counts=frames.counts,
+    )
+
+
+def _reports_background(frames: Frames, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether background is more likely than the target at the time that a pixel reports, `[K, H, W]`."""
+    bins = frames.expected.shape[-1]
+    at = np.nan_to_num((time - frames.gate_start) / frames.bin_width).astype(np.int64).clip(0, bins - 1)
+    expected = np.take_along_axis(frames.expected[None], at[..., None], axis=-1)[..., 0]
+    known = np.broadcast_to(frames.background, frames.expected.shape)
+    background = np.take_along_axis(known[None], at[..., None], axis=-1)[..., 0]
+    return (background > 0.5 * expected) & ~np.isnan(time)

@@ -1,0 +1,280 @@
+"""The directory of a run, with its checkpoint while it is not finished; the files of depth and of a fit."""
+
+from __future__ import annotations
+
+import itertools
+import secrets
+import tempfile
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.errors import ArgumentError, FileError
+from spadwarp.frames import Reduction, detector_response
+from spadwarp.io.arrays import point_cloud, point_normals, write_array, write_exr, write_ply
+from spadwarp.io.paths import file_within, remove_temporaries
+from spadwarp.io.text import write_text
+from spadwarp.limits import check_choice
+from spadwarp.parallel import Forked
+from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
+from spadwarp.result.file import read_head
+from spadwarp.scene import Scene
+from spadwarp.scene.pose import rotation_matrix, to_world
+
+if TYPE_CHECKING:
+    from spadwarp.inverse import Fit, Unknown
+
+__all__ = ["CHECKPOINT", "RUN_FILES", "RunFiles", "bytes_needed", "fit_files", "load_resumable", "remove_checkpoint"]
+__all__ += ["write_depth", "write_fit", "write_run"]
+
+CHECKPOINT = "checkpoint.h5"
+"""Name of the partial result of an unfinished run."""
+
+_KINDS, _ENDINGS = ("depth", "intensity", "histogram", "truth"), ("png", "pdf")
+_PICTURES = tuple(f"{name}.{ending}" for name in _KINDS for ending in _ENDINGS)
+RUN_FILES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr", CHECKPOINT, *_PICTURES)
+"""Names of all files that the directory of a run may have."""
+
+_RECORD_BYTES = 52  # of one photon's terminal state, id included
+_OTHER_BYTES = 16 << 20  # pictures, maps, text
+_POINT_FRAMES = {
+    "camera": "camera: origin in the lens, +x right, +y down, +z forward",
+    "world": "world: the axes of a camera without a pose",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The pictures beside the files of a result or a fit."""
+
+    of: Any
+    folder: Path
+
+    def plot(self, **options: Any) -> list[Callable[[], list[Path]]]:
+        """A call for each picture of a result."""
+        import spadwarp
+
+        return spadwarp.viz.picture_calls(self.of, self.folder, **options)
+
+    def save(self) -> Path:
+        """Draws that of a fit; returns its path."""
+        import spadwarp
+
+        return spadwarp.viz.draw_fit(self.of, self.folder / "fit.png")
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """The files of a run.
+
+    Attributes:
+        written: Their paths.
+        depth: Depth frame [m], float64 `[H, W]`, by `output.depth_method`; NaN where nothing returned.
+    """
+
+    written: list[Path]
+    depth: NDArray[np.float64]
+
+
+def write_run(result: Result, out: str | Path, *, device: str | None = None, keep: Sequence[str] = ()) -> RunFiles:
+    """Writes the files that a result's `[output]` asks for to a directory, its pictures by other processes (Linux).
+
+    result.h5, scene.toml, depth.exr, truth.exr, and depth, intensity, histogram and truth as PNG and PDF. Files of
+    these names that an earlier run has left, its checkpoint and records included, are removed.
+
+    Args:
+        result: From `spadwarp.simulate` or `spadwarp.merge`.
+        out: The directory, made if it is not there.
+        device: Warp device for the depth frame.
+        keep: Names of earlier files that are not removed.
+
+    Raises:
+        FileError: A file cannot be written; a result that does not fit goes to the folder for temporary files instead,
+            which the text names.
+    """
+    folder, scene, output = Path(out), result.scene, result.scene.output
+    written: list[Path] = []
+    try:
+        depth = _depth(result, device)
+        calls = _pictures(result, folder, depth)
+    except BaseException:
+        if output.result:  # photons must not be lost
+            _save(result, folder / "result.h5")
+        raise
+    try:
+        with Forked(calls) as pictures:
+            if output.result:
+                written.append(_save(result, folder / "result.h5"))
+            written.append(write_text(scene.to_toml(folder=folder), folder / "scene.toml"))
+            if output.exr:
+                written.append(save_depth_exr(result, depth, folder / "depth.exr"))
+                written.append(save_truth_maps(result, folder / "truth.exr"))
+            written += itertools.chain.from_iterable(pictures.results())
+    finally:
+        for name in _PICTURES:  # of processes that were ended
+            remove_temporaries(folder / name)
+    remove_checkpoint(folder)
+    for name in set(RUN_FILES) - set(keep) - {path.name for path in written}:
+        (folder / name).unlink(missing_ok=True)
+    return RunFiles(written, depth)
+
+
+def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
+    scene, method = result.scene, result.scene.output.depth_method
+    options: dict[str, Any] = {}
+    if method in ("matched", "likelihood"):
+        options["irf"] = detector_response(scene.detector, scene.laser)
+    return result.depth(method=method, device=device, **options)
+
+
+def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
+    output = result.scene.output
+    formats = [ending for ending in _ENDINGS if getattr(output, ending)]
+    pictures = _Pictures(result, folder)
+    return pictures.plot(depth=depth, method=output.depth_method, formats=formats) if formats else []
+
+
+def _save(result: Result, path: Path) -> Path:
+    """Saves the result, if need be elsewhere: a full disk must not cost hours of photons."""
+    try:
+        return result.save(path)
+    except FileError as error:
+        refuge = Path(tempfile.gettempdir()) / f"spadwarp-{secrets.token_hex(8)}-result.h5"
+        result.save(refuge)
+        raise FileError(f"{error}\n{refuge}: the result is here instead") from error
+
+
+def load_resumable(path: str | Path) -> tuple[Result, Path]:
+    """The result to resume and its file: of a directory its result or its checkpoint.
+
+    Of one run that which has more photons, whatever the clock said when they were written; of two runs the checkpoint,
+    since the result is then an earlier one that the unfinished run replaces. Where one cannot be read, the other, with
+    a warning. Raises `FileError`.
+    """
+    folder = Path(path)
+    files = [file for name in (CHECKPOINT, "result.h5") if (file := folder / name).is_file()]
+    if len(files) < 2:
+        file = files[0] if files else file_within(folder, ("result.h5",))
+        return load_result(file), file
+    try:
+        checkpoint, result = map(read_head, files)
+        if checkpoint.is_of_run(result) and result.photons >= checkpoint.photons:
+            files.reverse()
+        return load_result(files[0]), files[0]
+    except FileError as error:
+        for file in files:
+            with suppress(FileError):
+                earlier = load_result(file)
+                warnings.warn(f"{error}; {file} is resumed instead", RuntimeWarning, stacklevel=2)
+                return earlier, file
+        raise
+
+
+def remove_checkpoint(out: str | Path) -> None:
+    """Removes the checkpoint of a directory, and the parts of one that a killed run has left."""
+    path = Path(out) / CHECKPOINT
+    path.unlink(missing_ok=True)
+    remove_temporaries(path)
+
+
+def bytes_needed(
+    scene: Scene, *, batches: bool = False, records: bool = False, checkpoint: bool = False, derivatives: int = 0
+) -> int:
+    """Upper bound of what a run with so many derivatives writes [bytes]; compression takes off most of it."""
+    signed = derivatives + len(scene.camera.tallied_channels)
+    tallies = (1 + signed) * (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+    photons = scene.transport.photons if records else 0
+    return (2 if checkpoint else 1) * tallies + _OTHER_BYTES + _RECORD_BYTES * photons
+
+
+# Depth
+
+
+def write_depth(
+    reduction: Reduction,
+    directory: str | Path,
+    *,
+    ply: str | Path | None = None,
+    ply_frame: Literal["camera", "world"] = "camera",
+    comment: str = "",
+) -> list[Path]:
+    """Writes `depth.npy` (all frames, float32), `depth.exr` and `depth.png` (the first); returns the paths.
+
+    Without a field of view the names begin with `range`. `ply`: the points of the first frame, with normals and
+    intensity, in the frame `ply_frame`, which a comment of the file names.
+
+    Raises:
+        ArgumentError: A point cloud was asked for and the field of view is not known, or in the world where the
+            camera's pose is not known.
+        FileError: A file cannot be written.
+    """
+    check_choice("ply_frame", ply_frame, tuple(_POINT_FRAMES))
+    if ply is not None and reduction.lines is None:
+        raise ArgumentError("a point cloud needs the horizontal field of view")
+    if ply is not None and ply_frame == "world" and reduction.camera is None:
+        raise ArgumentError("points in the world need the pose of the camera: those of a measurement are in its frame")
+    folder, name = Path(directory), reduction.quantity
+    array = reduction.values.astype(np.float32)
+    channels = {"range": reduction.range[0], "intensity": reduction.intensity[0].astype(np.float32)}
+    if name == "depth":
+        channels["Z"] = reduction.first
+    label = "depth z [m]" if name == "depth" else "range [m]"
+    metadata = {"content": "measured depth", "method": reduction.method, "frame": "+x right, +y down, +z forward"}
+    written = [
+        write_array(folder / f"{name}.npy", array if reduction.frames > 1 else array[0]),
+        write_exr(folder / f"{name}.exr", channels, metadata),
+        reduction.plot(folder / f"{name}.png", label=label, title=f"{name.capitalize()} ({reduction.method})"),
+    ]
+    return written if ply is None else [*written, _write_points(reduction, ply, ply_frame, comment)]
+
+
+def _write_points(reduction: Reduction, path: str | Path, frame: str, comment: str) -> Path:
+    assert reduction.lines is not None
+    distance = reduction.range[0]
+    view = reduction.lines.directions_to(distance)
+    points, valid = point_cloud(distance, view)
+    normals = point_normals(distance, view)
+    if not len(points):
+        raise FileError(f"{path}: nothing returned in any pixel: there are no points to write")
+    if frame == "world":
+        assert reduction.camera is not None
+        points = to_world(reduction.camera, points).astype(np.float32)
+        normals = (normals @ rotation_matrix(reduction.camera.rotation_deg).T).astype(np.float32)
+    intensity = reduction.intensity[0][valid].astype(np.float32)
+    properties = {f"n{axis}": normals[:, index] for index, axis in enumerate("xyz")} | {"intensity": intensity}
+    return write_ply(path, points, properties, comment=f"{comment}; frame {_POINT_FRAMES[frame]}")
+
+
+# A fit
+
+
+def fit_files(unknowns: Sequence[Unknown]) -> list[str]:
+    """Names of the files that `write_fit` writes for these unknowns."""
+    maps = [_file_name(unknown.name) for unknown in unknowns if unknown.per_pixel]
+    return ["fit.png", "scene.toml", *(f"{name}{ending}.npy" for name in maps for ending in ("", "_error"))]
+
+
+def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
+    """Writes `fit.png` (counts, fit, residuals), `scene.toml` (with the estimates), and of each unknown of the pixels
+    its map and standard error, `NAME.npy` and `NAME_error.npy`, float64 `[H, W]`; returns the paths.
+
+    Raises `FileError`.
+    """
+    folder = Path(directory)
+    written = [_Pictures(fit, folder).save(), write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
+    for estimate in fit.maps.values():
+        name = _file_name(estimate.name)
+        written += [write_array(folder / f"{name}.npy", estimate.value)]
+        written += [write_array(folder / f"{name}_error.npy", estimate.standard_error)]
+    return written
+
+
+def _file_name(name: str) -> str:
+    """`targets[0].reflectance` as `targets_0_reflectance`."""
+    return name.replace("[", "_").replace("].", "_").replace(".", "_")

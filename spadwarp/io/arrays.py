@@ -1,0 +1,270 @@
+"""Arrays in the files of others: images (EXR), NumPy's files, point clouds (PLY)."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.errors import ArgumentError, FileError
+from spadwarp.io.paths import atomic_path, existing_file
+
+__all__ = ["point_cloud", "point_normals", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]
+
+# Names in an EXR's header that are its own.
+_STRUCTURE = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio"}
+_STRUCTURE |= {"screenWindowCenter", "screenWindowWidth", "type"}
+_LARGEST_IMAGE = 1 << 28  # values that are read
+_DEFLATE, _SMALL = 1100, 1 << 16  # no compression of EXR makes an image smaller by more than this, its header aside
+_KINDS = {"f4": "float", "f8": "double", "i4": "int", "u4": "uint", "u1": "uchar"}  # of PLY
+
+
+def write_exr(
+    path: str | Path, channels: Mapping[str, ArrayLike], metadata: Mapping[str, str | int | float] | None = None
+) -> Path:
+    """Writes an EXR image, losslessly compressed; returns its path.
+
+    Args:
+        path: The file; an existing one is replaced when the new one is whole.
+        channels: Name → `[H, W]`, all of one shape; float16, float32 and uint32 as they are, float64 as float32.
+        metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
+
+    Raises:
+        ArgumentError: No channels, another type or shape, or a metadata name that EXR uses itself.
+        FileError: The file cannot be written.
+    """
+    import OpenEXR
+
+    pixels = {name: _exr_pixels(name, array) for name, array in channels.items()}
+    shapes = {name: array.shape for name, array in pixels.items()}
+    if len(set(shapes.values())) != 1:
+        raise ArgumentError(f"channels have shapes {shapes}; one shape for all, and at least one channel, is needed")
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for name, value in (metadata or {}).items():
+        if name in _STRUCTURE:
+            raise ArgumentError(f"metadata name {name!r} is one that EXR uses itself")
+        header[name] = str(value)
+    with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
+        content = io.BytesIO()  # OpenEXR takes no names that are not Unicode
+        file.write(content)
+        temporary.write_bytes(content.getvalue())
+    return Path(path)
+
+
+def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
+    """Pixels as OpenEXR takes them; it writes wrong ones for arrays that are not contiguous."""
+    pixels = np.asarray(array)
+    if pixels.ndim != 2 or pixels.size == 0:
+        raise ArgumentError(f"channel {name!r} has shape {pixels.shape}; [height, width] is needed")
+    if pixels.dtype == np.float64:
+        pixels = pixels.astype(np.float32)
+    if pixels.dtype not in (np.float16, np.float32, np.uint32):
+        raise ArgumentError(f"channel {name!r} is {pixels.dtype}; float16, float32, float64 or uint32 is needed")
+    return np.ascontiguousarray(pixels)
+
+
+def read_exr(path: str | Path, *, largest: int = _LARGEST_IMAGE) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Channels (name → `[H, W]`, float16, float32 or uint32 as stored) and metadata of an EXR image's first part.
+
+    Args:
+        path: The file.
+        largest: Allowed number of values, of all channels and parts.
+
+    Raises:
+        FileError: No such file, not an EXR, damaged, or larger than allowed.
+    """
+    import OpenEXR
+
+    existing_file(path)
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            values = sum(map(_value_count, file.parts))
+        if values > largest:
+            raise FileError(f"{path}: an image of {values} values; at most {largest} are read")
+        if 2 * values > _DEFLATE * Path(path).stat().st_size + _SMALL:
+            raise FileError(f"{path}: {values} values cannot be in a file of {Path(path).stat().st_size} bytes")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+            metadata = {name: value for name, value in file.header().items() if name not in _STRUCTURE}
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise FileError(f"{path}: not an EXR image, or damaged: {error}") from error
+    return channels, metadata
+
+
+def _value_count(part: Any) -> int:
+    """Values of all channels, as an image's header has them."""
+    low, high = (corner.astype(np.int64) for corner in part.header["dataWindow"])
+    return math.prod(int(side) for side in np.maximum(high - low + 1, 0)) * len(part.header["channels"])
+
+
+# NumPy's files
+
+
+def write_array(path: str | Path, array: ArrayLike) -> Path:
+    """Writes a `.npy` file, whole or not at all; returns its path. Raises `FileError`."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, array)
+    return Path(path)
+
+
+def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
+    """The array of a `.npy` file: real or complex numbers or booleans; pickles are never loaded.
+
+    Args:
+        path: The file.
+        largest: Allowed number of values; None: any.
+
+    Raises:
+        FileError: No such file, not a `.npy` file, shorter than its header says, of another type, or too large.
+    """
+    place = existing_file(path)
+    try:
+        with place.open("rb") as file:
+            if file.read(4)[:2] == b"PK":
+                raise FileError(f"{path}: a .npz archive, not a .npy file; write one array with numpy.save")
+            file.seek(0)
+            return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
+    except FileError:
+        raise
+    except Exception as error:  # a damaged header is parsed by Python's own parser
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
+    """Those arrays of a `.npz` archive that have one of the names; real numbers or booleans; pickles are never loaded.
+
+    Args:
+        path: The file.
+        names: What to read; anything else in the archive is passed over.
+        largest: Allowed number of values of an array.
+
+    Raises:
+        FileError: No such file, not a `.npz` archive, shorter than a header says, of another type, or too large.
+    """
+    place = existing_file(path)
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(place) as archive:
+            for info in archive.infolist():
+                if (name := info.filename.removesuffix(".npy")) in names:
+                    with archive.open(info) as file:
+                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
+    except FileError:
+        raise
+    except Exception as error:  # a damaged header is parsed by Python's own parser
+        raise FileError(f"{path}: damaged or not a .npz archive: {error}") from error
+    return arrays
+
+
+def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) -> NDArray[Any]:
+    """The array of an open file of so many bytes, whose header is compared with them before anything is allocated."""
+    version = np.lib.format.read_magic(file)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"format version {version}")
+    shape, _, kind = readers[version](file)
+    values, available = math.prod(shape), size - file.tell()
+    if kind.kind not in kinds:
+        raise FileError(f"{where} holds {kind}; numbers are needed")
+    if largest is not None and values > largest:
+        raise FileError(f"{where} {shape} are {values} values; at most {largest} are allowed")
+    if values * kind.itemsize > available:
+        raise FileError(f"{where} cut: {kind} {shape} takes {values * kind.itemsize} bytes, and {available} are there")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+# Point clouds
+
+
+def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Points of a range image in the camera frame (+x right, +y down, +z forward) [m].
+
+    Args:
+        distance: Along the lines of sight `[H, W]` [m]; NaN where there is nothing.
+        directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.geometry.pixel_directions` gives.
+
+    Returns:
+        float32 `[P, 3]`, row after row of the pixels that have a range, and their mask, bool `[H, W]`.
+    """
+    along = np.asarray(distance, np.float64)
+    view = np.asarray(directions, np.float64)
+    if along.ndim != 2 or view.shape != (*along.shape, 3):
+        raise ArgumentError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
+    returned = np.isfinite(along)
+    return (along[returned][:, None] * view[returned]).astype(np.float32), returned
+
+
+def point_normals(distance: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
+    """Unit normals of the points of `point_cloud`, towards the camera: float32 `[P, 3]`.
+
+    By the cross product of the steps to a neighbour in the row and to one in the column, of both the one whose range is
+    nearer; where a pixel has no neighbour in one of them, the direction to the camera.
+    """
+    along = np.asarray(distance, np.float64)
+    view = np.asarray(directions, np.float64)
+    image = along[..., None] * view
+
+    def step(axis: int) -> NDArray[np.float64]:
+        ahead = np.full_like(image, np.nan)
+        inner = [slice(None)] * 3
+        inner[axis] = slice(None, -1)
+        ahead[tuple(inner)] = np.diff(image, axis=axis)
+        behind = np.roll(ahead, 1, axis=axis)  # the last row and column are NaN, and so is what comes round
+        cost_ahead, cost_behind = (np.abs((part * view).sum(axis=-1)) for part in (ahead, behind))
+        use_behind = ~(cost_ahead <= cost_behind) & ~np.isnan(cost_behind)
+        return np.where(use_behind[..., None], behind, ahead)
+
+    normal = np.cross(step(1), step(0))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= length
+    normal *= np.where((normal * view).sum(axis=-1) > 0, -1.0, 1.0)[..., None]
+    normal = np.where(np.isfinite(normal), normal, -view)
+    return normal[np.isfinite(along)].astype(np.float32)
+
+
+def write_ply(
+    path: str | Path, points: ArrayLike, properties: Mapping[str, ArrayLike] | None = None, *, comment: str = ""
+) -> Path:
+    """Writes points as a binary little-endian PLY file, whole or not at all; returns its path.
+
+    Args:
+        path: The file.
+        points: `[P, 3]`, written as float32 x, y, z.
+        properties: Name → `[P]`: float32, float64, int32, uint32 or uint8 as they are, other real numbers as float32.
+        comment: One line for the header.
+
+    Raises:
+        ArgumentError: Points or properties of another shape, or a name that PLY cannot have.
+        FileError: The file cannot be written.
+    """
+    xyz = np.asarray(points, np.float32)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ArgumentError(f"points have shape {xyz.shape}; [P, 3] is needed")
+    columns = {name: xyz[:, axis] for axis, name in enumerate("xyz")}
+    for name, value in (properties or {}).items():
+        values = np.asarray(value)
+        if values.shape != (len(xyz),):
+            raise ArgumentError(f"property {name!r} has shape {values.shape}; ({len(xyz)},) is needed")
+        if not name.isidentifier() or name in columns:
+            raise ArgumentError(f"property name {name!r} is not a new single word")
+        known = values.dtype.kind + str(values.dtype.itemsize) in _KINDS
+        columns[name] = values if known else values.astype(np.float32)
+    kinds = {name: values.dtype.kind + str(values.dtype.itemsize) for name, values in columns.items()}
+    table = np.empty(len(xyz), [(name, "<" + kind) for name, kind in kinds.items()])
+    for name, values in columns.items():
+        table[name] = values
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment {' '.join(comment.split())}"] if comment else []
+    header += [f"element vertex {len(xyz)}"]
+    header += [f"property {_KINDS[kind]} {name}" for name, kind in kinds.items()]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join([*header, "end_header", ""]).encode("ascii", "replace") + table.tobytes())
+    return Path(path)

@@ -1,0 +1,355 @@
+"""Exports: read back by the programs' own libraries, and as others' code reads them."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from scipy import io, sparse, stats
+
+import spadwarp
+from helpers.cli import run
+from helpers.synthetic_result import make_result, make_scene
+from spadwarp.errors import FileError, SpadwarpWarning
+from spadwarp.frames import record_frames
+from spadwarp.frames.measured import read_histograms
+from spadwarp.units import SPEED_OF_LIGHT
+
+WIDTH, HEIGHT, BINS, PULSES, FRAMES = 8, 5, 48, 20_000, 2
+LASER = {"position": [0.1, 0.0, 0.0], "pulse_energy": 1e-7, "repetition_rate": 4e6}  # a period of 34.6 m of path
+
+
+@pytest.fixture(scope="module")
+def result():
+    return make_result(make_scene(width=WIDTH, height=HEIGHT, bins=BINS, laser=LASER))
+
+
+@pytest.fixture(scope="module")
+def detection(result):
+    return spadwarp.detect(result, pulses=PULSES, frames=FRAMES, seed=3, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def frames(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames") / "frames.h5"
+    record_frames(result, path, pulses=PULSES, frames=FRAMES, seed=3, methods=("peak", "centroid"), device="cpu")
+    return path
+
+
+def read_exr_channels(path):
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+
+
+def test_expected_detections_are_what_the_counts_are_drawn_from(detection):
+    """A pulse is detected with probability 1 − exp(−Σλ): χ² of the pixels' binomial counts."""
+    chance = -np.expm1(-detection.expected.sum(axis=-1, dtype=np.float64))
+    trials = PULSES * FRAMES
+    z = (detection.intensity.sum(axis=0) - trials * chance) / np.sqrt(trials * chance * (1 - chance))
+    assert stats.chi2.sf((z**2).sum(), z.size) > 1e-3
+    assert (detection.expected >= detection.background).all()
+
+
+@pytest.mark.parametrize("origin", ["file", "memory"])
+def test_npy(origin, frames, detection, tmp_path):
+    source = frames if origin == "file" else detection
+    assert spadwarp.export(source, tmp_path / "all.npy") == [tmp_path / "all.npy"]
+    assert np.array_equal(np.load(tmp_path / "all.npy"), detection.counts)
+    spadwarp.export(source, tmp_path / "one.npy", frames=1)
+    assert np.array_equal(np.load(tmp_path / "one.npy"), detection.counts[1])
+    assert np.array_equal(read_histograms(tmp_path / "one.npy", gate_start=0.0).values, detection.counts[1])
+
+
+def test_tensors_are_exported_too(detection, tmp_path):
+    pytest.importorskip("torch")
+    spadwarp.export(spadwarp.result.to_torch(detection), tmp_path / "a.npy")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), detection.counts)
+
+
+def test_npy_of_a_result_is_its_histogram(result, tmp_path):
+    spadwarp.export(result, tmp_path / "a.npy")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), result.histogram)
+
+
+@pytest.mark.parametrize("origin", ["file", "memory"])
+def test_mat_as_denoisers_read_it(origin, frames, detection, result, tmp_path):
+    """Index arithmetic of the public training code for simulated data (Lindell, O'Toole and Wetzstein 2018)."""
+    source = frames if origin == "file" else detection
+    written = spadwarp.export(source, tmp_path / "a.mat", result=result)
+    assert written == [tmp_path / "a-00000.mat", tmp_path / "a-00001.mat"]
+    for number, path in enumerate(written):
+        file = io.loadmat(path, spmatrix=False)
+        assert sparse.issparse(file["spad"])
+        spad = np.asarray(file["spad"].todense()).reshape(1, WIDTH, HEIGHT, -1).transpose(0, 3, 2, 1)  # [1, T, H, W]
+        assert np.array_equal(spad[0], detection.counts[number].transpose(2, 0, 1))
+        rates = file["rates"].reshape(1, HEIGHT, WIDTH, -1).transpose(0, 3, 1, 2)
+        assert np.allclose(rates[0].transpose(1, 2, 0), PULSES * detection.expected, rtol=1e-6)
+    # MATLAB's reshape(full(spad), size(rates)) is column by column.
+    assert np.array_equal(
+        np.asarray(file["spad"].todense()).reshape(HEIGHT, WIDTH, BINS, order="F"), detection.counts[1]
+    )
+
+    # Light that was neither scattered nor spread by the response arrives in `bin`.
+    ballistic = result.component("ballistic")
+    illuminated = (file["bin"] > 0) & (ballistic.max(axis=-1) > 0)
+    assert illuminated.sum() > WIDTH * HEIGHT // 2
+    assert np.array_equal(file["bin"][illuminated] - 1, ballistic.argmax(axis=-1)[illuminated])
+    assert np.array_equal(file["range_bins"], file["bin"])
+    assert file["bin_size"].item() == pytest.approx(result.scene.gate.bin_width)
+    assert np.array_equal(file["depth"] > 0, np.isfinite(result.truth.depth))
+
+    signal, noise = file["mean_signal_photons"].item(), file["mean_background_photons"].item()
+    assert file["SBR"].item() == pytest.approx(signal / noise) and file["photons"].item() == signal
+    assert signal + noise == pytest.approx(file["rates"].sum() / (WIDTH * HEIGHT), rel=1e-4)
+    assert file["intensity"].min() >= 0 and file["intensity"].max() == 1
+
+
+def test_ptu_is_read_back_by_ptufile(frames, detection, tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    with ptufile.PtuFile(path) as file:
+        assert file.is_t3 and file.is_image
+        assert file.tcspc_resolution == pytest.approx(detection.bin_width)
+        assert file.global_resolution == pytest.approx(1 / LASER["repetition_rate"])
+        assert f"{detection.gate_start * 1e9:.6f} ns" in file.comment
+        image = file.decode_image(channel=0, keepdims=True)  # [frame, y, x, channel, bin]
+    assert np.array_equal(image[:, :, :, 0, :], detection.counts[..., : image.shape[-1]])
+    assert not detection.counts[..., image.shape[-1] :].any()
+    spadwarp.export(frames, tmp_path / "one.ptu", frames=0)
+    again = read_histograms(tmp_path / "one.ptu")
+    assert again.values.sum() == detection.counts[0].sum()
+
+
+def test_ptu_is_read_by_phconvert(frames, detection, tmp_path):
+    reader = pytest.importorskip("phconvert.pqreader")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    stamps, detectors, dtime, facts, markers = reader.load_ptu(str(path))
+    photon = ~np.isin(detectors, markers)
+    assert np.array_equal(np.bincount(dtime[photon], minlength=BINS), detection.counts.sum(axis=(0, 1, 2)))
+    assert facts["nanotimes_unit"] == pytest.approx(detection.bin_width)
+    assert facts["timestamps_unit"] == pytest.approx(1 / LASER["repetition_rate"])
+    assert facts["hardware_name"] == "simulated SPAD array" and facts["software"] == "spadwarp"
+    # The scan takes as long as its last record says, to a pixel and to a millisecond.
+    pixel = facts["tags"]["ImgHdr_TimePerPixel"]["value"] * 1e-3
+    assert abs(facts["acquisition_duration"] - stamps[-1] * facts["timestamps_unit"]) < pixel + 1e-3
+
+
+def test_ptu_is_read_by_tttrlib(frames, detection, tmp_path):
+    tttrlib = pytest.importorskip("tttrlib")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu")
+    events = tttrlib.TTTR(str(path), "PTU")
+    photon = np.asarray(events.event_types) == 0
+    found = np.bincount(np.asarray(events.micro_times)[photon], minlength=BINS)
+    assert np.array_equal(found, detection.counts.sum(axis=(0, 1, 2)))
+    assert events.header.micro_time_resolution == pytest.approx(detection.bin_width)
+    image = tttrlib.CLSMImage(tttr_data=events, channels=[0], fill=True)
+    assert np.array_equal(image.intensity, detection.counts.sum(axis=-1))
+
+
+def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
+    ptufile = pytest.importorskip("ptufile")
+    [path] = spadwarp.export(frames, tmp_path / "a.ptu", frames=0)
+    assert detection.gate_start > 0
+    assert read_histograms(path).gate_start == pytest.approx(detection.gate_start, abs=1e-15)
+    # The same words by another writer are not ours to believe.
+    with ptufile.PtuFile(path) as file:
+        options = {"global_resolution": 50e-9, "tcspc_resolution": 4e-12, "comment": file.comment}
+    ptufile.imwrite(tmp_path / "b.ptu", np.ones((1, 2, 2, 1, 4), np.uint32), **options)
+    with pytest.warns(SpadwarpWarning, match="gate start is not given"):
+        assert read_histograms(tmp_path / "b.ptu").gate_start == 0
+
+    ranges = {}
+    for name, options in {"own": (), "given": ("--gate-start-ns", 0)}.items():
+        arguments = ("depth", path, "--group-index", 1.3638, *options, "--device", "cpu", "--out", tmp_path / name)
+        run(*arguments)
+        ranges[name] = np.load(tmp_path / name / "range.npy")
+    later = 0.5 * SPEED_OF_LIGHT / 1.3638 * detection.gate_start
+    assert np.nanmedian(ranges["own"] - ranges["given"]) == pytest.approx(later, rel=1e-4)
+
+
+def test_exr_is_read_back_by_openexr(frames, detection, result, tmp_path):
+    import h5py
+
+    written = spadwarp.export(frames, tmp_path / "a.exr")
+    assert [path.name for path in written] == ["a-00000.exr", "a-00001.exr"]
+    channels = read_exr_channels(written[1])
+    with h5py.File(frames) as file:
+        for name in ("peak", "centroid"):
+            assert np.array_equal(channels[f"{name}.Z"], file[f"depth/{name}"][1], equal_nan=True)
+    assert np.array_equal(channels["Z"], channels["centroid.Z"], equal_nan=True)
+    assert np.array_equal(channels["intensity"], detection.counts[1].sum(axis=-1).astype(np.float32))
+    assert np.array_equal(channels["truth.Z"], result.truth.depth, equal_nan=True)
+
+    channels = read_exr_channels(*spadwarp.export(result, tmp_path / "b.exr"))
+    parts = sum(channels[name].astype(np.float64) for name in ("ballistic", "forward_scattered", "backscatter"))
+    assert np.allclose(parts, result.histogram.sum(axis=-1), rtol=1e-6)
+    assert np.array_equal(channels["Z"], result.depth().astype(np.float32), equal_nan=True)
+    assert np.array_equal(channels["truth.N.Z"], result.truth.normal[..., 2], equal_nan=True)
+
+
+def read_as_lindell(listed, noise, size, fine):
+    """Names, index arithmetic and normalisation of the loader of Lindell, O'Toole and Wetzstein's sensor fusion."""
+    with open(listed) as file:
+        intensity_files = file.read().split()
+    for intensity_file in intensity_files:
+        spad_file = intensity_file.replace("intensity", "spad").replace(".mat", f"_p{noise}.mat")
+        held = io.loadmat(spad_file, spmatrix=False)
+        spad = np.asarray(held["spad"].todense()).reshape(1, size[1], size[0], -1).transpose(0, 3, 2, 1)
+        rates = np.asarray(held["rates"]).reshape(1, *size, -1).transpose(0, 3, 1, 2)
+        yield {
+            "spad": spad,
+            "rates": rates / np.sum(rates, axis=1)[None],
+            "intensity": io.loadmat(intensity_file)["intensity"].astype(np.float32).reshape(1, *fine) / 255,
+            "bins": (np.asarray(held["bin"]).astype(np.float32).reshape(size) - 1)[None] / (spad.shape[1] - 1),
+            "bins_hr": (np.asarray(held["bin_hr"]).astype(np.float32).reshape(fine) - 1)[None] / (spad.shape[1] - 1),
+            "sbr": held["SBR"].item(),
+            "photons": held["photons"].item(),
+        }
+
+
+def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_path):
+    printed = run("export", frames, "--format", "fusion", "--factor", 5, "--out", tmp_path / "run").output
+    assert "frames.txt" in printed
+    fine = (5 * HEIGHT, 5 * WIDTH)
+    items = list(read_as_lindell(tmp_path / "run" / "frames.txt", 1, (HEIGHT, WIDTH), fine))
+    assert len(items) == FRAMES
+    for number, item in enumerate(items):
+        assert np.array_equal(item["spad"][0], detection.counts[number].transpose(2, 0, 1))
+        assert item["photons"] > 0 and item["sbr"] > 0
+        assert item["intensity"].max() == 1 and item["intensity"].min() >= 0
+        # The middle one of the finer pixels looks where the pixel does.
+        middle = {name: item[name][0, 2::5, 2::5] for name in ("bins_hr", "intensity")}
+        seen = item["bins"][0] >= 0
+        assert seen.sum() > WIDTH * HEIGHT // 2
+        assert np.abs(middle["bins_hr"] - item["bins"][0])[seen].max() * (BINS - 1) < 0.5 + 1e-3
+        view = spadwarp.scene.geometry.pixel_directions(result.scene.camera)
+        light = -result.truth.reflectance * (result.truth.normal * view).sum(axis=-1)
+        there = np.isfinite(light)
+        ratio = (middle["intensity"] / light)[there]
+        assert ratio.max() / ratio.min() < 1.001 and (middle["intensity"][~there] == 0).all()
+    with pytest.raises(ValueError, match="draw frames first"):
+        spadwarp.files.export_sensor_fusion(result, tmp_path / "none")
+    with pytest.raises(ValueError, match="no scene of meshes"):
+        spadwarp.files.export_sensor_fusion(detection, tmp_path / "none")
+
+
+def test_calibration_of_a_run(frames, result, tmp_path):
+    [path] = spadwarp.export(frames, tmp_path / "camera.xml")
+    camera = spadwarp.scene.Camera(calibration=str(path), aperture_diameter=0.02)
+    assert camera.focal_pixels == pytest.approx(result.scene.camera.focal_pixels)
+    assert camera.principal_point == pytest.approx(result.scene.camera.principal_point)
+
+
+def test_a_second_format_goes_into_the_same_folder(frames, tmp_path):
+    run("export", frames, "--format", "npy", "--out", tmp_path / "a")
+    run("export", frames, "--format", "mat", "--format", "xml", "--out", tmp_path / "a")
+    names = sorted(path.name for path in (tmp_path / "a").iterdir() if not path.name.startswith("."))
+    assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy", "frames.xml"]
+    again = run("export", frames, "--format", "mat", "--out", tmp_path / "a", code=2).output
+    assert "frames-00000.mat exists; --overwrite replaces it" in " ".join(again.split())
+    run("export", frames, "--format", "mat", "--out", tmp_path / "a", "--overwrite")
+
+
+def test_analytic_frames(tmp_path):
+    analytic = spadwarp.simulate_analytic(
+        make_scene(width=WIDTH, height=HEIGHT, bins=BINS), frames=3, seed=5, device="cpu"
+    )
+    path = analytic.save(tmp_path / "analytic.h5")
+    spadwarp.export(path, tmp_path / "depth.npy")
+    assert np.array_equal(np.load(tmp_path / "depth.npy"), analytic.depth, equal_nan=True)
+    [exr] = spadwarp.export(path, tmp_path / "depth.exr", frames=2)
+    assert np.array_equal(read_exr_channels(exr)["Z"], analytic.depth[2], equal_nan=True)
+    with pytest.raises(ValueError, match=r"frame 0 is depth without counts, which \.mat is for"):
+        spadwarp.export(path, tmp_path / "a.mat")
+
+
+def test_what_cannot_be_written_is_named(frames, detection, result, tmp_path):
+    for ending in ("mat", "ptu"):
+        with pytest.raises(ValueError, match="draw frames first"):
+            spadwarp.export(result, tmp_path / f"a.{ending}")
+    with pytest.raises(ValueError, match=r"frames = 2 is outside \[0, 1\]"):
+        spadwarp.export(frames, tmp_path / "a.npy", frames=2)
+    with pytest.raises(ValueError, match="result is missing"):
+        spadwarp.export(detection, tmp_path / "a.mat")
+    with pytest.raises(FileError, match=r"'\.tif' is not one of \.npy"):
+        spadwarp.export(result, tmp_path / "a.tif")
+    with pytest.raises(FileError, match="no such file"):
+        spadwarp.export(tmp_path / "none.h5", tmp_path / "a.npy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_command(frames, tmp_path):
+    def printed(source, out, *options, code=0):
+        return run("export", source, "--format", "npy", "--out", tmp_path / out, *options, code=code).output
+
+    assert "frames-00000.mat to frames-00001.mat (2 files)" in printed(frames.parent, "a", "--format", "mat")
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert names == ["frames-00000.mat", "frames-00001.mat", "frames.npy"]
+    printed(frames, "b", "--frames", "1:2", "--quiet")
+    assert np.load(tmp_path / "b" / "frames.npy").shape == (HEIGHT, WIDTH, BINS)
+    assert "holds no frames.h5 and no result.h5" in printed(tmp_path, "c", code=1)
+    assert "outside" in printed(frames, "d", "--frames", 9, code=2)
+    assert "none of them in 5:" in printed(frames, "d", "--frames", "5:", code=2)
+    make_result(make_scene()).save(tmp_path / "result.h5")
+    assert "draw frames first" in printed(tmp_path / "result.h5", "e", "--format", "mat", code=2)
+    assert not (tmp_path / "e").exists()  # the array neither, nor an empty folder
+
+
+RECIPE = {
+    **{"name": "both kinds", "seed": 3, "scenes_per_target": 2, "scenes_per_shard": 2},
+    **{"pose": {"distance": 5.0}, "exposure": {"pulses": 3000}, "frames": {"per_scene": 2}},
+    "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
+    "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
+    "monte_carlo": {"share": 1.0, "photons": 20_000},
+    "scene": {
+        "medium": {"extinction": 0.3, "albedo": 0.8},
+        "laser": {"half_angle_deg": 12.0, "position": [-0.05, 0.0, 0.0], "repetition_rate": 5e6},
+        "camera": {"width": 7, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    place = tmp_path_factory.mktemp("dataset") / "traced"
+    spadwarp.dataset.make_dataset(spadwarp.dataset.Recipe.from_dict(RECIPE), place, device="cpu")
+    return place
+
+
+def test_datasets_with_histograms(dataset, tmp_path):
+    items = list(spadwarp.dataset.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
+    written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
+    assert len(written) == len(items) == 4
+    for path, item in zip(written, items, strict=True):
+        file = io.loadmat(path, spmatrix=False)
+        counts = np.asarray(file["spad"].todense()).reshape(7, 4, -1).transpose(2, 1, 0)
+        assert np.array_equal(counts, item["counts"]) and counts.any()
+        assert np.array_equal(file["rates"].transpose(2, 0, 1), item["expected"])
+        assert np.array_equal(file["depth"], np.nan_to_num(item["clean"][0]))
+        assert file["SBR"] > 0
+    # Where light comes straight back, the bin of the truth holds most of what was expected of the target.
+    seen = file["bin"] > 0
+    rates, at = file["rates"], file["bin"].astype(int) - 1
+    near = sum(np.take_along_axis(rates, np.clip(at + k, 0, 39)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1, 2))
+    assert seen.sum() > 10 and np.median(near[seen] / rates.sum(axis=-1)[seen]) > 0.5
+
+    spadwarp.export(dataset, tmp_path / "a.npy", split="train", frames=slice(1, 3))
+    stacked = np.stack([item["counts"].transpose(1, 2, 0) for item in items[1:3]])
+    assert np.array_equal(np.load(tmp_path / "a.npy"), stacked)
+    spadwarp.export(dataset, tmp_path / "a.ptu", split="train", frames=0)
+    assert read_histograms(tmp_path / "a.ptu").values.sum() == items[0]["counts"].sum()
+
+
+def test_datasets_of_depth(dataset, tmp_path):
+    """Images of a frame with those of its scene; a split of its own."""
+    items = list(spadwarp.dataset.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
+    written = spadwarp.export(dataset, tmp_path / "a.exr", split="test")
+    assert len(written) == len(items)
+    for path, item in zip(written, items, strict=True):
+        channels = read_exr_channels(path)
+        for name, field in {"Z": "noisy", "truth.Z": "clean", "background": "label"}.items():
+            assert np.array_equal(channels[name], item[field][0], equal_nan=True), name
+    shard = next(dataset.glob("frames-*.h5"))
+    spadwarp.export(shard, tmp_path / "b.npy")
+    assert len(np.load(tmp_path / "b.npy")) == len(spadwarp.load(shard))
+    options = ("--split", "test", "--frames", "0:1", "--format", "exr")
+    run("export", dataset, *options, "--out", tmp_path / "c")
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["traced.exr"]
