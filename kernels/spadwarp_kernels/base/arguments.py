@@ -44,6 +44,12 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     return number
 
 
+def check_range(interval: str, **values: Any) -> None:
+    """`check_number` for several numbers of one interval, by name."""
+    for name, value in values.items():
+        check_number(name, value, interval)
+
+
 def check_integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
     """An integer from low to high, also one that is written as a float."""
     try:
@@ -141,6 +147,12 @@ def check_array(
         kinds = " or ".join(map(_dtype_name, allowed))
         raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape {_shape_text(shape)}, is needed")
     return array
+
+
+def check_arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **arrays: Any) -> None:
+    """`check_array` for several arrays of one kind, by name."""
+    for name, array in arrays.items():
+        check_array(name, array, dtypes, shape, device)
 
 
 def _fits(sizes: Sequence[int], shape: Sequence[int | None]) -> bool:

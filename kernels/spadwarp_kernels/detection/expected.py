@@ -16,19 +16,19 @@ from spadwarp_kernels.base.arguments import (
     check_integer,
     check_number,
     check_numbers,
+    check_range,
     check_seed,
 )
 from spadwarp_kernels.base.binomial import PURPOSE_DARK_COUNTS, uniforms
 from spadwarp_kernels.base.kernels import launch_pixels, made_once
 from spadwarp_kernels.base.native import expm1, log1p
 
-from .rates import RATES
-
 __all__ = [
     "add_crosstalk",
     "coates",
     "dark_count_rates",
     "expected_detections",
+    "first_invalid_row",
     "first_photon_probabilities",
     "free_running_probabilities",
 ]
@@ -36,6 +36,34 @@ __all__ = [
 wp.set_module_options({"enable_backward": False})
 
 _ONE = wp.constant(wp.uint32(1))
+
+RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
+"""What rows of counts, tallies or rates may be."""
+
+
+@made_once
+def _invalid_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):
+        pixel = first_pixel + wp.tid()
+        for k in range(values.shape[1]):
+            value = float(values[pixel, k])
+            if value < 0.0 or not wp.isfinite(value):
+                wp.atomic_min(worst, 0, pixel)
+                return
+
+    return invalid
+
+
+def first_invalid_row(values: wp.array) -> int | None:
+    """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
+    check_array("values", values, RATES, (None, None))
+    if values.shape[0] == 0:
+        return None
+    worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
+    launch_pixels(_invalid_kernel(values.dtype), values.shape[0], [values, worst], device=values.device)
+    row = int(worst.numpy()[0])
+    return None if row == 2**31 - 1 else row
 
 
 @made_once
@@ -176,8 +204,7 @@ def dark_count_rates(
     `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
     pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
-    for name, value in {"median": median, "spread": spread, "hot_rate": hot_rate, "offset": offset}.items():
-        check_number(name, value, "[0, inf)")
+    check_range("[0, inf)", median=median, spread=spread, hot_rate=hot_rate, offset=offset)
     check_number("hot_fraction", hot_fraction, "[0, 1]")
     device = check_device("device", device)
     rate = wp.empty(pixels, dtype=float, device=device)
@@ -213,12 +240,8 @@ def expected_detections(
     check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
     _check_matrix(source.shape[1], row_start, source_bin, weight, width)
     hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
-    matrix = [
-        wp.array(row_start, dtype=int, device=device),
-        wp.array(source_bin, dtype=int, device=device),
-        wp.array(weight, dtype=float, device=device),
-        wp.array(width, dtype=float, device=device),
-    ]
+    kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
+    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
     inputs = [source, *matrix, noise_rate, hazard]
     launch_pixels(_response_kernel(source.dtype), source.shape[0], inputs, device=device)
     return hazard

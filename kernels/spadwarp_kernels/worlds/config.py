@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.backscatter import check_phase, single_scatter_rate, spectral_lines
+from spadwarp_kernels.analytic.backscatter import Scattering, make_scattering, single_scatter_rate
 from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
+from spadwarp_kernels.analytic.optics import IN_WATER
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_number, check_vector
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
@@ -17,6 +18,8 @@ from spadwarp_kernels.optics.laser import LASER_PROFILES
 __all__ = ["SpadConfig"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_see = IN_WATER.see
 
 PLANCK = 6.62607015e-34  # [J s]
 
@@ -214,8 +217,7 @@ def check_config(config: object) -> SpadConfig:
 def _backscatter_kernel(
     first: int,
     lidar: Lidar,
-    lines: wp.array(dtype=wp.vec3d),
-    phase: wp.array(dtype=wp.float64),
+    water: Scattering,
     view: wp.array(dtype=wp.vec3d),
     # Out:
     rates: wp.array2d(dtype=float),
@@ -224,11 +226,12 @@ def _backscatter_kernel(
     i = first + wp.tid()
     bins = rates.shape[1]
     width = (lidar.stop - lidar.start) / wp.float64(bins)
+    sight = _see(lidar.ports, view[i])
     for k in range(bins):
         total = wp.float64(0.0)
         for n in range(4):
             time = lidar.start + (wp.float64(k) + (wp.float64(n) + wp.float64(0.5)) / wp.float64(4.0)) * width
-            total += single_scatter_rate(lidar, lines, phase, view[i], time)
+            total += single_scatter_rate(lidar, water, sight, time)
         rates[i, k] = float(total * width / wp.float64(4.0))
 
 
@@ -238,10 +241,9 @@ def backscatter_rates(config: SpadConfig, device: wp.Device) -> np.ndarray:
     rates = wp.zeros((config.width * config.height, config.bins), dtype=float, device=device)
     if config.scattering > 0.0:
         phase = wp.array(config.phase_table(), dtype=wp.float64, device=device)
-        check_phase(phase, device)
         view = wp.array(config.lines_of_sight(), dtype=wp.vec3d, device=device)
         lidar = config.lidar()
-        inputs = [lidar, spectral_lines(lidar, None, device), phase, view, rates]
+        inputs = [lidar, make_scattering(lidar, phase, device), view, rates]
         launch_pixels(_backscatter_kernel, rates.shape[0], inputs, device=device)
     taps, lowest = config.bin_response()
     padded = np.pad(rates.numpy(), ((0, 0), (-lowest, -lowest)))

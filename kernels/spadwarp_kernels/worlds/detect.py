@@ -4,7 +4,7 @@ import warp as wp
 
 from spadwarp_kernels.analytic.depth_frames import depth_of_path
 from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
-from spadwarp_kernels.detection.first_photon import first_photon_step
+from spadwarp_kernels.detection.counts import first_photon_step
 
 from .config import SpadConfig, backscatter_rates
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from spadwarp_kernels.analytic.lidar import Lidar, beam_path
+from spadwarp_kernels.analytic.optics import IN_WATER
 from spadwarp_kernels.analytic.signal import radiometric_signal
 from spadwarp_kernels.base.arguments import check_array, check_number
 
@@ -16,6 +17,8 @@ __all__ = ["SpadCamera"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
+_see = IN_WATER.see
 
 
 @wp.kernel(enable_backward=False)
@@ -121,7 +124,7 @@ def _signal_kernel(
     path[row] = wp.inf
     if depth[row] > 0.0:
         r = wp.float64(depth[row]) / u[2]
-        value = radiometric_signal(lidar, u, r, wp.vec3d(normal[row]), wp.float64(albedo[row]))
+        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(normal[row]), wp.float64(albedo[row]))
         path[row] = float(beam_path(lidar, r * u) + r)
         if value > wp.float64(0.0) and wp.isfinite(value):
             signal[row] = float(value)
