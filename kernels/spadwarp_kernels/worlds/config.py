@@ -1,7 +1,12 @@
-"""What a single-photon camera in water is made of."""
+"""What a single-photon camera in water is made of: laser, detector, water, and the frame of its pose.
+
+Everything that stands in a camera here (laser, normals, points) is in the optical frame; poses are given in the frame
+that the caller's simulator uses.
+"""
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,13 +20,31 @@ from spadwarp_kernels.detection.arrival_time import PHASES
 from spadwarp_kernels.optics.gate import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
 
-__all__ = ["SpadConfig"]
+__all__ = ["CAMERA_FRAMES", "SpadConfig"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _see = IN_WATER.see
 
 PLANCK = 6.62607015e-34  # [J s]
+
+CAMERA_FRAMES = {
+    "optical": (0.0, 0.0, 0.0, 1.0),
+    "opengl": (1.0, 0.0, 0.0, 0.0),
+    "forward_left_up": (-0.5, 0.5, -0.5, 0.5),
+}
+"""Conventions of a camera's pose, and the rotation (x, y, z, w) that takes the optical frame there.
+
+``optical``: +x right, +y down, +z forward (OpenCV; ROS, REP 103, `_optical` frames). ``opengl``: +x right, +y up, -z
+forward (OpenGL, USD, Newton, MuJoCo). ``forward_left_up``: +x forward, +y left, +z up (ROS, REP 103, bodies).
+"""
+
+
+def optical_to(frame: Any) -> wp.transform:
+    """The pose of the optical frame in a camera frame of `CAMERA_FRAMES`; raises `ArgumentError`."""
+    check_choice("frame", frame, CAMERA_FRAMES)
+    return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
+
 
 _RANGES = {
     "horizontal_fov": "(0, 3.1)",
