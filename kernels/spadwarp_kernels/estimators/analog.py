@@ -3,8 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.base.philox import u01
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState

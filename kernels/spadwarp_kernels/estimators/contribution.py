@@ -6,18 +6,16 @@ from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import one_minus_cosine, set_apart, snap_from
-from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate, lens_point
 from spadwarp_kernels.optics.laser import Scan
-from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import patch_face, tree_face
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, Scores, tally_index
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 
 from .flight_sampling import make_sample_flight

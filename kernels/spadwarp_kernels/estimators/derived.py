@@ -3,8 +3,7 @@
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
@@ -21,9 +20,8 @@ from spadwarp_kernels.riders.polarisation import (
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Contribution
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 from .contribution import Request, Scored
 

@@ -9,8 +9,7 @@ from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.optics.camera import Camera, lens_point
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.water.layers import Layers, Profile
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
 

@@ -10,17 +10,15 @@ from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, RoundKeys, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
-from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.gate import Gate
-from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.optics.camera import Camera, Gate, lens_point
+from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits, exit_distance, exit_distance_rotated
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
     HENYEY_GREENSTEIN_GUIDE,

@@ -4,8 +4,7 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
-from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate, lens_point
 from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.riders.derivatives import make_flight_scores, make_turn_scores
@@ -17,22 +16,23 @@ from spadwarp_kernels.riders.polarisation import (
     make_receive,
     make_reflected_stokes,
 )
-from spadwarp_kernels.surface.box import segment_meets_box
+from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Scores, tally_index
-from spadwarp_kernels.water.boundary import (
+from spadwarp_kernels.water.limits import (
+    Limits,
     face_index,
     flipped,
     image_direction,
     image_point,
     image_reflectance,
+    next_face,
     reflections_of,
+    to_next_face,
 )
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.limits import Limits, next_face, to_next_face
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 from .contribution import Request, Scored, make_scattering
 from .link import make_link

@@ -6,8 +6,7 @@ What a pixel's bin holds is noisy above all since few flights are scored in it; 
 import warp as wp
 
 from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
@@ -15,9 +14,8 @@ from spadwarp_kernels.riders.polarisation import Polarisation
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 from .contribution import Request
 from .mirrored import AddedScores

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
+from spadwarp_kernels.optics.camera import PLAIN, Lens
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.optics.projection import PLAIN, Lens
-from spadwarp_kernels.water.layers import HOMOGENEOUS, LAYERED, Water
+from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
 __all__ = ["TransportSpec"]

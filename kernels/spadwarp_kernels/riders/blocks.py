@@ -20,8 +20,7 @@ from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry,
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 from .derivatives import make_flight_scores
 

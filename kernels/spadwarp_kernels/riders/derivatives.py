@@ -12,8 +12,7 @@ from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lam
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
-from spadwarp_kernels.water.layers import Layers, boundary_ahead, layer_index
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium, boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_score
 
 

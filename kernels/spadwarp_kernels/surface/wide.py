@@ -16,8 +16,10 @@ import warp as wp
 
 from spadwarp_kernels.base.native import bits_of
 
-from .patches import NO_NODE, read_tree
+from .bvh import NO_NODE, read_tree
 from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 # Entries of the stack of `_faces_in_order_kernel`: three a level of Warp's trees, which are at most 32 deep.
 _Stack = wp.types.vector(length=104, dtype=int)
@@ -25,18 +27,12 @@ _Stack = wp.types.vector(length=104, dtype=int)
 
 @wp.struct
 class _Part:
-    """Faces that follow each other in the tree's order.
+    """Faces that follow each other in the tree's order, from start to stop."""
 
-    Attributes:
-        pair: Of Warp's nodes below it, see `pairs`; -1 for none: then they are parted in the middle.
-        start, stop: The faces.
-        area: Half the surface of their box [m²].
-    """
-
-    pair: int
+    pair: int  # of Warp's nodes below it, see `read_tree`; -1 for none: then they are parted in the middle
     start: int
     stop: int
-    area: float
+    area: float  # half the surface of their box [m²]
 
 
 @wp.kernel(enable_backward=False)

@@ -6,8 +6,7 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 from spadwarp_kernels.base.kernels import launch_pixels
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import BEFORE, Gate, gate_bin
+from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
 
 from .ledger import AFTER_GATE, BEFORE_GATE, BELOW_UNIT, CLIPPED, INVALID, OUTSIDE_SHIFT, add_to_ledger
 

@@ -22,11 +22,9 @@ from spadwarp_kernels.base.tables import TABLE_CELLS
 from spadwarp_kernels.estimators.contribution import takes_collisions
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import ESTIMATORS, make_estimator
-from spadwarp_kernels.optics.camera import Camera, check_camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, Lens, check_camera
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.port import PortKind, check_port
-from spadwarp_kernels.optics.projection import PLAIN, Lens
 from spadwarp_kernels.photon.spec import MOST_POINTS, TransportSpec
 from spadwarp_kernels.photon.state import Records
 from spadwarp_kernels.riders.polarisation import MATRIX_POINTS, MOST_CHANNELS, Polarisation
@@ -37,9 +35,8 @@ from spadwarp_kernels.tally.ledger import LEDGER_SLOTS, LEDGER_WIDTH
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS
 from spadwarp_kernels.water.grid import Grid
-from spadwarp_kernels.water.layers import Layers, Water
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, TABULATED, Guiding, PhaseFunction
 
 if TYPE_CHECKING:

@@ -8,20 +8,19 @@ from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
 from spadwarp_kernels.surface.ray_cast import offset_from_surface
 from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
-from spadwarp_kernels.water.boundary import face_index
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import (
     Limits,
     exit_distance,
     exit_distance_rotated,
     exit_face,
     exit_face_rotated,
+    face_index,
     first_exit,
     first_exit_rotated,
     is_outside,
     is_outside_rotated,
 )
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 
 @wp.struct

@@ -15,17 +15,15 @@ from spadwarp_kernels.base.philox import (
     u01,
     u01_tail,
 )
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import EVENT, RAY, Flight, PhotonState, is_planned, shorten
-from spadwarp_kernels.surface.box import segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box, segment_meets_box_on_cpu
 from spadwarp_kernels.surface.mesh import Surfaces
-from spadwarp_kernels.surface.patches import NOWHERE, nearest_patch
+from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import patch_hit
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 
 
 @made_once

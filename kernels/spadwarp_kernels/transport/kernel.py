@@ -20,8 +20,7 @@ from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.points import make_ask_flight, make_push_points, make_score_points
 from spadwarp_kernels.estimators.queue import long_queue_fits, make_queue
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.photon.lanes import READ_SIZE, SET_SIZE, count_lanes, exchange, queue_size, take_photons, vote
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -45,16 +44,14 @@ from spadwarp_kernels.photon.state import (
 )
 from spadwarp_kernels.riders.blocks import make_begin_history, make_fly_history
 from spadwarp_kernels.riders.polarisation import Polarisation, make_first_stokes
-from spadwarp_kernels.surface.box import inverse_direction
-from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
+from spadwarp_kernels.surface.bvh import NO_NODE, Stack, inverse_direction, place, step_leaf, step_node
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 from spadwarp_kernels.tally.scores import Derivatives, make_deposit
 from spadwarp_kernels.tally.tally import TOO_LONG
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .checks import check_spec

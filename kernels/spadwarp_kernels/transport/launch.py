@@ -8,10 +8,8 @@ from spadwarp_kernels.base.arguments import check_array, check_device, check_int
 from spadwarp_kernels.base.native import zeros
 from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.camera import Camera, with_field
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, with_field
 from spadwarp_kernels.optics.laser import Laser, Scan
-from spadwarp_kernels.optics.projection import PLAIN
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Records, make_records
@@ -29,9 +27,8 @@ from spadwarp_kernels.tally.ledger import (
 )
 from spadwarp_kernels.tally.scores import MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel, fold_kernel, fold_low_words, low_words_pay
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits, ready_limits
-from spadwarp_kernels.water.medium import Medium, ready_medium
+from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .checks import check_launch, check_model, check_spec

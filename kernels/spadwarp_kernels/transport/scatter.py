@@ -23,10 +23,8 @@ from spadwarp_kernels.surface.reflectance import (
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
-from spadwarp_kernels.water.boundary import face_index, flipped, fresnel_reflectance
-from spadwarp_kernels.water.layers import Layers
-from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.limits import Limits, face_index, flipped, fresnel_reflectance
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 

@@ -9,8 +9,7 @@ from spadwarp_kernels.optics.visibility import may_be_hidden
 from spadwarp_kernels.photon.lanes import count_lanes
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import NO_RAY, RAY, SHADOW_RAY, SURFACE_RAY, PhotonState
-from spadwarp_kernels.surface.box import segment_meets_box
-from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk, segment_meets_box
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 

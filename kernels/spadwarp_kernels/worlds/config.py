@@ -17,7 +17,7 @@ from spadwarp_kernels.analytic.optics import IN_WATER
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_number, check_vector
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
-from spadwarp_kernels.optics.gate import C0
+from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
 
 __all__ = ["CAMERA_FRAMES", "SpadConfig"]

@@ -9,8 +9,7 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces

@@ -14,8 +14,7 @@ from spadwarp_kernels import (
     u01,
 )
 from spadwarp_kernels.optics import project
-from spadwarp_kernels.optics.camera import clip_to_view, field, in_view
-from spadwarp_kernels.optics.gate import clip_to_gate
+from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, field, in_view
 
 _LENS_POINT = wp.constant(wp.vec2(0.1, -0.25))
 

@@ -11,8 +11,8 @@ from helpers.launch import Vectors, launched, on_device
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels import intersect_mesh, intersect_surfaces
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.surface.bvh import open_pairs
-from spadwarp_kernels.surface.patches import LARGEST_LEAF, SAME, join_leaves, pair_faces, read_tree, shared_corner
+from spadwarp_kernels.surface.bvh import LARGEST_LEAF, join_leaves, open_pairs, read_tree, shared_corner
+from spadwarp_kernels.surface.patches import SAME, pair_faces
 from spadwarp_kernels.surface.triangle import meet_planes, set_rows
 
 Rows = wp.array(dtype=wp.vec4)

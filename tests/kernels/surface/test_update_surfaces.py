@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.surface.patches import read_tree
+from spadwarp_kernels.surface.bvh import read_tree
 
 PRIVATE_LAYOUT = (
     f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/intersect/bvh.py reads "

@@ -17,7 +17,7 @@ from spadwarp_kernels import (
     segment_meets_box,
     u01,
 )
-from spadwarp_kernels.surface.box import segment_meets_box_on_cpu
+from spadwarp_kernels.surface.bvh import segment_meets_box_on_cpu
 
 
 @wp.kernel(enable_backward=False)

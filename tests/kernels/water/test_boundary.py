@@ -7,8 +7,14 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.water.boundary import image_direction, image_point, image_reflectance
-from spadwarp_kernels.water.limits import Limits, next_face, to_next_face
+from spadwarp_kernels.water.limits import (
+    Limits,
+    image_direction,
+    image_point,
+    image_reflectance,
+    next_face,
+    to_next_face,
+)
 
 LOWER, UPPER = np.array([-0.7, -0.4, -1.0]), np.array([0.5, 0.9, 1.6])
 
