@@ -10,7 +10,6 @@ import warp as wp
 
 from spadwarp_kernels.base.native import load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
-from spadwarp_kernels.water.medium import Layers, Profile, ProfileSample, Water
 
 from .grid import (
     block_line,
@@ -22,7 +21,7 @@ from .grid import (
     next_block,
     next_place,
 )
-from .medium import Medium
+from .medium import Layers, Medium, Profile, ProfileSample, Water
 
 __all__ = ["DELTA_TRACKING", "REGULAR_TRACKING"]
 
