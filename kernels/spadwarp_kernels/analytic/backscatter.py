@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_array, check_integer, check_number
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
 from .lidar import Lidar
@@ -57,7 +57,7 @@ class SingleScatter(NamedTuple):
     rate: wp.Function
 
 
-@made_once
+@memoised
 def make_single_scatter(optics: Optics) -> SingleScatter:
     """The functions for a camera and a laser with these optics."""
     light_at, range_of_path = optics.light, optics.range_of_path
@@ -108,7 +108,7 @@ single_scatter_rate = make_single_scatter(IN_WATER).rate
 """That of a camera and a laser in the water."""
 
 
-@made_once
+@memoised
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
     see, light_at, range_of_path, illuminated = optics.see, optics.light, optics.range_of_path, optics.illuminated
     per_metre = make_single_scatter(optics).per_metre
@@ -165,7 +165,7 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
     return table_kernel
 
 
-@made_once
+@memoised
 def make_background_rate(optics: Optics) -> wp.Function:
     """The Warp function of the rate of dark counts and backscatter for these optics."""
     scatter_rate = make_single_scatter(optics).rate

@@ -16,7 +16,7 @@ from spadwarp_kernels.base.arguments import (
     check_integer,
     check_range,
 )
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 
 from .backscatter import Scattering, make_background_rate, make_scattering
@@ -176,7 +176,7 @@ def _gauss_legendre(node: int) -> wp.vec2d:
     return wp.vec2d(x, w)
 
 
-@made_once
+@memoised
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
     see = optics.see
     background_rate = make_background_rate(optics)

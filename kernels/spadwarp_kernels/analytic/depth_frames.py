@@ -20,7 +20,7 @@ from spadwarp_kernels.base.arguments import (
     check_vector,
 )
 from spadwarp_kernels.base.binomial import count_quantile
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.philox import STREAM_ANALYTIC, STREAM_FRAMES, random_block, u01, u01_open
 
 from .lidar import Ports
@@ -78,7 +78,7 @@ def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
     return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
 
 
-@made_once
+@memoised
 def _make_depths(optics: Optics) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(maps, pixel, path)`` -> planar depth at which light has gone a path, 0 if there is none;
     and ``(maps, pixel, flat, draw)`` -> that of a background photon, which comes at any time of the gate alike (flat)
@@ -107,7 +107,7 @@ def _make_depths(optics: Optics) -> tuple[wp.Function, wp.Function]:
     return depth_at, background_depth
 
 
-@made_once
+@memoised
 def _make_sample_kernel(optics: Optics) -> wp.Kernel:
     _, background_depth = _make_depths(optics)
 
@@ -285,7 +285,7 @@ class FrameCoding:
     intensity_step: float
 
 
-@made_once
+@memoised
 def _make_coding_kernel(optics: Optics) -> wp.Kernel:
     depth_at, background_depth = _make_depths(optics)
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_struct
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, PortKind, check_port
 
@@ -118,7 +118,7 @@ def point_at(sight: SightRay, r: wp.float64) -> wp.vec3d:
 # ---- The camera.
 
 
-@made_once
+@memoised
 def _make_camera(kind: PortKind | None) -> dict[str, wp.Function]:
     """What `Optics` has of a camera behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
@@ -195,7 +195,7 @@ def _intensity(lidar: Lidar, u: wp.vec3d) -> wp.float64:
     return TWO / (PI * lidar.tan2) * wp.exp(-TWO * tan2 / lidar.tan2) / (along * along * along)
 
 
-@made_once
+@memoised
 def _make_beam(kind: PortKind | None) -> dict[str, wp.Function]:
     """What `Optics` has of a laser behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
@@ -288,7 +288,7 @@ def _straight_range(laser: wp.vec3d, sight: SightRay, path: wp.float64) -> wp.fl
     return (path * path - wp.length_sq(y)) / (TWO * (path + wp.dot(sight.u, y)))
 
 
-@made_once
+@memoised
 def _make_range_of_path(kind: PortKind | None) -> wp.Function:
     """`Optics.range_of_path` for a laser behind a kind of port, or in the water."""
     has_port = kind is not None
@@ -351,7 +351,7 @@ def cone_interval(lidar: Lidar, apex: wp.vec3d, u: wp.vec3d) -> wp.vec2d:
     return wp.vec2d(wp.max(low, ZERO), high)
 
 
-@made_once
+@memoised
 def _make_illuminated(kinds: tuple[PortKind | None, PortKind | None], light: wp.Function) -> wp.Function:
     """`Optics.illuminated` for kinds of ports of camera and laser."""
     in_water, has_port = kinds == (None, None), kinds[1] is not None
@@ -416,7 +416,7 @@ def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None
     return _make_optics(port, laser_port)
 
 
-@made_once
+@memoised
 def _make_optics(port: PortKind | None, laser_port: PortKind | None) -> Optics:
     beam = _make_beam(laser_port)
     illuminated = _make_illuminated((port, laser_port), beam["light"])

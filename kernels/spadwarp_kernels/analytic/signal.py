@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_array, check_arrays
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
 from .lidar import Lidar
@@ -86,7 +86,7 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
     return lidar.axis
 
 
-@made_once
+@memoised
 def make_radiometric_signal(optics: Optics) -> wp.Function:
     """The Warp function ``(lidar, sight, distance, normal, reflectance)`` -> signal detections per pulse, `distance`
     being the range."""
@@ -162,7 +162,7 @@ radiometric_signal = make_radiometric_signal(IN_WATER)
 """That of a camera and a laser in the water."""
 
 
-@made_once
+@memoised
 def _make_kernel(optics: Optics) -> wp.Kernel:
     see, light_at = optics.see, optics.light
     radiometric = make_radiometric_signal(optics)

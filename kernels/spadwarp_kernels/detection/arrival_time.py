@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
 from .expected import RATES
 
@@ -47,7 +47,7 @@ def _parabola_vertex(left: float, centre: float, right: float) -> float:
     return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
 
 
-@made_once
+@memoised
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def peak(
@@ -91,7 +91,7 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     return peak
 
 
-@made_once
+@memoised
 def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     """The delay of the largest score: of the log-matched filter, whose `response` is its gain, or of the likelihood."""
 

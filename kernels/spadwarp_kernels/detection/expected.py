@@ -20,7 +20,7 @@ from spadwarp_kernels.base.arguments import (
     check_seed,
 )
 from spadwarp_kernels.base.binomial import PURPOSE_DARK_COUNTS, uniforms
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import expm1, log1p
 
 __all__ = [
@@ -41,7 +41,7 @@ RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
 """What rows of counts, tallies or rates may be."""
 
 
-@made_once
+@memoised
 def _invalid_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):
@@ -66,7 +66,7 @@ def first_invalid_row(values: wp.array) -> int | None:
     return None if row == 2**31 - 1 else row
 
 
-@made_once
+@memoised
 def _response_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def respond(
@@ -141,7 +141,7 @@ def _crosstalk_kernel(
         hazard[pixel, k] = hazard[pixel, k] + probability * light
 
 
-@made_once
+@memoised
 def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def law(first_pixel: int, hazard: wp.array2d(dtype=dtype), probability: wp.array2d(dtype=dtype)):

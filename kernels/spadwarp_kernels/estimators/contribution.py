@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import one_minus_cosine, set_apart, snap_from
@@ -103,7 +103,7 @@ class ScoredPoint:
     ahead: float
 
 
-@made_once
+@memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, camera) -> Request`` of the event that the photon has come to."""
     view_of = spec.lens.view
@@ -163,7 +163,7 @@ def takes_collisions(spec: TransportSpec) -> bool:
     return spec.water.profile is not None and spec.water.profile.draw is None
 
 
-@made_once
+@memoised
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera) -> ScoredPoint`` that draws the point of a flight to be
     scored."""
@@ -239,7 +239,7 @@ def _fused_axes(spec: TransportSpec, flights: bool) -> int:
     return 2 if flights else 3
 
 
-@made_once
+@memoised
 def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(request, x, v, way, distance, medium, layers, surfaces) -> float``: density [1/sr] of what
     the water or the face of the request scatters at x into the direction v = way/distance. In water, polarised light
@@ -289,7 +289,7 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
     return scattering_density
 
 
-@made_once
+@memoised
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan) -> Scored`` of next events.
 

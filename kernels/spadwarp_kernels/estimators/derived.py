@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -26,7 +26,7 @@ from spadwarp_kernels.water.medium import Layers, Medium
 from .contribution import Request, Scored
 
 
-@made_once
+@memoised
 def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Function | None:
     """The Warp function ``(s, camera, gate, limits, layers, derivatives, polarisation) -> Contribution``:
     `Estimator.cross`, with scores."""
@@ -65,7 +65,7 @@ def make_derived_cross(spec: TransportSpec, cross: wp.Function | None) -> wp.Fun
     return derived_cross
 
 
-@made_once
+@memoised
 def make_derived_score(spec: TransportSpec, score: wp.Function | None) -> wp.Function | None:
     """The Warp function ``(request, medium, layers, camera, gate, surfaces, scan, derivatives, polarisation)
     -> Scored``: `Estimator.score`, with scores."""

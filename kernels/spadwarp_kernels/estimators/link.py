@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.photon.spec import TransportSpec
 
@@ -72,7 +72,7 @@ def _value_behind_port(camera: Camera, extinction: float, weight: float, scatter
     return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
 
 
-@made_once
+@memoised
 def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
     scattering, link) -> float``, the fraction of the photon that arrives."""
@@ -100,7 +100,7 @@ def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
     return o
 
 
-@made_once
+@memoised
 def make_apparent_lens(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
     if spec.port is None:
@@ -128,7 +128,7 @@ def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
     return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
 
-@made_once
+@memoised
 def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
     and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""

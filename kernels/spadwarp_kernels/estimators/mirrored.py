@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
 from spadwarp_kernels.optics.camera import Camera, Gate, lens_point
 from spadwarp_kernels.optics.laser import Scan
@@ -74,7 +74,7 @@ def _no_origin(limits: Limits) -> wp.vec3:
     return wp.vec3(0.0)
 
 
-@made_once
+@memoised
 def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(x, v, length, reflections, scores, medium, layers, limits, surfaces, derivatives, seed) ->
     Way`` of the light that leaves x along v, in the domain's axes, and is reflected so many times within that
@@ -131,7 +131,7 @@ def make_way(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return way_of
 
 
-@made_once
+@memoised
 def make_leaving_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, v, derivatives, medium, layers, surfaces) -> Scores`` of light that the event of a
     request sends along v."""
@@ -146,7 +146,7 @@ def make_leaving_scores(spec: TransportSpec) -> wp.Function:
     return leaving_scores
 
 
-@made_once
+@memoised
 def make_image_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, length, reflections, end, inside, camera, limits, surfaces, polarisation) ->
     vec4`` of light that the event of a request sends along v, in the domain's axes from x on, and that is reflected so
@@ -190,7 +190,7 @@ def make_image_stokes(spec: TransportSpec) -> wp.Function:
     return image_stokes
 
 
-@made_once
+@memoised
 def make_score_image(spec: TransportSpec, flights: bool, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
     polarisation) -> Scored`` of an event by way of one of `Boundary.images`; what stands in between has been looked
@@ -294,7 +294,7 @@ class AddedScores:
     shadow_queries: int
 
 
-@made_once
+@memoised
 def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool, low_words: bool) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
     polarisation, tally, low, gradients, ledger, pending_add, thread, scale) -> AddedScores`` that scores an event by

@@ -5,7 +5,7 @@ What a pixel's bin holds is noisy above all since few flights are scored in it; 
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Scan
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -21,7 +21,7 @@ from .contribution import Request
 from .mirrored import AddedScores
 
 
-@made_once
+@memoised
 def make_point_of(points: int) -> wp.Function:
     """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
 
@@ -40,7 +40,7 @@ def make_point_of(points: int) -> wp.Function:
     return point_of
 
 
-@made_once
+@memoised
 def make_push_points(points: int, push: wp.Function) -> wp.Function:
     """The Warp function ``(memory, request)``: `push` of `make_queue` for each of the points of a flight."""
     if points == 1:
@@ -56,7 +56,7 @@ def make_push_points(points: int, push: wp.Function) -> wp.Function:
     return push_points
 
 
-@made_once
+@memoised
 def make_ask_flight(request_flight: wp.Function | None, push: wp.Function) -> wp.Function | None:
     """The Warp function ``(s, memory) -> Request`` that asks for a flight to be scored, once; None where none is."""
     if request_flight is None:
@@ -72,7 +72,7 @@ def make_ask_flight(request_flight: wp.Function | None, push: wp.Function) -> wp
     return ask_flight
 
 
-@made_once
+@memoised
 def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function, low_words: bool) -> wp.Function:
     """The Warp function with the arguments of `make_score_images` that scores a flight at all points but the first,
     where each thread scores its own requests; shadow rays are traced on the spot."""

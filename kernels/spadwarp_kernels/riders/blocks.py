@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry, score_entry
 from spadwarp_kernels.tally.scores import Derivatives
@@ -48,7 +48,7 @@ def _forget(blocks: Blocks, half: int):
     blocks.memory[met_entry(blocks, half, blocks.count)] = 0.0
 
 
-@made_once
+@memoised
 def _make_meet(kinds: int) -> wp.Function:
     @wp.func
     def meet(blocks: Blocks, half: int, block: int):
@@ -63,7 +63,7 @@ def _make_meet(kinds: int) -> wp.Function:
     return meet
 
 
-@made_once
+@memoised
 def make_block_scores(spec: TransportSpec) -> BlockScores | None:
     """Of a spec with blocks."""
     if not spec.blocks:
@@ -134,7 +134,7 @@ def _make_turn(spec: TransportSpec) -> wp.Function:
     return turn
 
 
-@made_once
+@memoised
 def make_begin_history(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(derivatives) -> Scores`` of a photon that has met nothing; of blocks too."""
     in_blocks = bool(spec.blocks)
@@ -148,7 +148,7 @@ def make_begin_history(spec: TransportSpec) -> wp.Function:
     return begin_history
 
 
-@made_once
+@memoised
 def make_fly_history(spec: TransportSpec) -> wp.Function:
     """The Warp function of `make_flight_scores`, for a flight of the photon itself: of blocks too."""
     flight_scores, by_block = make_flight_scores(spec), make_block_scores(spec)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -16,7 +16,7 @@ from spadwarp_kernels.water.medium import Layers, Medium, boundary_ahead, layer_
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_score
 
 
-@made_once
+@memoised
 def make_turn_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, x, u, v, slot, derivatives, medium, layers, surfaces) -> Scores`` after an event at
     x that turns light from u to v, on the face of a slot of the mesh's tree or (-1) in the water."""
@@ -46,7 +46,7 @@ def make_turn_scores(spec: TransportSpec) -> wp.Function:
     return turn_scores
 
 
-@made_once
+@memoised
 def make_request_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, x, u, slot, point, end, derivatives, medium, layers, surfaces) -> Scores`` of light
     that goes from x along u to the point that is scored, scatters there, and leaves the water at the end.
@@ -95,7 +95,7 @@ def _unchanged(
     return scores
 
 
-@made_once
+@memoised
 def make_flight_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, derivatives, layers, x, u, length) -> Scores`` after a way in the water."""
     if not spec.derivatives:
@@ -132,7 +132,7 @@ def make_flight_scores(spec: TransportSpec) -> wp.Function:
     return flight_scores
 
 
-@made_once
+@memoised
 def make_event_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(scores, derivatives, medium, layers, surfaces, face, normal, x, u, v) -> Scores`` after an
     event at x that has turned light from u to v, on a face or (-1) in the water."""
@@ -215,7 +215,7 @@ def _to_lens(camera: Camera, x: wp.vec3, u: wp.vec3) -> float:
     return -x[2] / u[2]
 
 
-@made_once
+@memoised
 def make_to_lens(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, x, u) -> float``: the way in water of a photon at x whose flight along u leads to
     the lens [m]."""
@@ -230,7 +230,7 @@ def make_to_lens(spec: TransportSpec) -> wp.Function:
     return to_port
 
 
-@made_once
+@memoised
 def make_crossing_scores(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, camera, layers, derivatives) -> Scores`` of a photon whose flight leads to the lens."""
     flight_scores, to_lens = make_flight_scores(spec), make_to_lens(spec)

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_items, check_number, check_numbers
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.laser import Laser, Scan, beam_frame
@@ -173,7 +173,7 @@ def window_elements(n: wp.vec4, q: wp.vec4) -> Elements:
     return m
 
 
-@made_once
+@memoised
 def make_port_elements(port: PortKind | None) -> wp.Function | None:
     """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u; None without a port."""
     if port is None:
@@ -191,7 +191,7 @@ def make_port_elements(port: PortKind | None) -> wp.Function | None:
 # ---- What a receiver takes of the light that comes to the lens.
 
 
-@made_once
+@memoised
 def make_leave_water(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, stokes, x, u, inside) -> vec4`` of light at x in the water along u that arrives at
     the lens along `inside`: what a port does to it."""
@@ -208,7 +208,7 @@ def make_leave_water(spec: TransportSpec) -> wp.Function:
     return leave_water
 
 
-@made_once
+@memoised
 def make_receive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(stokes, u) -> vec4`` of light that arrives at the lens along u: with respect to the image's
     x, to which the lens turns all light by the smallest rotation to the optical axis."""
@@ -223,7 +223,7 @@ def make_receive(spec: TransportSpec) -> wp.Function:
     return receive
 
 
-@made_once
+@memoised
 def make_add_channels(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(contribution, polarisation, stokes) -> Contribution``: its value times I, and what the
     channels take, over that, as scores."""
@@ -339,7 +339,7 @@ def check_stokes(name: str, stokes: Any) -> list[float]:
 # ---- What events do to a Stokes vector: scattering in the water, surfaces, faces of the domain.
 
 
-@made_once
+@memoised
 def make_event_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(stokes, polarisation, surfaces, slot, x, u, v) -> vec4`` of light that an event at x has
     turned from u to v, on the face of a slot of the mesh's tree or (-1) in the water.
@@ -378,7 +378,7 @@ def make_event_stokes(spec: TransportSpec) -> wp.Function:
     return event_stokes
 
 
-@made_once
+@memoised
 def make_reflected_stokes() -> wp.Function:
     """The Warp function ``(stokes, u, v, index) -> vec4`` of light that a smooth boundary mirrors from u to v, for the
     index behind it over that of the water."""
@@ -395,7 +395,7 @@ def make_reflected_stokes() -> wp.Function:
 # ---- The Stokes vector of a photon that enters the water.
 
 
-@made_once
+@memoised
 def make_first_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(polarisation, laser, scan, target, emitted, x, u) -> vec4`` of a photon that was emitted,
     see `make_emit`, and is in the water at x on its way along u.
@@ -435,7 +435,7 @@ def make_first_stokes(spec: TransportSpec) -> wp.Function:
 # ---- The Stokes vector of a photon that enters the aperture itself.
 
 
-@made_once
+@memoised
 def make_crossing_stokes(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, camera) -> vec4`` of a photon whose flight leads to the lens, see `make_receive`."""
     has_port, leave_water, receive = spec.port is not None, make_leave_water(spec), make_receive(spec)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.water.limits import EXIT_FACES
 
 __all__ = ["COUNTERS", "LEDGER_ENTRIES", "LEDGER_UNIT"]
@@ -97,7 +97,7 @@ def slot_of_core(first_id: wp.uint64) -> int:
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
 
 
-@made_once
+@memoised
 def make_ledger_slot(cuda: bool) -> wp.Function:
     """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
 

@@ -20,7 +20,7 @@ from spadwarp_kernels.base.arguments import (
     check_numbers,
     check_struct,
 )
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 
 from .blocks import Blocks, met_count, met_entry, score_entry
 from .ledger import CLIPPED, INVALID, add_to_ledger, atomic_add_int64
@@ -106,7 +106,7 @@ def _numbers_of_parts(name: str, values: Any, device: wp.Device) -> wp.array:
     return wp.array(whole, dtype=int, device=device, shape=whole.size)
 
 
-@made_once
+@memoised
 def make_deposit(count: int, kinds: int = 0, low_words: bool = False) -> wp.Function:
     """The Warp function ``(tally, low, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
     `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.lanes import MOST_LEFT
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import EVENT, PhotonState, is_planned
@@ -42,7 +42,7 @@ class Collision:
     mirror: int
 
 
-@made_once
+@memoised
 def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, limits) -> Collision``; `flies_on`: see `make_flies`."""
     has_mesh, reflecting = spec.mesh, spec.reflecting
@@ -99,7 +99,7 @@ def make_collide(spec: TransportSpec, flies_on: bool = False) -> wp.Function:
     return collide
 
 
-@made_once
+@memoised
 def make_arrives(flights: bool, traces: bool, queues: bool, at_once: bool) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(s, queued) -> bool``, whether the photon's flight is to be scored, and
     ``(s, queued, flies) -> bool``, whether, that being done, it is at the end of its flight and free to collide.

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.laser import Laser, Scan, emit_along, emit_measured
 from spadwarp_kernels.optics.port import Passage, Port, PortKind
 from spadwarp_kernels.photon.lanes import exchange
@@ -28,7 +28,7 @@ class Start:
     weight: Weight
 
 
-@made_once
+@memoised
 def make_enter(port: PortKind | None) -> wp.Function:
     """The Warp function ``(laser, emitted, s, ledger, thread) -> Start`` of a photon that a laser has emitted,
     behind a port or in the water."""
@@ -61,7 +61,7 @@ def _no_passage(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
     return Passage()
 
 
-@made_once
+@memoised
 def make_emit(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(laser, scan, seed, id) -> spatial_vector``: start position [m], then unit direction."""
     confocal = spec.confocal
@@ -78,7 +78,7 @@ def make_emit(spec: TransportSpec) -> wp.Function:
     return emit
 
 
-@made_once
+@memoised
 def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(laser, scan, seed, id, entry) -> spatial_vector`` of a photon: on CUDA the one that a lane
     of the warp has put at an entry, see `exchange`."""
@@ -95,7 +95,7 @@ def make_take_emitted(spec: TransportSpec, cuda: bool) -> wp.Function:
     return take_emitted
 
 
-@made_once
+@memoised
 def make_first_photon(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(first_id, offset) -> uint64``: the id of a launch's first photon."""
     stepped = spec.stepped

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Records, Weight
 from spadwarp_kernels.tally.ledger import (
@@ -22,7 +22,7 @@ from spadwarp_kernels.tally.ledger import (
 )
 
 
-@made_once
+@memoised
 def make_finish(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, out, ledger, thread) -> Weight``: writes the photon's record, and the ledger entry that
     takes the rest of its weight."""
@@ -48,7 +48,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
     return finish
 
 
-@made_once
+@memoised
 def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     """The Warp function ``(s, tally, ledger, thread)``: adds what a thread has summed up to the ledger, and with `adds`
     to the tally what `add_pending` has left."""

@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import (
     STREAM_FLIGHT_SAMPLE,
     STREAM_ROULETTE,
     STREAM_TRANSPORT,
     RoundKeys,
-    block_ahead,
     join_words,
-    make_draw_ahead,
+    make_prefetch,
+    prefetched_block,
     random_block_keyed,
     u01,
     u01_tail,
@@ -26,16 +26,16 @@ from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Medium
 
 
-@made_once
+@memoised
 def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, cuda: bool) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, gate, limits, keys, id, words) -> Flight``.
 
-    On a CPU `words`, WORDS_AHEAD of them, keep the random words of the photon's next flights. They are drawn for
+    On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
     several flights at once, so that it must be called for each flight of a photon in turn.
     """
     plans = plan_flight is not None
     water_free_path = spec.water.free_path
-    events, draw_ahead = make_draw_ahead(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
+    events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
 
     @wp.func
@@ -56,8 +56,8 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, cuda: bool) -
         else:
             k = s.collisions & last
             if k == 0:
-                draw_ahead(words, keys, id, wp.uint32(s.collisions + 1))
-            f.block = block_ahead(words, k)
+                prefetch(words, keys, id, wp.uint32(s.collisions + 1))
+            f.block = prefetched_block(words, k)
         seed = join_words(f.block[0], f.block[2])
         f.distance = water_free_path(medium, layers, s.x, s.u, u01_tail(f.block[0], f.block[2]), seed)
         f.reach = wp.min(f.distance, limits.max_path - s.path)
@@ -65,7 +65,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, cuda: bool) -
             if wp.static(cuda):
                 f.sample_block = random_block_keyed(keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
             else:
-                f.sample_block = block_ahead(words, events + k)
+                f.sample_block = prefetched_block(words, events + k)
             plan = plan_flight(s, f.sample_block, medium, camera, gate, limits)
             f.lens = plan.lens
             f.lens_weight = plan.lens_weight
@@ -77,7 +77,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, cuda: bool) -
     return fly
 
 
-@made_once
+@memoised
 def make_draw_albedo(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, medium, keys, id) -> float``: the albedo of the next collision, that of the water or
     uniform in [0, medium.albedo)."""
@@ -92,7 +92,7 @@ def make_draw_albedo(spec: TransportSpec) -> wp.Function:
     return draw_albedo
 
 
-@made_once
+@memoised
 def make_depart(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, gate, limits, surfaces, keys, id, words)``: lets a photon fly, to
     EVENT or, where a tree of faces may be in its way, to RAY. `brute_force`: every face is tried on the spot."""

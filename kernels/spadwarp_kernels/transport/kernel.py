@@ -12,8 +12,8 @@ state.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.base.philox import WORDS_AHEAD, RoundKeys, hold_keys
+from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.philox import PREFETCHED_WORDS, RoundKeys, hold_keys
 from spadwarp_kernels.estimators.contribution import Asked
 from spadwarp_kernels.estimators.derived import make_derived_cross, make_derived_score
 from spadwarp_kernels.estimators.mirrored import make_score_images
@@ -82,7 +82,7 @@ START_LANES = 4
 FEWER_START_LANES = 3
 
 
-@made_once
+@memoised
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
@@ -183,7 +183,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
         if wp.static(cuda):  # noqa: SIM108, Warp has no such choice between arrays
             words = cursor  # any: it is not used
         else:
-            words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
+            words = wp.zeros(shape=PREFETCHED_WORDS, dtype=int)
         memory = warp_memory()
         turn = Turn()
         turn.enough = 32

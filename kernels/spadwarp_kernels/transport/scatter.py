@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_ROULETTE, STREAM_SURFACE, RoundKeys, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
@@ -60,7 +60,7 @@ class Scattering:
     stokes: wp.vec4
 
 
-@made_once
+@memoised
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, surfaces) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
@@ -81,7 +81,7 @@ def make_survive(spec: TransportSpec) -> wp.Function:
     return survive
 
 
-@made_once
+@memoised
 def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, reflected, lobe, medium, layers, camera, surfaces, guiding, keys, id) -> Direction``.
 
@@ -124,7 +124,7 @@ def make_turn(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     return turn
 
 
-@made_once
+@memoised
 def make_flies(flies_on: bool) -> wp.Function:
     """The Warp function ``reason -> bool``: whether there is a flight after an event.
 
@@ -138,7 +138,7 @@ def make_flies(flies_on: bool) -> wp.Function:
     return flies
 
 
-@made_once
+@memoised
 def make_leave(flies_on: bool) -> wp.Function:
     """The Warp function ``(s, new)`` that takes what an event has made of a photon into its state.
 
@@ -162,7 +162,7 @@ def make_leave(flies_on: bool) -> wp.Function:
     return leave
 
 
-@made_once
+@memoised
 def make_terminate(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(new, collisions, limits, keys, id, ledger, thread) -> Scattering``: the end of a history for
     its analog weight or its events."""
@@ -195,7 +195,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
     return terminate
 
 
-@made_once
+@memoised
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, limits, keys, id, ledger, thread) -> Scattering`` of a photon that a face of the domain
     reflects; what is not reflected leaves by the face.
@@ -238,7 +238,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     return bounce
 
 
-@made_once
+@memoised
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool = False) -> wp.Function:
     """The Warp function ``(s, medium, layers, camera, limits, surfaces, guiding, derivatives, polarisation, keys,
     id, ledger, thread) -> Scattering``.

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.estimators.contribution import Scored
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import may_be_hidden
@@ -23,7 +23,7 @@ class Ray:
     length: float
 
 
-@made_once
+@memoised
 def make_aim(spec: TransportSpec, scores: bool) -> wp.Function:
     """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
 
@@ -49,7 +49,7 @@ def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d(dtype=float), x:
     return True
 
 
-@made_once
+@memoised
 def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(found, camera, surfaces) -> Scored``: whether a shadow ray is needed; by brute force it is
     traced here."""
@@ -76,7 +76,7 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return look
 
 
-@made_once
+@memoised
 def make_begin_walk(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU and with
     Warp's own queries."""
@@ -107,7 +107,7 @@ def next_ray(s: PhotonState) -> int:
     return ray
 
 
-@made_once
+@memoised
 def make_free_lanes(traces: bool) -> wp.Function:
     """The Warp function ``s -> int``, called by all lanes together: how many have room for a contribution that waits
     for its shadow ray. `traces`: whether rays wait at all."""

@@ -7,10 +7,10 @@ import warp as wp
 from helpers.launch import Floats, launched, on_device
 from spadwarp_kernels.base import philox4x32, random_block, u01, u01_fine
 from spadwarp_kernels.base.philox import (
-    WORDS_AHEAD,
+    PREFETCHED_WORDS,
     RoundKeys,
-    block_ahead,
-    make_draw_ahead,
+    make_prefetch,
+    prefetched_block,
     random_block_keyed,
     round_keys,
 )
@@ -80,14 +80,14 @@ def test_round_keys_give_the_blocks_of_their_seed(seed, device):
 
 
 def _ahead(*streams):
-    events, draw_ahead = make_draw_ahead(*streams)
+    events, prefetch = make_prefetch(*streams)
 
     @wp.kernel(enable_backward=False)
     def ahead(keys: RoundKeys, id: wp.uint64, event: wp.uint32, out: wp.array(dtype=wp.vec4ui)):
-        words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
-        draw_ahead(words, keys, id, event)
+        words = wp.zeros(shape=PREFETCHED_WORDS, dtype=int)
+        prefetch(words, keys, id, event)
         for lane in range(8):
-            out[lane] = block_ahead(words, lane)
+            out[lane] = prefetched_block(words, lane)
             stream = wp.uint32(wp.static(streams[0]))
             if lane >= events:
                 stream = wp.uint32(wp.static(streams[-1]))
