@@ -109,7 +109,7 @@ def build_model(
         model = polarised_model(model, scene, mesh)
     if camera:
         spare = _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
-        model = dataclasses.replace(model, low_words=spare)
+        model = dataclasses.replace(model, split_accumulators=spare)
     return model
 
 

@@ -295,12 +295,12 @@ class AddedScores:
 
 
 @memoised
-def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool, low_words: bool) -> wp.Function:
+def make_score_images(spec: TransportSpec, flights: bool, brute_force: bool, split_accumulators: bool) -> wp.Function:
     """The Warp function ``(request, medium, layers, camera, gate, limits, surfaces, scan, derivatives,
     polarisation, tally, low, gradients, ledger, pending_add, thread, scale) -> AddedScores`` that scores an event by
     way of all images; arguments as of `make_score_image`."""
     score_image = make_score_image(spec, flights, brute_force)
-    deposit = make_deposit(spec.signed, 0, low_words)
+    deposit = make_deposit(spec.signed, 0, split_accumulators)
 
     @wp.func
     def score_images(

@@ -73,11 +73,13 @@ def make_ask_flight(request_flight: wp.Function | None, push: wp.Function) -> wp
 
 
 @memoised
-def make_score_points(spec: TransportSpec, score: wp.Function, look: wp.Function, low_words: bool) -> wp.Function:
+def make_score_points(
+    spec: TransportSpec, score: wp.Function, look: wp.Function, split_accumulators: bool
+) -> wp.Function:
     """The Warp function with the arguments of `make_score_images` that scores a flight at all points but the first,
     where each thread scores its own requests; shadow rays are traced on the spot."""
     points, point_of = spec.points, make_point_of(spec.points)
-    deposit = make_deposit(spec.signed, 0, low_words)
+    deposit = make_deposit(spec.signed, 0, split_accumulators)
     has_mesh = spec.mesh
 
     @wp.func

@@ -107,11 +107,11 @@ def _numbers_of_parts(name: str, values: Any, device: wp.Device) -> wp.array:
 
 
 @memoised
-def make_deposit(count: int, kinds: int = 0, low_words: bool = False) -> wp.Function:
+def make_deposit(count: int, kinds: int = 0, split_accumulators: bool = False) -> wp.Function:
     """The Warp function ``(tally, low, gradients, ledger, pending, thread, scale, derivatives, c) -> vec2l``:
     `deposit`, which also adds value times score of a contribution to the tally [voxel, derivative] of so many
     derivatives, and after them of so many kinds of derivatives by block; rounded down after the rounding sample is
-    added, so that the mean is kept. With `low_words`, those of the tally are in `low`."""
+    added, so that the mean is kept. With `split_accumulators`, those of the tally are in `low`."""
 
     @wp.func
     def deposit_scored(
@@ -156,7 +156,7 @@ def make_deposit(count: int, kinds: int = 0, low_words: bool = False) -> wp.Func
                             units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
                             p = wp.static(count) + q * blocks.count + k
                             deposit_scored(gradients, ledger, thread, c.index * width + p, units, c.rounding_sample)
-        if wp.static(low_words):
+        if wp.static(split_accumulators):
             units = c.value * scale
             if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
                 add_to_words(tally, low, c.index, wp.int64(units + c.rounding_sample))

@@ -186,7 +186,7 @@ CACHE_BYTES = 50_000_000
 PHOTONS_PER_VOXEL = 4
 
 
-def low_words_pay(voxels: int, photon_count: int) -> bool:
+def splitting_pays(voxels: int, photon_count: int) -> bool:
     """Whether low words make a launch of so many photons faster, with so many voxels in a component of the tally."""
     return 8 * voxels > CACHE_BYTES and photon_count >= PHOTONS_PER_VOXEL * voxels
 
@@ -194,30 +194,32 @@ def low_words_pay(voxels: int, photon_count: int) -> bool:
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const unsigned low = static_cast<unsigned>(value);
-    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(low_words.data) + index, low);
+    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(split_accumulators.data) + index, low);
     const unsigned high = static_cast<unsigned>(value >> 32) + (before + low < low ? 1u : 0u);
     // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
     if (high)
         atomicAdd(reinterpret_cast<unsigned*>(reinterpret_cast<long long*>(tally.data) + index) + 1, high);
 #endif
 """)
-def add_to_words(tally: wp.array(dtype=wp.int64), low_words: wp.array(dtype=wp.uint32), index: int, value: wp.int64):
+def add_to_words(
+    tally: wp.array(dtype=wp.int64), split_accumulators: wp.array(dtype=wp.uint32), index: int, value: wp.int64
+):
     """Adds value >= 0 to a voxel whose low word is apart; on CUDA alone."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def fold_kernel(low_words: wp.array(dtype=wp.uint32), tally: wp.array(dtype=wp.int64)):
+def fold_kernel(split_accumulators: wp.array(dtype=wp.uint32), tally: wp.array(dtype=wp.int64)):
     """Launch: voxels of all components. Takes the low words and adds them to the tally; other launches may add to both
     meanwhile."""
     voxel = wp.tid()
-    if low_words[voxel] != wp.uint32(0):
-        wp.atomic_add(tally, voxel, wp.int64(wp.atomic_exch(low_words, voxel, wp.uint32(0))))
+    if split_accumulators[voxel] != wp.uint32(0):
+        wp.atomic_add(tally, voxel, wp.int64(wp.atomic_exch(split_accumulators, voxel, wp.uint32(0))))
 
 
-def fold_low_words(low_words: wp.array, tally: wp.array) -> None:
+def fold_accumulators(split_accumulators: wp.array, tally: wp.array) -> None:
     """Adds the low words of a tally to it and sets them to zero; asynchronous on CUDA."""
-    wp.launch(fold_kernel, dim=tally.size, inputs=[low_words, tally], device=tally.device)
+    wp.launch(fold_kernel, dim=tally.size, inputs=[split_accumulators, tally], device=tally.device)
 
 
 # ---- Tallies as rates on their device: sums over components in single precision.

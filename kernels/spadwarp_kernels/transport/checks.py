@@ -343,8 +343,10 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
         check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
     elif data.gradients is not None:
         check_array("data.gradients", data.gradients, wp.int64, (None,), device)
-    if data.low_words is not None:
-        check_array("data.low_words", data.low_words, wp.uint32, (data.tally.size,), device, contiguous=True)
+    if data.split_accumulators is not None:
+        check_array(
+            "data.split_accumulators", data.split_accumulators, wp.uint32, (data.tally.size,), device, contiguous=True
+        )
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)
     if spec.stepped or data.offset is not None:

@@ -83,11 +83,11 @@ FEWER_START_LANES = 3
 
 
 @memoised
-def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bool = False) -> wp.Kernel:
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumulators: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote. `low_words`: on CUDA, those of the tally
-    are apart, see `tally.low_words`.
+    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, those of the tally
+    are apart, see `tally.split_accumulators`.
 
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
@@ -127,12 +127,12 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     warp_memory, push, pop = make_queue(
         flights, queues, asks_twice, has_bvh, confocal, len(spec.derivatives), spec.polarised, spec.points, short
     )
-    deposit = make_deposit(spec.signed, len(spec.blocks), low_words)
+    deposit = make_deposit(spec.signed, len(spec.blocks), split_accumulators)
     begin_history, fly_history, first_stokes = make_begin_history(spec), make_fly_history(spec), make_first_stokes(spec)
     ask_flight = make_ask_flight(request_flight, make_push_points(spec.points, push))
-    score_more, scores_more = make_score_images(spec, flights, brute_force, low_words), reflecting
+    score_more, scores_more = make_score_images(spec, flights, brute_force, split_accumulators), reflecting
     if spec.points > 1 and not queues:
-        score_more, scores_more = make_score_points(spec, score, look, low_words), True
+        score_more, scores_more = make_score_points(spec, score, look, split_accumulators), True
     first_photon, ledger_slot = make_first_photon(spec), make_ledger_slot(cuda)
     finish, flush = make_finish(spec), make_flush(not cuda and (crosses or scores), reflecting)
 

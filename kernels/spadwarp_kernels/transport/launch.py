@@ -26,7 +26,13 @@ from spadwarp_kernels.tally.ledger import (
     PORT_ENTRY,
 )
 from spadwarp_kernels.tally.scores import MOST_DERIVATIVES, Derivatives
-from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel, fold_kernel, fold_low_words, low_words_pay
+from spadwarp_kernels.tally.tally import (
+    COMPONENTS,
+    find_overflow_kernel,
+    fold_accumulators,
+    fold_kernel,
+    splitting_pays,
+)
 from spadwarp_kernels.water.limits import Limits, ready_limits
 from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import Guiding
@@ -51,7 +57,7 @@ class Model:
         scan: Raster of a confocal spec; empty otherwise.
         derivatives: The parameters of a spec with derivatives or channels, from `make_derivatives`.
         polarisation: Those of a polarised spec, from `make_polarisation`.
-        low_words: Whether large launches on CUDA may take half the tally's memory more where that makes them faster,
+        split_accumulators: Whether large launches on CUDA may take half the tally's memory more where that makes them faster,
             with the same sums.
 
     Raises:
@@ -72,7 +78,7 @@ class Model:
     scan: Scan = field(default_factory=Scan)
     derivatives: Derivatives = field(default_factory=Derivatives)
     polarisation: Polarisation = field(default_factory=Polarisation)
-    low_words: bool = False
+    split_accumulators: bool = False
 
     def __post_init__(self) -> None:
         check_model(self)
@@ -97,8 +103,8 @@ class Data:
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
         gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
             without them.
-        low_words: uint32, as long as the tally, zero between launches; made by the first launch that is large enough,
-            see `tally.low_words`, and used by those after it.
+        split_accumulators: uint32, as long as the tally, zero between launches; made by the first launch that is large enough,
+            see `tally.split_accumulators`, and used by those after it.
     """
 
     tally: wp.array
@@ -108,7 +114,7 @@ class Data:
     offset: wp.array | None = None
     reflecting: bool = False
     gradients: wp.array | None = None
-    low_words: wp.array | None = None
+    split_accumulators: wp.array | None = None
 
 
 def make_data(
@@ -157,29 +163,29 @@ def load_transport_kernel(
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch.
 
     With `model`, the kernel of a first launch of `photon_count` photons, which later launches into the same data take,
-    too: with a large tally on CUDA it may be another one, see `Model.low_words`.
+    too: with a large tally on CUDA it may be another one, see `Model.split_accumulators`.
     """
     check_spec(spec)
     device = check_device("device", device)
-    low_words = False
+    split_accumulators = False
     if model is not None:
         check_kind("model", model, Model)
         photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-        low_words = uses_low_words(spec, model, photon_count)
-    kernel = make_transport_kernel(spec, device.is_cuda, low_words)
+        split_accumulators = splits_accumulators(spec, model, photon_count)
+    kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators)
     kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
-    if low_words:
+    if split_accumulators:
         wp.load_module(fold_kernel.module, device=device)
     # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
 
 
-def uses_low_words(spec: TransportSpec, model: Model, photon_count: int) -> bool:
-    """Whether a launch into a tally of the model keeps its low words apart; see `tally.low_words`."""
-    if not (model.low_words and model.device.is_cuda and make_estimator(spec).scores):
+def splits_accumulators(spec: TransportSpec, model: Model, photon_count: int) -> bool:
+    """Whether a launch into a tally of the model keeps its low words apart; see `tally.split_accumulators`."""
+    if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
         return False
     voxels = model.tally_size // len(COMPONENTS)
-    return not (spec.signed or spec.blocks) and low_words_pay(voxels, photon_count)
+    return not (spec.signed or spec.blocks) and splitting_pays(voxels, photon_count)
 
 
 def launch_transport(
@@ -225,27 +231,27 @@ def launch_transport(
     medium, limits = ready_medium(model.medium), ready_limits(model.limits)
     inputs = [medium, model.layers, model.laser, camera, model.gate, limits, model.guiding]
     inputs += [model.surfaces, model.scan, derivatives, model.polarisation]
-    low_words = _low_words(spec, model, data, photon_count)
+    split_accumulators = _split_accumulators(spec, model, data, photon_count)
     wp.launch(
-        make_transport_kernel(spec, model.device.is_cuda, low_words is not None),
+        make_transport_kernel(spec, model.device.is_cuda, split_accumulators is not None),
         dim=threads,
         inputs=[*inputs, seed, round_keys(seed), first_id, photon_count, model.scale],
-        outputs=[data.tally, data.gradients, data.ledger, data.records, data.cursor, data.offset, low_words],
+        outputs=[data.tally, data.gradients, data.ledger, data.records, data.cursor, data.offset, split_accumulators],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )
-    if low_words is not None:
-        fold_low_words(low_words, data.tally)
+    if split_accumulators is not None:
+        fold_accumulators(split_accumulators, data.tally)
 
 
-def _low_words(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
+def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
     """Those of `data` for a launch that uses them: a large one, and after it also smaller ones, which would need
     another kernel otherwise."""
-    if not uses_low_words(spec, model, photon_count if data.low_words is None else _MOST_PHOTONS):
+    if not splits_accumulators(spec, model, photon_count if data.split_accumulators is None else _MOST_PHOTONS):
         return None
-    if data.low_words is None and not model.device.is_capturing:  # what is made there belongs to the graph
-        data.low_words = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
-    return data.low_words
+    if data.split_accumulators is None and not model.device.is_capturing:  # what is made there belongs to the graph
+        data.split_accumulators = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
+    return data.split_accumulators
 
 
 def _with_memory(derivatives: Derivatives, threads: int, device: wp.Device) -> Derivatives:
