@@ -60,14 +60,14 @@ def _launches(mesh: wp.Mesh, grid, flat: dict) -> dict:
     cloud = sk.Model(
         device="cpu",
         mesh=mesh,
-        surfaces=sk.make_surfaces(mesh, 0.5, textures=textures, specular=0.1, public_tree=True),
+        surfaces=sk.make_surfaces(mesh, 0.5, textures=textures, specular=0.1, use_warp_bvh=True),
         scale=2.0**50,
         layers=layers,
         derivatives=sk.make_derivatives((), (), (), blocks=blocks, device="cpu"),
         **behind,
     )
     in_cloud = sk.TransportSpec(
-        "guided", mesh=True, pattern=True, specular=True, public_tree=True, grid=sk.REGULAR_TRACKING,
+        "guided", mesh=True, pattern=True, specular=True, use_warp_bvh=True, grid=sk.REGULAR_TRACKING,
         port=sk.FLAT_PORT, blocks=("absorption",),
     )  # fmt: skip
     limits, camera, laser = within["limits"], within["camera"], within["laser"]

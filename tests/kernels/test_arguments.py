@@ -121,14 +121,14 @@ def test_a_mesh_that_is_not_there(box):
     launch(box, sk.TransportSpec("next_event", mesh=False), model=model)
 
 
-def test_a_public_tree_is_read_from_the_mesh_that_the_model_keeps(box):
+def test_the_bvh_of_warp_is_read_from_the_mesh_that_the_model_keeps(box):
     """With a mesh that nobody keeps this was a segmentation fault, too."""
-    surfaces = sk.make_surfaces(box, 0.5, public_tree=True)
-    spec = sk.TransportSpec("next_event", public_tree=True)
+    surfaces = sk.make_surfaces(box, 0.5, use_warp_bvh=True)
+    spec = sk.TransportSpec("next_event", use_warp_bvh=True)
     for mesh in (None, wp.Mesh(wp.clone(box.points), wp.clone(box.indices))):
         model = sk.Model(device="cpu", mesh=mesh, surfaces=surfaces, scale=2.0**50, **structs())
         with pytest.raises(
-            sk.ArgumentError, match=r"spec\.public_tree = True reads the mesh that the surfaces were made"
+            sk.ArgumentError, match=r"spec\.use_warp_bvh = True reads the mesh that the surfaces were made"
         ):
             launch(box, spec, model=model)
     model = sk.Model(device="cpu", mesh=box, surfaces=surfaces, scale=2.0**50, **structs())

@@ -249,7 +249,7 @@ def make_scattering(spec: TransportSpec, flights: bool = False) -> wp.Function:
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
-    face_at = patch_face if spec.brute_force and not spec.public_tree else tree_face
+    face_at = patch_face if spec.brute_force and not spec.use_warp_bvh else tree_face
     divides, fused = spec.polarised and spec.port is None, _fused_axes(spec, flights)
 
     @wp.func

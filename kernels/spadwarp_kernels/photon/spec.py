@@ -32,7 +32,7 @@ class TransportSpec(NamedTuple):
         confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
         rotated_domain: The domain has axes of its own.
         reflecting: Faces of the domain reflect, as `Limits.boundary` says; needs `bounded`.
-        public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
+        use_warp_bvh: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
         merged: The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is
@@ -70,7 +70,7 @@ class TransportSpec(NamedTuple):
     confocal: bool = False
     rotated_domain: bool = False
     reflecting: bool = False
-    public_tree: bool = False
+    use_warp_bvh: bool = False
     stepped: bool = False
     merged: bool = False
     port: PortKind | None = None

@@ -94,7 +94,7 @@ def make_surfaces(
     camera: "Camera | None" = None,
     device: wp.DeviceLike = None,
     extent: float | None = None,
-    public_tree: bool = False,
+    use_warp_bvh: bool = False,
 ) -> Surfaces:
     """The kernel's view of a mesh.
 
@@ -113,7 +113,7 @@ def make_surfaces(
         camera: Saves most of the rays between scattering events and its lens.
         device: Where the empty arrays go if there is no mesh.
         extent: Largest coordinate that a moving mesh will have [m]; then its bounding box is taken to be this large.
-        public_tree: Rays take `wp.mesh_query_ray` instead of a tree that is read from Warp's private structs: slower,
+        use_warp_bvh: Rays take `wp.mesh_query_ray` instead of a tree that is read from Warp's private structs: slower,
             and the way back when another version of Warp changes these.
 
     Raises:
@@ -168,7 +168,7 @@ def make_surfaces(
     surfaces.extent = float(abs(points).max()) if extent is None else float(extent)
     padding = 1e-6 * surfaces.extent + 1e-6
     surfaces.mesh = mesh.id
-    if public_tree:
+    if use_warp_bvh:
         slots = face_count if device.is_cuda else -(-face_count // LANES) * LANES
         numbers = np.where(np.arange(slots) < face_count, np.arange(slots), -1)
         surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
@@ -198,7 +198,7 @@ def _few_patches(mesh: wp.Mesh, order: wp.array, pairs: bool) -> tuple[wp.array,
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
-    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `public_tree` the
+    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `use_warp_bvh` the
     mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
 
     Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
@@ -277,7 +277,7 @@ def _check_sum(surfaces: Surfaces) -> None:
 
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
-    """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `public_tree`."""
+    """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `use_warp_bvh`."""
     check_struct("surfaces", surfaces, Surfaces)
     for name in ("corner_reflectance", "specular", "nodes"):
         if not isinstance(getattr(surfaces, name), wp.array):
@@ -285,7 +285,7 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     return {
         "pattern": surfaces.corner_reflectance.size > 0,
         "specular": surfaces.specular.size > 0,
-        "public_tree": surfaces.nodes.size == 0,
+        "use_warp_bvh": surfaces.nodes.size == 0,
     }
 
 

@@ -118,7 +118,7 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
     """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
 
     Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
-    Surfaces of `public_tree` take `intersect_mesh`.
+    Surfaces of `use_warp_bvh` take `intersect_mesh`.
     """
     if surfaces.nodes.shape[0] == 0:
         hit = intersect_mesh(surfaces.mesh, x, u, max_distance)

@@ -262,9 +262,9 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
     check_faces("model.surfaces", surfaces, faces, device)
-    if spec.public_tree and (model.mesh is None or model.mesh.id != surfaces.mesh):
+    if spec.use_warp_bvh and (model.mesh is None or model.mesh.id != surfaces.mesh):
         raise ArgumentError(
-            "spec.public_tree = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
+            "spec.use_warp_bvh = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
             "model keeps it"
         )
     if spec.brute_force and device.is_cuda:

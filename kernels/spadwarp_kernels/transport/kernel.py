@@ -100,7 +100,7 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumul
     has_mesh, reflecting, confocal = spec.mesh, spec.reflecting, spec.confocal
     # A handful of faces is tried on the spot; rays for a tree wait until the warp has enough of them. A core walks the
     # tree of a box in a third of the time that its twelve faces take.
-    brute_force = has_mesh and spec.brute_force and cuda and not spec.public_tree
+    brute_force = has_mesh and spec.brute_force and cuda and not spec.use_warp_bvh
     has_bvh = has_mesh and not brute_force
     in_blocks = bool(spec.blocks)
     queues = scores and cuda and not in_blocks  # scores of blocks stay with the thread

@@ -80,7 +80,7 @@ def make_look(spec: TransportSpec, brute_force: bool) -> wp.Function:
 def make_begin_walk(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(surfaces, ray, any_hit) -> TreeWalk``: at the root on CUDA, at its end on the CPU and with
     Warp's own queries."""
-    whole = spec.public_tree or not cuda
+    whole = spec.use_warp_bvh or not cuda
 
     @wp.func
     def begin_walk(surfaces: Surfaces, ray: Ray, any_hit: bool) -> TreeWalk:

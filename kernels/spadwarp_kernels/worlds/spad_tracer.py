@@ -321,7 +321,7 @@ class SpadTracer(WorldCameras):
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
         lanes: Cameras that a GPU traces side by side, each with memory of its own: 8 B a pixel and bin of the tally.
-        public_tree: See `make_surfaces`.
+        use_warp_bvh: See `make_surfaces`.
 
     Attributes:
         rates, histogram, counts, depth, true_depth, normal, albedo, step: As of `SpadCamera`; `rates` have the noise of
@@ -344,7 +344,7 @@ class SpadTracer(WorldCameras):
         estimator: str = "guided",
         oversampling: int = 4,
         lanes: int = 8,
-        public_tree: bool = False,
+        use_warp_bvh: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
         check_kind("shapes", shapes, Shapes)
@@ -357,7 +357,7 @@ class SpadTracer(WorldCameras):
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
         check_choice("estimator", estimator, ESTIMATORS)
         self.photons = check_integer("photons", photons, 1, 1 << 26)
-        self.shapes, self._public_tree = shapes, public_tree
+        self.shapes, self._use_warp_bvh = shapes, use_warp_bvh
         worlds = self._world.numpy().tolist()
         if max(worlds) >= shapes.worlds:
             raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
@@ -458,7 +458,7 @@ class SpadTracer(WorldCameras):
                 textures=textures,
                 camera=camera,
                 extent=extent,
-                public_tree=self._public_tree,
+                use_warp_bvh=self._use_warp_bvh,
             )
             models.append(Model(self.device, medium, laser, camera, gate, limits, guiding, mesh, surfaces, scale))
         self._models = models

@@ -13,7 +13,7 @@ from spadwarp_kernels.surface.bvh import read_tree
 PRIVATE_LAYOUT = (
     f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/intersect/bvh.py reads "
     "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
-    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., public_tree=True) "
+    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., use_warp_bvh=True) "
     "takes wp.mesh_query_ray."
 )
 
@@ -96,11 +96,11 @@ def test_the_tree_is_read_as_warp_writes_it(device):
         assert sorted(seen) == list(range(len(faces))), f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
 
 
-@pytest.mark.parametrize("public_tree", [False, True])
-def test_surfaces_follow_moving_points(public_tree, device):
+@pytest.mark.parametrize("use_warp_bvh", [False, True])
+def test_surfaces_follow_moving_points(use_warp_bvh, device):
     mesh, points = ball(device)
-    surfaces = sk.make_surfaces(mesh, extent=5.0, public_tree=public_tree)
-    assert sk.surface_choices(surfaces)["public_tree"] == public_tree
+    surfaces = sk.make_surfaces(mesh, extent=5.0, use_warp_bvh=use_warp_bvh)
+    assert sk.surface_choices(surfaces)["use_warp_bvh"] == use_warp_bvh
     before = distances(surfaces, device)[0]
     moved = points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)
     mesh.points.assign(moved.astype(np.float32))
@@ -218,10 +218,10 @@ def test_transport_by_public_queries_and_by_steps(device):
     model = small_model(mesh, sk.make_surfaces(mesh, 0.5))
     spec = sk.TransportSpec("next_event")
     light = tally(model, spec)
-    public = dataclasses.replace(model, surfaces=sk.make_surfaces(mesh, 0.5, public_tree=True))
-    with pytest.raises(sk.ArgumentError, match="public_tree = False does not go with"):
+    public = dataclasses.replace(model, surfaces=sk.make_surfaces(mesh, 0.5, use_warp_bvh=True))
+    with pytest.raises(sk.ArgumentError, match="use_warp_bvh = False does not go with"):
         tally(public, spec)
-    other = tally(public, spec._replace(public_tree=True))
+    other = tally(public, spec._replace(use_warp_bvh=True))
     # A ray on an edge may fall on either side of it: the same photons otherwise.
     assert light.sum() > 0 and np.abs(light - other).sum() < 1e-3 * light.sum()
     stepped = spec._replace(stepped=True)

@@ -45,8 +45,8 @@ def garden(device):
     ), transforms([(x, y, 2.5, 0, 0, 0, 1) for x, y in places], device)
 
 
-@pytest.mark.parametrize("public_tree", [False, True])
-def test_without_scattering_both_cameras_see_the_same(public_tree, device):
+@pytest.mark.parametrize("use_warp_bvh", [False, True])
+def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     """Light of the whole image and of its parts, in absorbing water; edges of polygons aside."""
     config = sk.SpadConfig(**SMALL, absorption=0.05, scattering=0.0, dark_rate=2e3)
     fine = dataclasses.replace(config, width=64, height=48, dark_rate=0.0)  # the camera's rays are at pixel centres
@@ -56,7 +56,7 @@ def test_without_scattering_both_cameras_see_the_same(public_tree, device):
     camera.update(shapes, poses, bodies)
     dark = config.dark_rate * config.bin_path / config.speed
     theirs = camera.rates.numpy().astype(float).reshape(2, 12, 4, 16, 4, 64).sum(axis=(2, 4))
-    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, public_tree=public_tree)
+    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, use_warp_bvh=use_warp_bvh)
     tracer.update(poses, bodies)
     mine = tracer.rates.numpy() - dark
     for world in range(2):
