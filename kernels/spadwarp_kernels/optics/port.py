@@ -77,7 +77,7 @@ class Connection:
 
 
 @wp.struct
-class Passage:
+class PortRay:
     """A ray that has gone through a port.
 
     Attributes:
@@ -215,10 +215,10 @@ def apparent_centre_flat(port: Port) -> wp.vec3:
 
 
 @wp.func
-def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
     ray as it goes straight on."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     cosine = -wp.dot(u, port.normal)
     behind = wp.dot(x, port.normal) - port.distance - port.thickness
@@ -243,9 +243,9 @@ def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
 
 
 @wp.func
-def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     cosine = wp.dot(u, port.normal)
     before = port.distance - wp.dot(x, port.normal)
@@ -399,10 +399,10 @@ def apparent_centre_dome(port: Port) -> wp.vec3:
 
 
 @wp.func
-def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
     ray as it goes straight on."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
@@ -434,9 +434,9 @@ def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
 
 
 @wp.func
-def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
@@ -473,8 +473,8 @@ class PortKind(NamedTuple):
         connect: Warp function (port, x, o) -> Connection from x in the water to o inside.
         apparent: Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m].
         apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
-        leave: Warp function (port, x, u) -> Passage of a ray from the water to the plane z = 0 inside.
-        enter: Warp function (port, x, u) -> Passage of a ray from inside into the water.
+        leave: Warp function (port, x, u) -> PortRay of a ray from the water to the plane z = 0 inside.
+        enter: Warp function (port, x, u) -> PortRay of a ray from inside into the water.
         cosines: Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces,
             in the order of `transmission`, of the ray through x in the water along u, on its way in or out.
     """

@@ -13,7 +13,7 @@ from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.tally.scores import Derivatives
 from spadwarp_kernels.tally.tally import Scores
 from spadwarp_kernels.water.medium import Layers, Medium, boundary_ahead, layer_index
-from spadwarp_kernels.water.phase_functions import henyey_greenstein_score
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 
 
 @memoised
@@ -155,7 +155,7 @@ def make_event_scores(spec: TransportSpec) -> wp.Function:
             if (wp.static(by_scattering) >> p) & 1 == 1:
                 scores[p] = scores[p] + wp.where((here >> p) & 1 == 1, 1.0 / derivatives.value[p], 0.0)
             if (wp.static(by_anisotropy) >> p) & 1 == 1:
-                score = henyey_greenstein_score(t, derivatives.value[p])
+                score = henyey_greenstein_log_derivative(t, derivatives.value[p])
                 scores[p] = scores[p] + wp.where((here >> p) & 1 == 1, score, 0.0)
         return scores
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.laser import Laser, Scan, emit_along, emit_measured
-from spadwarp_kernels.optics.port import Passage, Port, PortKind
+from spadwarp_kernels.optics.port import Port, PortKind, PortRay
 from spadwarp_kernels.photon.lanes import exchange
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, Weight, full_weight, give, reweigh
@@ -33,7 +33,7 @@ def make_enter(port: PortKind | None) -> wp.Function:
     """The Warp function ``(laser, emitted, s, ledger, thread) -> Start`` of a photon that a laser has emitted,
     behind a port or in the water."""
     has_port = port is not None
-    enter_port = port.enter if port is not None else _no_passage
+    enter_port = port.enter if port is not None else _no_port_ray
 
     @wp.func
     def enter(
@@ -57,8 +57,8 @@ def make_enter(port: PortKind | None) -> wp.Function:
 
 
 @wp.func
-def _no_passage(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
-    return Passage()
+def _no_port_ray(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
+    return PortRay()
 
 
 @memoised
