@@ -46,15 +46,10 @@ def phase_at(phase: wp.array(dtype=wp.float64), cos_theta: wp.float64) -> wp.flo
 
 
 class SingleScatter(NamedTuple):
-    """Warp functions for single scattering seen through some optics.
+    """Warp functions for single scattering seen through some optics."""
 
-    Attributes:
-        per_metre: (lidar, water, sight, r) -> detections per pulse and metre of range [1/m].
-        rate: (lidar, water, sight, time) -> C_back(t) [1/s].
-    """
-
-    per_metre: wp.Function
-    rate: wp.Function
+    per_metre: wp.Function  # (lidar, water, sight, r) -> detections per pulse and metre of range [1/m]
+    rate: wp.Function  # (lidar, water, sight, time) -> C_back(t) [1/s]
 
 
 @memoised

@@ -54,45 +54,28 @@ class Port:
 
 @wp.struct
 class Connection:
-    """The one way of light from a point in the water to a point inside.
+    """The one way of light from a point in the water to a point inside."""
 
-    Attributes:
-        to_port: Unit direction in the water.
-        inside: Unit direction in which it arrives.
-        exit: Where it leaves the water [m].
-        water: Length of its way in the water [m].
-        path: Length in water that takes as long as the whole way [m].
-        transmission: Fraction of unpolarised light that gets through.
-        density: Solid angle at the point in the water over the area that its light covers inside, across the ray
-            [sr/m^2]; 0: there is no such way. 1/r^2 where all indices are equal.
-    """
-
-    to_port: wp.vec3
-    inside: wp.vec3
-    exit: wp.vec3
-    water: float
-    path: float
-    transmission: float
+    to_port: wp.vec3  # unit direction in the water
+    inside: wp.vec3  # unit direction in which it arrives
+    exit: wp.vec3  # where it leaves the water [m]
+    water: float  # length of its way in the water [m]
+    path: float  # length in water that takes as long as the whole way [m]
+    transmission: float  # fraction of unpolarised light that gets through
+    # solid angle at the point in the water over the area that its light covers inside, across the ray [sr/m^2]; 0:
+    # there is no such way. 1/r^2 where all indices are equal
     density: float
 
 
 @wp.struct
 class PortRay:
-    """A ray that has gone through a port.
+    """A ray that has gone through a port."""
 
-    Attributes:
-        x: Where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside.
-        u: Its unit direction there.
-        water: Length of its way in the water up to the port [m]; negative if the ray began behind that.
-        path: Length in water that takes as long as the way behind that [m].
-        transmission: Fraction of unpolarised light that gets through; 0: none.
-    """
-
-    x: wp.vec3
-    u: wp.vec3
-    water: float
-    path: float
-    transmission: float
+    x: wp.vec3  # where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside
+    u: wp.vec3  # its unit direction there
+    water: float  # length of its way in the water up to the port [m]; negative if the ray began behind that
+    path: float  # length in water that takes as long as the way behind that [m]
+    transmission: float  # fraction of unpolarised light that gets through; 0: none
 
 
 @wp.func

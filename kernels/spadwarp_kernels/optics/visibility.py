@@ -134,17 +134,11 @@ def may_be_hidden(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3
 
 
 class PortView(NamedTuple):
-    """Warp functions for one kind of port, or none.
+    """Warp functions for one kind of port, or none."""
 
-    Attributes:
-        clip: As `clip_to_view`, holding the part that lies in the view.
-        shows: As `in_view`.
-        clip_gate: (camera, gate, x, u, path, lens, interval) -> the part whose light arrives within the gate.
-    """
-
-    clip: wp.Function
-    shows: wp.Function
-    clip_gate: wp.Function
+    clip: wp.Function  # as `clip_to_view`, holding the part that lies in the view
+    shows: wp.Function  # as `in_view`
+    clip_gate: wp.Function  # (camera, gate, x, u, path, lens, interval) -> the part whose light arrives within the gate
 
 
 @wp.func

@@ -198,8 +198,8 @@ def _few_patches(mesh: wp.Mesh, order: wp.array, pairs: bool) -> tuple[wp.array,
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
-    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `use_warp_bvh` the
-    mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
+    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `use_warp_bvh`
+    the mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
 
     Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
     from each other, surfaces made from a new `wp.Mesh` are faster.

@@ -86,8 +86,8 @@ FEWER_START_LANES = 3
 def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumulators: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, those of the tally
-    are apart, see `tally.split_accumulators`.
+    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, those of
+    the tally are apart, see `tally.split_accumulators`.
 
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.

@@ -57,8 +57,8 @@ class Model:
         scan: Raster of a confocal spec; empty otherwise.
         derivatives: The parameters of a spec with derivatives or channels, from `make_derivatives`.
         polarisation: Those of a polarised spec, from `make_polarisation`.
-        split_accumulators: Whether large launches on CUDA may take half the tally's memory more where that makes them faster,
-            with the same sums.
+        split_accumulators: Whether large launches on CUDA may take half the tally's memory more where that makes them
+            faster, with the same sums.
 
     Raises:
         ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
@@ -103,8 +103,8 @@ class Data:
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
         gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
             without them.
-        split_accumulators: uint32, as long as the tally, zero between launches; made by the first launch that is large enough,
-            see `tally.split_accumulators`, and used by those after it.
+        split_accumulators: uint32, as long as the tally, zero between launches; made by the first launch that is large
+            enough, see `tally.split_accumulators`, and used by those after it.
     """
 
     tally: wp.array

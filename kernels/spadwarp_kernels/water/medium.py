@@ -232,34 +232,24 @@ class ProfileSample:
 
 
 class Profile(NamedTuple):
-    """Extinction along a line, by which `guided` takes a point of a flight, as Warp functions.
+    """Extinction along a line, by which `guided` takes a point of a flight, as Warp functions."""
 
-    Attributes:
-        depth: ``(medium, layers, x, u, length) -> float``, the optical depth.
-        draw: ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width] from c(s)
-            exp(-depth(s)); or, where that is not negative, the point `given` with the density that it would have.
-            None: the point is where the photon collides, and `depth` is a guess without chance.
-    """
-
-    depth: wp.Function
+    depth: wp.Function  # ``(medium, layers, x, u, length) -> float``, the optical depth
+    # ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width] from c(s) exp(-depth(s)); or,
+    # where that is not negative, the point `given` with the density that it would have. None: the point is where the
+    # photon collides, and `depth` is a guess without chance
     draw: wp.Function | None = None
 
 
 class Water(NamedTuple):
-    """What transport asks of water, as Warp functions; `seed` has 64 random bits for those that answer by chance.
+    """What transport asks of water, as Warp functions; `seed` has 64 random bits for those that answer by chance."""
 
-    Attributes:
-        free_path: ``(medium, layers, x, u, xi, seed) -> float``, free flight [m].
-        extinction: ``(medium, layers, x, u, length, seed) -> float``, mean extinction of a flight [1/m]; by chance, one
-            whose exp(-extinction length) has the expectation of what passes.
-        at: ``(medium, layers, x) -> Medium``, the water at a point.
-        profile: How `guided` draws a point of a flight; None: with the mean extinction.
-    """
-
-    free_path: wp.Function
+    free_path: wp.Function  # ``(medium, layers, x, u, xi, seed) -> float``, free flight [m]
+    # ``(medium, layers, x, u, length, seed) -> float``, mean extinction of a flight [1/m]; by chance, one whose
+    # exp(-extinction length) has the expectation of what passes
     extinction: wp.Function
-    at: wp.Function
-    profile: Profile | None = None
+    at: wp.Function  # ``(medium, layers, x) -> Medium``, the water at a point
+    profile: Profile | None = None  # how `guided` draws a point of a flight; None: with the mean extinction
 
 
 HOMOGENEOUS = Water(_free_path, _extinction, _water)

@@ -14,11 +14,20 @@ import warp as wp
 from spadwarp_kernels.analytic.backscatter import Scattering, make_scattering, single_scatter_rate
 from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
 from spadwarp_kernels.analytic.optics import IN_WATER
-from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_number, check_vector
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_choice,
+    check_fields,
+    check_integer,
+    check_kind,
+    check_number,
+    check_vector,
+)
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
 from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_density
 
 __all__ = ["CAMERA_FRAMES", "SpadConfig"]
 
@@ -118,8 +127,7 @@ class SpadConfig:
         for name in ("width", "height", "bins"):
             check_integer(f"config.{name}", getattr(self, name), 1)
         check_integer("config.pulses", self.pulses, 0)
-        for name, interval in _RANGES.items():
-            check_number(f"config.{name}", getattr(self, name), interval)
+        check_fields("config", self, _RANGES)
         check_vector("config.gate", self.gate, size=2)
         check_number("config.gate[0]", self.gate[0], "[0, inf)")
         check_number("config.gate[1]", self.gate[1], f"({float(self.gate[0])}, inf)")
@@ -198,9 +206,7 @@ class SpadConfig:
 
     def phase_table(self) -> np.ndarray:
         """The phase function at 4097 angles uniform on [0, π] [1/sr]."""
-        t = 1.0 - np.cos(np.linspace(0.0, np.pi, 4097))
-        g = self.anisotropy
-        return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
+        return henyey_greenstein_density(1.0 - np.cos(np.linspace(0.0, np.pi, 4097)), self.anisotropy)
 
     def response(self) -> tuple[np.ndarray, int]:
         """The Gaussian response in bins for `arrival_bins`, `[PHASES, taps]`, and its lowest tap."""
@@ -227,12 +233,10 @@ def _normal_integral(z: float) -> float:
     return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
 
-def check_config(config: object) -> SpadConfig:
+def check_config(config: Any) -> SpadConfig:
     """A `SpadConfig`, or the default for None."""
-    if config is None:
-        return SpadConfig()
-    if not isinstance(config, SpadConfig):
-        raise ArgumentError(f"config is {type(config).__name__}; a SpadConfig is needed")
+    config = SpadConfig() if config is None else config
+    check_kind("config", config, SpadConfig)
     return config
 
 

@@ -31,34 +31,23 @@ _FAR = wp.constant(1.0e10)
 
 @wp.struct
 class ShapeTable:
-    """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place.
+    """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place."""
 
-    Attributes:
-        kind: Index into SHAPE_KINDS, [shapes].
-        size: [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone:
-            radius and half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points.
-        body: Index of the pose that carries the shape, -1 for none, [shapes].
-        local: Pose of the shape on its body, [shapes].
-        mesh: Id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes].
-        albedo: Lambertian reflectance in [0, 1], [shapes].
-        first: Where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last.
-        member: Shapes in the order of their worlds.
-        first_face: Of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none.
-        textures: Images on the faces of meshes, which multiply the albedo; see `make_textures`.
-        pose: Of each shape in its world, written by `move_shapes`, [shapes].
-    """
-
-    kind: wp.array(dtype=int)
+    kind: wp.array(dtype=int)  # index into SHAPE_KINDS, [shapes]
+    # [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone: radius and
+    # half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points
     size: wp.array(dtype=wp.vec3)
-    body: wp.array(dtype=int)
-    local: wp.array(dtype=wp.transform)
-    mesh: wp.array(dtype=wp.uint64)
-    albedo: wp.array(dtype=float)
+    body: wp.array(dtype=int)  # index of the pose that carries the shape, -1 for none, [shapes]
+    local: wp.array(dtype=wp.transform)  # pose of the shape on its body, [shapes]
+    mesh: wp.array(dtype=wp.uint64)  # id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes]
+    reflectance: wp.array(dtype=float)  # Lambertian, in [0, 1], [shapes]
+    # where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last
     first: wp.array(dtype=int)
-    member: wp.array(dtype=int)
+    member: wp.array(dtype=int)  # shapes in the order of their worlds
+    # of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none
     first_face: wp.array(dtype=int)
-    textures: Textures
-    pose: wp.array(dtype=wp.transform)
+    textures: Textures  # images on the faces of meshes, which multiply the reflectance; see `make_textures`
+    pose: wp.array(dtype=wp.transform)  # of each shape in its world, written by `move_shapes`, [shapes]
 
 
 @dataclass(frozen=True)
@@ -90,7 +79,7 @@ def make_shapes(
     body: Any = None,
     local: Any = None,
     mesh: Any = None,
-    albedo: Any = 0.2,
+    reflectance: Any = 0.2,
     world: Any = None,
     worlds: int = 1,
     visible: Any = None,
@@ -106,7 +95,7 @@ def make_shapes(
         body: -1, the default, stands still in its world.
         local: Poses on the bodies (x, y, z, qx, qy, qz, qw).
         mesh: `wp.Mesh` objects, or ids of such; None or 0 for the other kinds. The shapes keep them alive.
-        albedo: A number, or one for each shape.
+        reflectance: A number, or one for each shape.
         world: Index of the world of each shape, -1 for a shape that stands in all; read once, on the host. By default
             all stand in world 0, or in all worlds if there are several.
         worlds: Number of worlds.
@@ -157,7 +146,7 @@ def make_shapes(
     table.body = on_device("body", body, wp.int32, -1)
     table.local = on_device("local", local, wp.transform, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     table.mesh = on_device("mesh", mesh, wp.uint64, 0)
-    table.albedo = on_device("albedo", albedo, wp.float32, None)
+    table.reflectance = on_device("reflectance", reflectance, wp.float32, None)
     table.first_face = on_device("first_face", first_face, wp.int32, -1)
     if textures is not None:
         check_struct("textures", textures, Textures)
@@ -210,9 +199,9 @@ def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...
     kind, mesh, size = table.kind.numpy(), table.mesh.numpy(), table.size.numpy()
     if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
         raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
-    albedo = table.albedo.numpy()
-    if not ((albedo >= 0.0) & (albedo <= 1.0)).all():
-        raise ArgumentError(f"albedo holds {albedo.min()} to {albedo.max()}, outside [0, 1]")
+    reflectance = table.reflectance.numpy()
+    if not ((reflectance >= 0.0) & (reflectance <= 1.0)).all():
+        raise ArgumentError(f"reflectance holds {reflectance.min()} to {reflectance.max()}, outside [0, 1]")
     body = table.body.numpy()
     if body.min() < -1:
         raise ArgumentError(f"body[{body.argmin()}] = {body.min()} is outside [-1, 2147483647]")
@@ -305,24 +294,17 @@ def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
 
 @wp.struct
 class SceneHit:
-    """The nearest shape along a ray.
+    """The nearest shape along a ray."""
 
-    Attributes:
-        distance: [m]; -1 for none.
-        normal: Unit vector against the ray.
-        albedo: At this point.
-        shape: Its index; -1 for none.
-    """
-
-    distance: float
-    normal: wp.vec3
-    albedo: float
-    shape: int
+    distance: float  # [m]; -1 for none
+    normal: wp.vec3  # unit vector against the ray
+    reflectance: float  # at this point
+    shape: int  # its index; -1 for none
 
 
 @wp.func
-def _albedo_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
-    albedo = table.albedo[k]
+def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
+    reflectance = table.reflectance[k]
     first = table.first_face[k]
     if hit.face >= 0 and first >= 0:
         row = first + hit.face
@@ -331,8 +313,8 @@ def _albedo_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
             uv = hit.corner[0] * table.textures.coordinates[row, 0]
             uv += hit.corner[1] * table.textures.coordinates[row, 1]
             uv += (1.0 - hit.corner[0] - hit.corner[1]) * table.textures.coordinates[row, 2]
-            albedo *= texture_at(table.textures, index, uv)
-    return albedo
+            reflectance *= texture_at(table.textures, index, uv)
+    return reflectance
 
 
 @wp.func
@@ -363,5 +345,5 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> S
         normal = wp.transform_vector(table.pose[found], nearest.normal)
         result.distance = nearest.distance
         result.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-        result.albedo = _albedo_at(table, found, nearest)
+        result.reflectance = _reflectance_at(table, found, nearest)
     return result

@@ -44,7 +44,7 @@ def _trace_kernel(
     # Out, [cameras, height, width]:
     depth: wp.array3d(dtype=float),
     normal: wp.array3d(dtype=wp.vec3),
-    albedo: wp.array3d(dtype=float),
+    reflectance: wp.array3d(dtype=float),
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
@@ -53,11 +53,11 @@ def _trace_kernel(
     hit = intersect_shapes(shapes, world[v], wp.transform_get_translation(pose), wp.transform_vector(pose, u))
     depth[v, i, j] = wp.NAN
     normal[v, i, j] = wp.vec3(wp.NAN)
-    albedo[v, i, j] = wp.NAN
+    reflectance[v, i, j] = wp.NAN
     if hit.shape >= 0:
         depth[v, i, j] = hit.distance * u[2]
         normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
-        albedo[v, i, j] = hit.albedo
+        reflectance[v, i, j] = hit.reflectance
 
 
 @wp.kernel(enable_backward=False)
@@ -145,7 +145,7 @@ class WorldCameras:
         self.counts = wp.zeros(image, dtype=int, device=device)
         self.depth, self.true_depth = (wp.full(image, wp.nan, dtype=float, device=device) for _ in range(2))
         self.normal = wp.zeros(image, dtype=wp.vec3, device=device)
-        self.albedo = wp.zeros(image, dtype=float, device=device)
+        self.reflectance = wp.zeros(image, dtype=float, device=device)
         self.step = wp.zeros(1, dtype=wp.int64, device=device)
         self._view = wp.array(config.lines_of_sight(), dtype=wp.vec3, device=device)
         background = backscatter_rates(config, device)
@@ -172,7 +172,7 @@ class WorldCameras:
             self._poses_checked = True
         move_shapes(shapes, body_q)
         inputs = [shapes.table, camera_q, self._optical, self._world, self._view]
-        outputs = [self.true_depth, self.normal, self.albedo]
+        outputs = [self.true_depth, self.normal, self.reflectance]
         wp.launch(_trace_kernel, self.true_depth.shape, inputs, outputs, device=self.device)
 
     def _detect(self) -> None:
@@ -218,12 +218,12 @@ def _images_kernel(
     normal_in: wp.array3d(dtype=wp.vec3),
     camera_q: wp.array(dtype=wp.transform),
     optical: wp.transform,
-    albedo_in: wp.array3d(dtype=float),
-    one_albedo: float,
+    reflectance_in: wp.array3d(dtype=float),
+    one_reflectance: float,
     # Out:
     depth: wp.array3d(dtype=float),
     normal: wp.array3d(dtype=wp.vec3),
-    albedo: wp.array3d(dtype=float),
+    reflectance: wp.array3d(dtype=float),
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
@@ -233,10 +233,10 @@ def _images_kernel(
     if along_ray == 1:
         z = z * u[2]
     depth[v, i, j] = wp.where(wp.isfinite(z) and z > 0.0, z, wp.NAN)
-    value = one_albedo
-    if albedo_in.shape[0] > 0:
-        value = albedo_in[v, i, j]
-    albedo[v, i, j] = value
+    value = one_reflectance
+    if reflectance_in.shape[0] > 0:
+        value = reflectance_in[v, i, j]
+    reflectance[v, i, j] = value
     n = wp.vec3(0.0)
     if normal_in.shape[0] > 0:
         n = normal_in[v, i, j]
@@ -300,7 +300,7 @@ def _signal_kernel(
     view: wp.array(dtype=wp.vec3),
     depth: wp.array(dtype=float),
     normal: wp.array(dtype=wp.vec3),
-    albedo: wp.array(dtype=float),
+    reflectance: wp.array(dtype=float),
     # Out:
     signal: wp.array(dtype=float),
     path: wp.array(dtype=float),
@@ -312,7 +312,7 @@ def _signal_kernel(
     path[row] = wp.inf
     if depth[row] > 0.0:
         r = wp.float64(depth[row]) / u[2]
-        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(normal[row]), wp.float64(albedo[row]))
+        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(normal[row]), wp.float64(reflectance[row]))
         path[row] = float(beam_path(lidar, r * u) + r)
         if value > wp.float64(0.0) and wp.isfinite(value):
             signal[row] = float(value)
@@ -371,7 +371,7 @@ class SpadCamera(WorldCameras):
         counts: Sum of the histogram, int32 `[cameras, height, width]`.
         depth: Planar depth (z of the optical frame) from the histogram [m], float32 `[cameras, height, width]`; NaN for
             none.
-        true_depth, normal, albedo: What is there, `[cameras, height, width]`: planar depth [m], unit normals towards
+        true_depth, normal, reflectance: What is there, `[cameras, height, width]`: planar depth [m], unit normals to
             the camera in the optical frame, reflectance; NaN for none.
         step: Number of the next step, int64 `[1]`. A step's random numbers depend on `config.seed` and it alone.
 
@@ -410,7 +410,7 @@ class SpadCamera(WorldCameras):
         self,
         depth: wp.array,
         normal: wp.array | None = None,
-        albedo: wp.array | float = 0.2,
+        reflectance: wp.array | float = 0.2,
         *,
         along_ray: bool = False,
         camera_q: wp.array | None = None,
@@ -421,31 +421,31 @@ class SpadCamera(WorldCameras):
             depth: float32 [m], planar; 0, negative, NaN or infinite where nothing is.
             normal: vec3, either side, in the camera's frame or, with `camera_q`, in the world's; None takes them from
                 the slope of the depth.
-            albedo: float32 in [0, 1], or a number.
+            reflectance: float32 in [0, 1], or a number.
             along_ray: Depth is the distance from the lens, as Newton's `depth_image` is.
             camera_q: As in `update`.
         """
         shape = self.true_depth.shape
         check_array("depth", depth, wp.float32, shape, self.device)
         number = 0.0
-        if isinstance(albedo, wp.array):
-            check_array("albedo", albedo, wp.float32, shape, self.device)
+        if isinstance(reflectance, wp.array):
+            check_array("reflectance", reflectance, wp.float32, shape, self.device)
         else:
-            number, albedo = check_number("albedo", albedo, "[0, 1]"), self._none
+            number, reflectance = check_number("reflectance", reflectance, "[0, 1]"), self._none
         if normal is not None:
             check_array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
             check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
         inputs = [self._view, depth, int(bool(along_ray)), self._no_normal if normal is None else normal]
-        inputs += [self._no_pose if camera_q is None else camera_q, self._optical, albedo, number]
-        outputs = [self.true_depth, self.normal, self.albedo]
+        inputs += [self._no_pose if camera_q is None else camera_q, self._optical, reflectance, number]
+        outputs = [self.true_depth, self.normal, self.reflectance]
         wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)
         self._draw()
 
     def _draw(self) -> None:
         """Signal, rates, counts and depth from the images of what is there."""
         config = self.config
-        inputs = [self._lidar, self._view, self.true_depth.flatten(), self.normal.flatten(), self.albedo.flatten()]
+        inputs = [self._lidar, self._view, self.true_depth.flatten(), self.normal.flatten(), self.reflectance.flatten()]
         outputs = [self._signal, self._path]
         wp.launch(_signal_kernel, self._rows[0], inputs, outputs, device=self.device)
         inputs = [self._signal, self._path, self._background, config.gate_paths[0], config.bin_path]

@@ -142,7 +142,7 @@ def _place_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _albedo_kernel(
+def _reflectance_kernel(
     shape: wp.array(dtype=int),
     table: ShapeTable,
     # Out:
@@ -151,7 +151,7 @@ def _albedo_kernel(
 ):
     """Launch: faces."""
     i = wp.tid()
-    value = table.albedo[shape[i]]
+    value = table.reflectance[shape[i]]
     reflectance[i] = value
     if corner_reflectance.shape[0] > 0:
         corner_reflectance[i] = wp.vec3(value)
@@ -293,15 +293,10 @@ def _advance_kernel(offset: wp.array(dtype=wp.uint64), count: wp.uint64):
 
 @dataclasses.dataclass(frozen=True)
 class _Lane:
-    """What cameras that are traced one after the other share; lanes run side by side on a GPU.
+    """What cameras that are traced one after the other share; lanes run side by side on a GPU."""
 
-    Attributes:
-        stream: None for the device's current one.
-        data: Its tally and cursor; the ledger and the offset are those of all lanes.
-    """
-
-    stream: wp.Stream | None
-    data: Data
+    stream: wp.Stream | None  # none for the device's current one
+    data: Data  # its tally and cursor; the ledger and the offset are those of all lanes
 
 
 class SpadTracer(WorldCameras):
@@ -313,7 +308,7 @@ class SpadTracer(WorldCameras):
     48 sides. The light of a photon depends on `config.seed` and its number, and every step has new photons.
 
     Args:
-        shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, albedo and the points of meshes may
+        shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, reflectance and the points of meshes may
             change in place.
         config, cameras, frame, device: As for `SpadCamera`.
         world: World of each camera, a list; by default camera k is in world k.
@@ -324,8 +319,8 @@ class SpadTracer(WorldCameras):
         use_warp_bvh: See `make_surfaces`.
 
     Attributes:
-        rates, histogram, counts, depth, true_depth, normal, albedo, step: As of `SpadCamera`; `rates` have the noise of
-            the photons that were traced.
+        rates, histogram, counts, depth, true_depth, normal, reflectance, step: As of `SpadCamera`; `rates` have the noise
+            of the photons that were traced.
         data: Ledger of the last step, for `read_ledger`, and the tally of one of the cameras.
 
     Raises:
@@ -397,7 +392,7 @@ class SpadTracer(WorldCameras):
         config, surfaces, photons = self.config, model.surfaces, self.photons
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
-        wp.launch(_albedo_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
+        wp.launch(_reflectance_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
         launch_transport(
