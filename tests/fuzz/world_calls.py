@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 import spadwarp_kernels as sk
+from spadwarp_kernels.worlds.shapes import move_shapes
 
 _STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -43,7 +44,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
         "SpadCamera.update": (lambda **changed: sk.SpadCamera(**camera).update(**changed), looked),
         "SpadCamera.images": (lambda **changed: sk.SpadCamera(**camera).update_from_images(**changed), images),
         "SpadTracer": (sk.SpadTracer, {"shapes": made, "photons": 100, "oversampling": 2, **camera}),
-        "move_shapes": (sk.move_shapes, {"shapes": made, "body_q": poses}),
+        "move_shapes": (move_shapes, {"shapes": made, "body_q": poses}),
         "write_poses": (
             sk.write_poses,
             {"position": wp.zeros(2, dtype=wp.vec3), "rotation": matrix, "out": wp.zeros(2, dtype=wp.transform)},

@@ -30,13 +30,13 @@ _PANELS = wp.constant(TABLE_EDGES - 1)
 class Scattering:
     """What the water scatters back, made by `make_scattering`."""
 
-    lines: wp.array(dtype=wp.vec3d)  # photons per pulse, extinction and scattering [1/m] of each spectral line
-    phase: wp.array(dtype=wp.float64)  # phase function [1/sr] at angles uniform on [0, π]
-    profile: wp.array2d(dtype=float)  # backscatter detections per pulse and bin, see `statistics_maps`
+    lines: wp.array[wp.vec3d]  # photons per pulse, extinction and scattering [1/m] of each spectral line
+    phase: wp.array[wp.float64]  # phase function [1/sr] at angles uniform on [0, π]
+    profile: wp.array2d[float]  # backscatter detections per pulse and bin, see `statistics_maps`
 
 
 @wp.func
-def phase_at(phase: wp.array(dtype=wp.float64), cos_theta: wp.float64) -> wp.float64:
+def phase_at(phase: wp.array[wp.float64], cos_theta: wp.float64) -> wp.float64:
     """Phase function [1/sr] from its table over the scattering angle, uniform on [0, pi]."""
     last = phase.shape[0] - 1
     position = wp.acos(wp.clamp(cos_theta, -ONE, ONE)) / PI * wp.float64(last)
@@ -113,12 +113,12 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
         first: int,
         lidar: Lidar,
         water: Scattering,
-        view: wp.array(dtype=wp.vec3d),
-        distance: wp.array(dtype=wp.float64),
+        view: wp.array[wp.vec3d],
+        distance: wp.array[wp.float64],
         # Out:
-        paths: wp.array2d(dtype=float),
-        cumulative: wp.array2d(dtype=float),
-        total: wp.array(dtype=wp.float64),
+        paths: wp.array2d[float],
+        cumulative: wp.array2d[float],
+        total: wp.array[wp.float64],
     ):
         """Edges in path, cumulative distribution and total of single-scatter backscatter. Launch grid: pixels."""
         i = first + wp.tid()

@@ -128,11 +128,11 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
 @wp.kernel
 def _outliers(
     first: int,
-    signal_count: wp.array(dtype=wp.float64),
-    level: wp.array(dtype=wp.float64),
-    window: wp.array(dtype=wp.float64),
+    signal_count: wp.array[wp.float64],
+    level: wp.array[wp.float64],
+    window: wp.array[wp.float64],
     # Out:
-    probability: wp.array(dtype=wp.float64),
+    probability: wp.array[wp.float64],
 ):
     """Launch grid: elements."""
     i = first + wp.tid()
@@ -183,13 +183,7 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
 
     @wp.func
     def integrate_pulse(
-        lidar: Lidar,
-        water: Scattering,
-        i: int,
-        sight: SightRay,
-        s: wp.float64,
-        mu: wp.float64,
-        ambient: wp.float64,
+        lidar: Lidar, water: Scattering, i: int, sight: SightRay, s: wp.float64, mu: wp.float64, ambient: wp.float64
     ) -> PulseIntegrals:
         """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there,
         24 panels of at most σ/2 with five Gauss-Legendre nodes."""
@@ -231,21 +225,21 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         first: int,
         lidar: Lidar,
         water: Scattering,
-        view: wp.array(dtype=wp.vec3d),
-        signal: wp.array(dtype=wp.float64),
-        arrival: wp.array(dtype=wp.float64),
-        backscatter: wp.array(dtype=wp.float64),
-        ambient: wp.array(dtype=wp.float64),
+        view: wp.array[wp.vec3d],
+        signal: wp.array[wp.float64],
+        arrival: wp.array[wp.float64],
+        backscatter: wp.array[wp.float64],
+        ambient: wp.array[wp.float64],
         count_law: int,
         acquisitions: wp.float64,
         pulses_per_frame: wp.float64,
         with_outliers: int,
         # Out:
-        alpha: wp.array(dtype=wp.float64),
-        fisher: wp.array(dtype=wp.float64),
-        sigma_time: wp.array(dtype=wp.float64),
-        level: wp.array(dtype=wp.float64),
-        outlier: wp.array(dtype=wp.float64),
+        alpha: wp.array[wp.float64],
+        fisher: wp.array[wp.float64],
+        sigma_time: wp.array[wp.float64],
+        level: wp.array[wp.float64],
+        outlier: wp.array[wp.float64],
     ):
         """α (integral of eq 8), Fisher information per photon (eq 9), σ*, outlier probability. Launch grid: pixels."""
         i = first + wp.tid()
@@ -289,13 +283,13 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
 @wp.kernel
 def _histogram_information(
     first: int,
-    signal: wp.array2d(dtype=float),
-    background: wp.array2d(dtype=float),
-    taps: wp.array(dtype=wp.float64),
-    slope_taps: wp.array(dtype=wp.float64),
+    signal: wp.array2d[float],
+    background: wp.array2d[float],
+    taps: wp.array[wp.float64],
+    slope_taps: wp.array[wp.float64],
     first_photon: int,
     # Out:
-    information: wp.array(dtype=wp.float64),
+    information: wp.array[wp.float64],
 ):
     """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels.
 
@@ -393,12 +387,7 @@ def statistics_maps(
 
 
 def histogram_information(
-    signal: wp.array,
-    background: wp.array,
-    taps: wp.array,
-    slope_taps: wp.array,
-    *,
-    first_photon: bool,
+    signal: wp.array, background: wp.array, taps: wp.array, slope_taps: wp.array, *, first_photon: bool
 ) -> wp.array:
     """Fisher information of the delay per pulse [1/bins²], float64 `[pixel]`.
 

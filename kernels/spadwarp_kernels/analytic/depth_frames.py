@@ -38,18 +38,18 @@ class PixelMaps:
     laser: wp.vec3
     nearest: float  # path at which the gate opens [m]
     farthest: float  # path at which it closes [m]
-    view: wp.array(dtype=wp.vec3)
-    depth: wp.array(dtype=float)
-    sigma_depth: wp.array(dtype=float)
-    probability: wp.array(dtype=float)
-    flat_share: wp.array(dtype=float)
-    paths: wp.array2d(dtype=float)
-    cumulative: wp.array2d(dtype=float)
+    view: wp.array[wp.vec3]
+    depth: wp.array[float]
+    sigma_depth: wp.array[float]
+    probability: wp.array[float]
+    flat_share: wp.array[float]
+    paths: wp.array2d[float]
+    cumulative: wp.array2d[float]
     ports: Ports
 
 
 @wp.func
-def path_at_share(paths: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=float), pixel: int, u: float) -> float:
+def path_at_share(paths: wp.array2d[float], cumulative: wp.array2d[float], pixel: int, u: float) -> float:
     """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
     row = pixel % cumulative.shape[0]
     edges = pixel % paths.shape[0]
@@ -120,8 +120,8 @@ def _make_sample_kernel(optics: Optics) -> wp.Kernel:
         frame_count: int,
         seed: wp.uint64,
         # Out:
-        frames: wp.array2d(dtype=float),
-        labels: wp.array2d(dtype=wp.bool),
+        frames: wp.array2d[float],
+        labels: wp.array2d[wp.bool],
     ):
         """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
 
@@ -294,12 +294,12 @@ def _make_coding_kernel(optics: Optics) -> wp.Kernel:
         first: int,
         coding: FrameCoding,
         maps: PixelMaps,
-        alpha: wp.array(dtype=float),
-        fraction: wp.array(dtype=float),
+        alpha: wp.array[float],
+        fraction: wp.array[float],
         # Out:
-        depth_codes: wp.array2d(dtype=wp.uint16),
-        intensity_codes: wp.array2d(dtype=wp.uint8),
-        label_bytes: wp.array2d(dtype=wp.uint8),
+        depth_codes: wp.array2d[wp.uint16],
+        intensity_codes: wp.array2d[wp.uint8],
+        label_bytes: wp.array2d[wp.uint8],
     ):
         """Launch grid: frames x bytes of labels. A thread draws the eight pixels of one byte."""
         tid = first + wp.tid()

@@ -171,13 +171,13 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
     def signal_kernel(
         first: int,
         lidar: Lidar,
-        view: wp.array(dtype=wp.vec3d),
-        distance: wp.array(dtype=wp.float64),
-        normal: wp.array(dtype=wp.vec3d),
-        reflectance: wp.array(dtype=wp.float64),
+        view: wp.array[wp.vec3d],
+        distance: wp.array[wp.float64],
+        normal: wp.array[wp.vec3d],
+        reflectance: wp.array[wp.float64],
         # Out:
-        signal: wp.array(dtype=wp.float64),
-        arrival: wp.array(dtype=wp.float64),
+        signal: wp.array[wp.float64],
+        arrival: wp.array[wp.float64],
     ):
         """Launch grid: pixels."""
         i = first + wp.tid()

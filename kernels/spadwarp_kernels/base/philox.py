@@ -9,7 +9,7 @@ import warp as wp
 from .kernels import memoised
 from .native import held_word
 
-__all__ = ["philox4x32", "random_block", "u01", "u01_fine", "u01_tail"]
+__all__ = ["random_block", "u01"]
 
 _M0 = wp.constant(wp.uint32(0xD2511F53))
 _M1 = wp.constant(wp.uint32(0xCD9E8D57))
@@ -208,13 +208,13 @@ def make_prefetch(*streams: int) -> tuple[int, wp.Function]:
     ids = [str(int(streams[lane // events])) for lane in range(_BLOCKS)]
 
     @wp.func_native(_CODE.replace("EVENTS", ", ".join(steps)).replace("STREAMS", ", ".join(ids)))
-    def prefetch(words: wp.array(dtype=int), keys: RoundKeys, id: wp.uint64, event: wp.uint32): ...
+    def prefetch(words: wp.array[int], keys: RoundKeys, id: wp.uint64, event: wp.uint32): ...
 
     return events, prefetch
 
 
 @wp.func
-def prefetched_block(words: wp.array(dtype=int), lane: int) -> wp.vec4ui:
+def prefetched_block(words: wp.array[int], lane: int) -> wp.vec4ui:
     """Block `lane` of what `prefetch` has written: the number of the stream times the number of events, plus that of
     the event."""
     return wp.vec4ui(

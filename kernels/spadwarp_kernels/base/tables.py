@@ -40,9 +40,9 @@ class DensityTables:
 
     # `[row, cell]`, cells in ascending order of x: probability below the cell, below its upper end, density at its end
     # nearer to 0 or 1, density at its other end
-    cells: wp.array2d(dtype=wp.vec4)
+    cells: wp.array2d[wp.vec4]
     # `[row, cell]`: for each cell of a uniform number, on the same grid, the first cell that its sample can lie in
-    guide: wp.array2d(dtype=int)
+    guide: wp.array2d[int]
 
 
 @wp.func

@@ -52,13 +52,13 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def peak(
         first_pixel: int,
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
         first: int,
         stop: int,
         half_width: int,
         # Out:
-        arrival: wp.array(dtype=float),
+        arrival: wp.array[float],
     ):
         pixel = first_pixel + wp.tid()
         level = pixel % background.shape[0]
@@ -97,9 +97,9 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
 
     @wp.func
     def filter_score(
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
-        response: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         pixel: int,
         window: wp.vec3i,
         phases: int,
@@ -115,9 +115,9 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
 
     @wp.func
     def profile_likelihood(
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
-        response: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         pixel: int,
         window: wp.vec3i,
         phases: int,
@@ -173,14 +173,14 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def search(
         first_pixel: int,
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
-        response: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         response_floor: float,
         window: wp.vec3i,
         coarse_step: int,
         # Out:
-        arrival: wp.array(dtype=float),
+        arrival: wp.array[float],
     ):
         """`window`: the first bin, the one after the last, the bin of the first tap. Launch: pixels."""
         pixel = first_pixel + wp.tid()

@@ -91,7 +91,7 @@ def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.u
 
 @wp.func
 def _draw_row(
-    hazard: wp.array2d(dtype=float),
+    hazard: wp.array2d[float],
     pixel: int,
     row: int,
     pulses: int,
@@ -99,7 +99,7 @@ def _draw_row(
     seed: wp.uint64,
     id: wp.uint64,
     # Out, zero before or counts to add to:
-    counts: wp.array2d(dtype=int),
+    counts: wp.array2d[int],
 ):
     """Adds the counts of `pulses` pulses of a pixel to a row; `id` names the draw."""
     block = wp.uint32(0)
@@ -135,14 +135,14 @@ def _draw_row(
 @wp.kernel(enable_backward=False)
 def _first_photon_kernel(
     first_row: int,
-    hazard: wp.array2d(dtype=float),
+    hazard: wp.array2d[float],
     pulses: int,
-    first_frame: wp.array(dtype=wp.int64),
+    first_frame: wp.array[wp.int64],
     summed: int,
     depth: int,
     seed: wp.uint64,
     # Out, zero before:
-    counts: wp.array2d(dtype=int),
+    counts: wp.array2d[int],
 ):
     row = first_row + wp.tid()
     pixels = hazard.shape[0]
@@ -194,13 +194,7 @@ def first_photon_counts(
 
 
 def first_photon_step(
-    hazard: wp.array,
-    *,
-    pulses: int,
-    frame: wp.array,
-    counter_depth: int = 0,
-    seed: int,
-    counts: wp.array,
+    hazard: wp.array, *, pulses: int, frame: wp.array, counter_depth: int = 0, seed: int, counts: wp.array
 ) -> None:
     """One frame of `first_photon_counts` whose number is on the device, for a step that is captured in a graph.
 
@@ -228,7 +222,7 @@ def first_photon_step(
 
 
 @wp.func
-def _last_not_above(values: wp.array2d(dtype=wp.float64), row: int, x: wp.float64) -> int:
+def _last_not_above(values: wp.array2d[wp.float64], row: int, x: wp.float64) -> int:
     """Index i of the interval [values[i], values[i + 1]) of a rising row that holds x, clamped to the row."""
     low = int(0)
     high = values.shape[1] - 1
@@ -242,9 +236,7 @@ def _last_not_above(values: wp.array2d(dtype=wp.float64), row: int, x: wp.float6
 
 
 @wp.kernel(enable_backward=False)
-def _cumulative_kernel(
-    first_pixel: int, offset: int, hazard: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=wp.float64)
-):
+def _cumulative_kernel(first_pixel: int, offset: int, hazard: wp.array2d[float], cumulative: wp.array2d[wp.float64]):
     pixel = first_pixel + wp.tid()
     total = wp.float64(0.0)
     cumulative[pixel, 0] = total
@@ -265,8 +257,8 @@ class Moment:
 
 @wp.func
 def _next_primary(
-    cumulative: wp.array2d(dtype=wp.float64),
-    edges: wp.array2d(dtype=wp.float64),
+    cumulative: wp.array2d[wp.float64],
+    edges: wp.array2d[wp.float64],
     local: int,
     pulses: wp.int64,
     pulse: wp.int64,
@@ -322,10 +314,10 @@ def _next_afterpulse(
 def _event_kernel(
     first_row: int,
     # Pixels `offset` … of an image of `pixels`:
-    cumulative: wp.array2d(dtype=wp.float64),
+    cumulative: wp.array2d[wp.float64],
     offset: int,
     pixels: int,
-    edges: wp.array2d(dtype=wp.float64),
+    edges: wp.array2d[wp.float64],
     recorded: int,
     pulses: wp.int64,
     period: wp.float64,
@@ -337,12 +329,12 @@ def _event_kernel(
     depth: int,
     seed: wp.uint64,
     write_tags: int,
-    tag_start: wp.array(dtype=wp.int64),
+    tag_start: wp.array[wp.int64],
     # Out, counts zero before:
-    counts: wp.array2d(dtype=int),
-    tag_count: wp.array(dtype=int),
-    tag_pulse: wp.array(dtype=wp.int64),
-    tag_bin: wp.array(dtype=int),
+    counts: wp.array2d[int],
+    tag_count: wp.array[int],
+    tag_pulse: wp.array[wp.int64],
+    tag_bin: wp.array[int],
 ):
     tid = first_row + wp.tid()
     local = tid % cumulative.shape[0]

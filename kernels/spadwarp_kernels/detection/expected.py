@@ -44,7 +44,7 @@ RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
 @memoised
 def _invalid_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def invalid(first_pixel: int, values: wp.array2d(dtype=dtype), worst: wp.array(dtype=int)):
+    def invalid(first_pixel: int, values: wp.array2d[dtype], worst: wp.array[int]):
         pixel = first_pixel + wp.tid()
         for k in range(values.shape[1]):
             value = float(values[pixel, k])
@@ -71,15 +71,15 @@ def _response_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def respond(
         first_pixel: int,
-        source: wp.array2d(dtype=dtype),
+        source: wp.array2d[dtype],
         # Sparse rows, one a detector bin:
-        row_start: wp.array(dtype=int),
-        source_bin: wp.array(dtype=int),
-        weight: wp.array(dtype=float),
-        width: wp.array(dtype=float),
-        noise_rate: wp.array(dtype=float),
+        row_start: wp.array[int],
+        source_bin: wp.array[int],
+        weight: wp.array[float],
+        width: wp.array[float],
+        noise_rate: wp.array[float],
         # Out:
-        hazard: wp.array2d(dtype=float),
+        hazard: wp.array2d[float],
     ):
         pixel = first_pixel + wp.tid()
         noise = noise_rate[pixel]
@@ -102,7 +102,7 @@ def _dark_count_kernel(
     hot_rate: float,
     offset: float,
     # Out:
-    rate: wp.array(dtype=float),
+    rate: wp.array[float],
 ):
     pixel = first_pixel + wp.tid()
     id = wp.uint64(pixel)
@@ -122,9 +122,9 @@ def _crosstalk_kernel(
     first_pixel: int,
     width: int,
     probability: float,
-    detections: wp.array2d(dtype=float),
+    detections: wp.array2d[float],
     # In and out:
-    hazard: wp.array2d(dtype=float),
+    hazard: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
     x = pixel % width
@@ -144,7 +144,7 @@ def _crosstalk_kernel(
 @memoised
 def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def law(first_pixel: int, hazard: wp.array2d(dtype=dtype), probability: wp.array2d(dtype=dtype)):
+    def law(first_pixel: int, hazard: wp.array2d[dtype], probability: wp.array2d[dtype]):
         pixel = first_pixel + wp.tid()
         before = wp.float64(0.0)
         for k in range(hazard.shape[1]):
@@ -157,11 +157,7 @@ def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
 
 @wp.kernel(enable_backward=False)
 def _free_running_kernel(
-    first_pixel: int,
-    hazard: wp.array2d(dtype=float),
-    dead_time: float,
-    period: float,
-    probability: wp.array2d(dtype=float),
+    first_pixel: int, hazard: wp.array2d[float], dead_time: float, period: float, probability: wp.array2d[float]
 ):
     pixel = first_pixel + wp.tid()
     total = float(0.0)
@@ -173,9 +169,7 @@ def _free_running_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _coates_kernel(
-    first_pixel: int, counts: wp.array2d(dtype=int), pulses: wp.float64, hazard: wp.array2d(dtype=wp.float64)
-):
+def _coates_kernel(first_pixel: int, counts: wp.array2d[int], pulses: wp.float64, hazard: wp.array2d[wp.float64]):
     pixel = first_pixel + wp.tid()
     left = wp.float64(pulses)
     for k in range(counts.shape[1]):

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from .camera import *
 from .laser import *
 from .port import *
-from .visibility import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = camera.__all__ + laser.__all__ + port.__all__ + visibility.__all__
+    __all__ = camera.__all__ + laser.__all__ + port.__all__

@@ -13,19 +13,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
 
-__all__ = [
-    "C0",
-    "CALIBRATED",
-    "PLAIN",
-    "Camera",
-    "Gate",
-    "Lens",
-    "gate_bin",
-    "lens_point",
-    "pixel_direction",
-    "project",
-    "project_calibrated",
-]
+__all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens"]
 
 
 @wp.struct

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_vector
+from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -505,8 +505,7 @@ def make_flat_port(
     """
     check_number("distance", distance, "(-inf, inf)")
     check_vector("normal", normal, unit=True)
-    _check_layers(thickness, index, group_index, origin, aperture_radius)
-    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
+    port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
     inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
     if tilt >= inside:
@@ -514,7 +513,6 @@ def make_flat_port(
             f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
             "through the port"
         )
-    port = _port(thickness, index, group_index)
     port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
     slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
@@ -540,11 +538,8 @@ def make_dome_port(
 
     Args:
         radius: Of the inner sphere [m], > 0.
-        thickness: Of the window [m], >= 0.
         centre: Of the spheres, from the camera's lens centre [m].
-        index, group_index: Of what is inside, of the window, of the water; >= 1.
-        origin: The lens centre, or the position of a laser, which must be inside [m].
-        aperture_radius: Of the camera [m].
+        thickness, index, group_index, origin, aperture_radius: As for `make_flat_port`.
         largest_angle: Between the optical axis and any ray of the view, inside, in [0, pi/2) [rad].
 
     Raises:
@@ -553,9 +548,7 @@ def make_dome_port(
     """
     check_number("radius", radius, "(0, 1e9]")
     check_vector("centre", centre)
-    _check_layers(thickness, index, group_index, origin, aperture_radius)
-    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
-    port = _port(thickness, index, group_index)
+    port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     port.radius, port.centre = radius, wp.vec3(*centre)
     n = tuple(port.index)
     furthest = math.dist(centre, origin) + aperture_radius
@@ -588,23 +581,22 @@ def check_port(name: str, port: Port, kind: PortKind) -> None:
         check_vector(f"{name}.centre", port.centre)
 
 
-def _check_layers(
+def _port(
     thickness: float,
     index: Sequence[float],
     group_index: Sequence[float],
     origin: Sequence[float],
     aperture_radius: float,
-) -> None:
+    largest_angle: float,
+) -> Port:
+    """What both kinds have, whose numbers are in range."""
     check_vector("origin", origin)
-    check_number("thickness", thickness, "[0, 1e9]")
-    check_number("aperture_radius", aperture_radius, "[0, 1e9]")
+    check_range("[0, 1e9]", thickness=thickness, aperture_radius=aperture_radius)
     for name, values in (("index", index), ("group_index", group_index)):
         check_vector(name, values)
         for k, value in enumerate(values):
             check_number(f"{name}[{k}]", value, "[1, inf)")
-
-
-def _port(thickness: float, index: Sequence[float], group_index: Sequence[float]) -> Port:
+    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
     port = Port()
     port.thickness = thickness
     # A window without thickness has no faces, and must not be the layer of the least index.

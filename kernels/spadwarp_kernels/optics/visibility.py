@@ -9,8 +9,6 @@ from spadwarp_kernels.base.arguments import check_array, check_kind
 from .camera import Camera, Gate, check_camera, clip_half_space, clip_to_gate, clip_to_view, field, in_view
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind
 
-__all__ = ["near_depth_map"]
-
 # Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
 _TEXELS = wp.constant(128)
 _NOTHING = wp.constant(1.0e30)
@@ -50,7 +48,7 @@ def _rectangle(camera: Camera, view: wp.vec4, p: wp.vec3, q: wp.vec3, r: wp.vec3
 
 
 @wp.kernel(enable_backward=False)
-def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth: wp.array2d(dtype=float)):
+def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth: wp.array2d[float]):
     """Lowers each texel to the least depth of the faces that may cover it. Launch: (faces, threads of a face)."""
     face, thread = wp.tid()
     m = wp.mesh_get(mesh)
@@ -114,7 +112,7 @@ def update_near_depth(near_depth: wp.array, mesh: wp.Mesh, camera: Camera) -> No
 
 
 @wp.func
-def may_be_hidden(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+def may_be_hidden(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
     """Whether something may stand between the point x, x[2] > 0, and the lens; False is certain.
 
     True for points beside the view (left, top, right, bottom), which the lens sees out of focus.

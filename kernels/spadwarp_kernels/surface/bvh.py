@@ -23,10 +23,8 @@ import warp as wp
 
 from spadwarp_kernels.base.native import bits_of, from_bits
 
-from .patches import LEAST_HEIGHT, SAME
+from .patches import SAME, shared_corner
 from .triangle import box_padding, face_in, meet_face, number_in, pack_faces, set_faces, set_row
-
-__all__ = ["segment_meets_box"]
 
 
 @wp.func_native("""
@@ -142,14 +140,14 @@ def _with_bits(corner: wp.vec3, bits: int) -> wp.vec4:
 
 
 @wp.kernel(enable_backward=False)
-def _count_kernel(mesh: wp.uint64, has_children: wp.array(dtype=int)):
+def _count_kernel(mesh: wp.uint64, has_children: wp.array[int]):
     """Launch: nodes that the tree may have."""
     node = wp.tid()
     has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
 
 
 @wp.func
-def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array(dtype=int)):
+def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array[int]):
     for slot in range(start, stop):
         face = _tree_face(mesh, slot)
         order[slot] = wp.where(slot + 1 < stop, ~face, face)
@@ -157,11 +155,7 @@ def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array(dtype=in
 
 @wp.kernel(enable_backward=False)
 def _pack_kernel(
-    mesh: wp.uint64,
-    padding: float,
-    before: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
+    mesh: wp.uint64, padding: float, before: wp.array[int], nodes: wp.array[wp.vec4], order: wp.array[int]
 ):
     """Launch: nodes that the tree may have. The root's pair is the first; the others stand in the tree's order."""
     node = wp.tid()
@@ -222,52 +216,14 @@ LARGEST_LEAF = wp.constant(8)
 
 
 @wp.func
-def _point(mesh: wp.uint64, face: int, corner: int) -> wp.vec3:
-    m = wp.mesh_get(mesh)
-    return m.points[m.indices[3 * face + corner % 3]]
-
-
-@wp.func
-def _apart(p: wp.vec3, q: wp.vec3) -> float:
-    return wp.max(wp.abs(p - q))
-
-
-@wp.func
-def shared_corner(mesh: wp.uint64, first: int, second: int, same: float) -> int:
-    """The corner (0 to 2) of a face that is not on the diagonal of the parallelogram that another one completes; -1 if
-    it does not. As `pair_faces`; points so far from each other [m] are taken for one."""
-    found = int(-1)
-    p = _point(mesh, first, 0)
-    q = _point(mesh, first, 1)
-    r = _point(mesh, first, 2)
-    longest = wp.max(wp.max(wp.length(q - p), wp.length(r - q)), wp.length(p - r))
-    if wp.length(wp.cross(q - p, r - p)) > wp.static(LEAST_HEIGHT) * same * longest:
-        for corner in range(3):
-            a = _point(mesh, first, corner + 1)
-            b = _point(mesh, first, corner + 2)
-            across = a + (b - _point(mesh, first, corner))
-            for turn in range(3):
-                apart = _apart(_point(mesh, second, turn), across)
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 1), b))
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 2), a))
-                if apart <= same and found < 0:
-                    found = corner
-    return found
-
-
-@wp.func
-def _leaf(nodes: wp.array(dtype=wp.vec4), node: int) -> int:
+def _leaf(nodes: wp.array[wp.vec4], node: int) -> int:
     """The slot of a leaf's first face, below 0 for other nodes."""
     return -2 - bits_of(nodes[2 * node][3])
 
 
 @wp.kernel(enable_backward=False)
 def _siblings_kernel(
-    mesh: wp.uint64,
-    same: float,
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-    joined: wp.array(dtype=int),
+    mesh: wp.uint64, same: float, nodes: wp.array[wp.vec4], order: wp.array[int], joined: wp.array[int]
 ):
     """Two leaves of a face each that make a parallelogram become a leaf of two, which is marked. Launch: pairs."""
     pair = wp.tid()
@@ -282,7 +238,7 @@ def _siblings_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _parents_kernel(joined: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)):
+def _parents_kernel(joined: wp.array[int], nodes: wp.array[wp.vec4]):
     """In place of a pair that has become one leaf, that. Launch: nodes."""
     node = wp.tid()
     child = bits_of(nodes[2 * node][3])
@@ -291,13 +247,7 @@ def _parents_kernel(joined: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4))
 
 
 @wp.kernel(enable_backward=False)
-def _leaves_kernel(
-    mesh: wp.uint64,
-    same: float,
-    found: wp.array(dtype=int),
-    order: wp.array(dtype=int),
-    faces: wp.array(dtype=wp.vec4),
-):
+def _leaves_kernel(mesh: wp.uint64, same: float, found: wp.array[int], order: wp.array[int], faces: wp.array[wp.vec4]):
     """Writes the faces of each leaf anew: behind a face the one with which it makes a parallelogram, if there is one.
     Launch: slots."""
     start = wp.tid()
@@ -360,13 +310,13 @@ _SLACK = wp.constant(1.0 / 64.0)
 
 
 @wp.func
-def child_of(nodes: wp.array(dtype=wp.vec4), node: int, k: int) -> int:
+def child_of(nodes: wp.array[wp.vec4], node: int, k: int) -> int:
     """One of the four children of a node."""
     return bits_of(nodes[4 * node + 3][k])
 
 
 @wp.func
-def leaf_at(order: wp.array(dtype=int), slot: int) -> int:
+def leaf_at(order: wp.array[int], slot: int) -> int:
     """A slot's face and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are more."""
     return -2 - 2 * slot - wp.where(number_in(order, slot) < 0, 1, 0)
 
@@ -383,7 +333,7 @@ def _byte(bits: int, k: int) -> int:
 
 
 @wp.func
-def set_node(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, low: Corners, high: Corners):
+def set_node(nodes: wp.array[wp.vec4], node: int, children: wp.vec4i, low: Corners, high: Corners):
     """Writes a node of boxes with these corners; those of children that are not there do not matter."""
     origin, scale = wp.vec3(), wp.vec3()
     lower, upper = wp.vec3i(), wp.vec3i()
@@ -415,7 +365,7 @@ def set_node(nodes: wp.array(dtype=wp.vec4), node: int, children: wp.vec4i, low:
 
 
 @wp.func
-def box_of(nodes: wp.array(dtype=wp.vec4), node: int):
+def box_of(nodes: wp.array[wp.vec4], node: int):
     """Lower and upper corner of a box around all children of a node."""
     p = nodes[4 * node]
     q = nodes[4 * node + 1]
@@ -475,7 +425,7 @@ def empty_nodes(device: wp.DeviceLike) -> wp.array:
     return wp::vec4ui(0xffffffffu);
 #endif
 """)
-def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
+def box_entries(nodes: wp.array[wp.vec4], node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
     """Bits of the distances at which a ray enters the boxes of four children; 2^31 more for those that it misses. CUDA
     alone."""
     ...
@@ -489,7 +439,7 @@ def box_entries(nodes: wp.array(dtype=wp.vec4), node: int, inverse: wp.vec3, shi
     return wp::vec4ui(0xffffffffu);
 #endif
 """)
-def children_of(nodes: wp.array(dtype=wp.vec4), node: int) -> wp.vec4ui:
+def children_of(nodes: wp.array[wp.vec4], node: int) -> wp.vec4ui:
     """The bits of the four children of a node. CUDA alone."""
     ...
 
@@ -502,7 +452,7 @@ Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
 
 
 @wp.func
-def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
+def _surface(nodes: wp.array[wp.vec4], node: int) -> float:
     """Of the box of a node [m²]; -1 for a leaf, which cannot be opened."""
     size = nodes[2 * node + 1] - nodes[2 * node]
     area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
@@ -510,7 +460,7 @@ def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4)):
+def _open_kernel(pairs: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
     """A node of four children for each pair; the largest are opened first. Launch: pairs."""
     pair = wp.tid()
     held = wp.vec4i(2 * pair, 2 * pair + 1, -1, -1)
@@ -542,7 +492,7 @@ def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4))
 
 
 @wp.kernel(enable_backward=False)
-def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dtype=int)):
+def _depth_kernel(nodes: wp.array[wp.vec4], level: int, depth: wp.array[int]):
     """Launch: nodes."""
     node = wp.tid()
     if depth[node] == level:
@@ -562,18 +512,14 @@ def node_depths(nodes: wp.array) -> wp.array:
 
 
 @wp.kernel(enable_backward=False)
-def _flag_kernel(depth: wp.array(dtype=int), used: wp.array(dtype=int)):
+def _flag_kernel(depth: wp.array[int], used: wp.array[int]):
     """Launch: nodes."""
     used[wp.tid()] = wp.where(depth[wp.tid()] >= 0, 1, 0)
 
 
 @wp.kernel(enable_backward=False)
 def _gather_kernel(
-    wide: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-    used: wp.array(dtype=int),
-    place: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
+    wide: wp.array[wp.vec4], order: wp.array[int], used: wp.array[int], place: wp.array[int], nodes: wp.array[wp.vec4]
 ):
     """The nodes that are used, in their order. Launch: nodes."""
     node = wp.tid()
@@ -625,12 +571,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
 
 @wp.kernel(enable_backward=False)
 def _refit_kernel(
-    mesh: wp.uint64,
-    padding: float,
-    level: int,
-    depth: wp.array(dtype=int),
-    order: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
+    mesh: wp.uint64, padding: float, level: int, depth: wp.array[int], order: wp.array[int], nodes: wp.array[wp.vec4]
 ):
     """Boxes of the children of one level's nodes, those below being done. Launch: nodes."""
     node = wp.tid()
@@ -713,7 +654,7 @@ class NodeStep:
 
 
 @wp.func
-def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
+def step_node(nodes: wp.array[wp.vec4], walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
     """The children of a node that a ray meets.
 
     Args:
@@ -745,9 +686,7 @@ class LeafStep:
 
 
 @wp.func
-def step_leaf(
-    faces: wp.array(dtype=wp.vec4), order: wp.array(dtype=int), walk: TreeWalk, x: wp.vec3, u: wp.vec3
-) -> LeafStep:
+def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x: wp.vec3, u: wp.vec3) -> LeafStep:
     """Tries the face that a walk has come to.
 
     Args:

@@ -38,10 +38,10 @@ class Textures:
         texels: Reflectance factors in [0, 1], row after row from the top.
     """
 
-    face: wp.array(dtype=int)
-    coordinates: wp.array2d(dtype=wp.vec2)
-    region: wp.array(dtype=wp.vec3i)
-    texels: wp.array(dtype=float)
+    face: wp.array[int]
+    coordinates: wp.array2d[wp.vec2]
+    region: wp.array[wp.vec3i]
+    texels: wp.array[float]
 
 
 @wp.struct
@@ -67,20 +67,20 @@ class Surfaces:
     mesh: wp.uint64
     lower: wp.vec3
     upper: wp.vec3
-    nodes: wp.array(dtype=wp.vec4)
-    faces: wp.array(dtype=wp.vec4)
-    order: wp.array(dtype=int)
-    reflectance: wp.array(dtype=float)
-    near_depth: wp.array2d(dtype=float)
-    corner_reflectance: wp.array(dtype=wp.vec3)
+    nodes: wp.array[wp.vec4]
+    faces: wp.array[wp.vec4]
+    order: wp.array[int]
+    reflectance: wp.array[float]
+    near_depth: wp.array2d[float]
+    corner_reflectance: wp.array[wp.vec3]
     textures: Textures
-    specular: wp.array(dtype=float)
-    roughness: wp.array(dtype=float)
-    depth: wp.array(dtype=int)
+    specular: wp.array[float]
+    roughness: wp.array[float]
+    depth: wp.array[int]
     levels: int
     extent: float
-    patches: wp.array(dtype=wp.vec4)
-    normals: wp.array(dtype=wp.vec4)
+    patches: wp.array[wp.vec4]
+    normals: wp.array[wp.vec4]
 
 
 def make_surfaces(
@@ -291,11 +291,15 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
     """Empty arrays in place of `make_textures`."""
+    return _textures(np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3)), np.zeros(0), device)
+
+
+def _textures(face: Any, coordinates: Any, region: Any, texels: Any, device: wp.DeviceLike) -> Textures:
     textures = Textures()
-    textures.face = wp.zeros(0, dtype=int, device=device)
-    textures.coordinates = wp.zeros((0, 3), dtype=wp.vec2, device=device)
-    textures.region = wp.zeros(0, dtype=wp.vec3i, device=device)
-    textures.texels = wp.zeros(0, dtype=float, device=device)
+    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
+    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
+    textures.region = wp.array(np.asarray(region, np.int32), dtype=wp.vec3i, device=device)
+    textures.texels = wp.array(np.asarray(texels, np.float32), dtype=float, device=device)
     return textures
 
 
@@ -336,10 +340,4 @@ def make_textures(
         raise ArgumentError("coordinates are not all finite")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
-    textures = Textures()
-    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
-    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
-    textures.region = wp.array(np.array(region, np.int32), dtype=wp.vec3i, device=device)
-    texels = np.concatenate([image.ravel() for image in images])
-    textures.texels = wp.array(texels, dtype=float, device=device)
-    return textures
+    return _textures(face, coordinates, region, np.concatenate([image.ravel() for image in images]), device)

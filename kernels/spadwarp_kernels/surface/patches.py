@@ -30,47 +30,68 @@ SAME = 5.0e-7
 LEAST_HEIGHT = 100.0
 
 
-def pair_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[int, int, int]]:
-    """A mesh's faces as (face, second face, corner) of patches: where two make a parallelogram, the lower index first
-    and the corner (0 to 2) of the first that is not on the diagonal; else (face, face, 0).
-
-    Args:
-        points: Vertices [m], [vertices, 3].
-        faces: Indices of vertices, integers [faces, 3]. Faces that turn opposite ways are not paired.
-    """
-    corners = np.asarray(points, np.float64)[np.asarray(faces)]
-    same = SAME * np.abs(corners).max(initial=0.0)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    free = [bool(one) for one in doubled > LEAST_HEIGHT * same * longest]
-    patches = []
-    taken: set[int] = set()
-    for first in range(len(corners)):
-        if first in taken:
-            continue
-        patch = (first, first, 0)
-        for second in (k for k in range(first + 1, len(corners)) if free[first] and free[k] and k not in taken):
-            corner = _corner(corners[first], corners[second], same)
-            if corner is not None:
-                patch = (first, second, corner)
-                taken.add(second)
-                break
-        patches.append(patch)
-    return patches
+@wp.func
+def _point(mesh: wp.uint64, face: int, corner: int) -> wp.vec3:
+    m = wp.mesh_get(mesh)
+    return m.points[m.indices[3 * face + corner % 3]]
 
 
-def _corner(first: np.ndarray, second: np.ndarray, same: float) -> int | None:
-    """The corner of a triangle across which another one completes it to a parallelogram, if it does."""
-    for corner in range(3):
-        opposite, a, b = np.roll(first, -corner, axis=0)
-        expected = np.array([a + b - opposite, b, a])
-        if any(np.abs(np.roll(second, turn, axis=0) - expected).max() <= same for turn in range(3)):
-            return corner
-    return None
+@wp.func
+def _apart(p: wp.vec3, q: wp.vec3) -> float:
+    return wp.max(wp.abs(p - q))
+
+
+@wp.func
+def shared_corner(mesh: wp.uint64, first: int, second: int, same: float) -> int:
+    """The corner (0 to 2) of a face that is not on the diagonal of the parallelogram that another one completes; -1 if
+    it does not, or is less high than LEAST_HEIGHT; points so far from each other [m] are taken for one."""
+    found = int(-1)
+    p = _point(mesh, first, 0)
+    q = _point(mesh, first, 1)
+    r = _point(mesh, first, 2)
+    longest = wp.max(wp.max(wp.length(q - p), wp.length(r - q)), wp.length(p - r))
+    if wp.length(wp.cross(q - p, r - p)) > wp.static(LEAST_HEIGHT) * same * longest:
+        for corner in range(3):
+            a = _point(mesh, first, corner + 1)
+            b = _point(mesh, first, corner + 2)
+            across = a + (b - _point(mesh, first, corner))
+            for turn in range(3):
+                apart = _apart(_point(mesh, second, turn), across)
+                apart = wp.max(apart, _apart(_point(mesh, second, turn + 1), b))
+                apart = wp.max(apart, _apart(_point(mesh, second, turn + 2), a))
+                if apart <= same and found < 0:
+                    found = corner
+    return found
 
 
 @wp.kernel(enable_backward=False)
-def _patches_kernel(mesh: wp.uint64, patches: wp.array(dtype=wp.vec4), normals: wp.array(dtype=wp.vec4)):
+def _corners_kernel(mesh: wp.uint64, same: float, corners: wp.array2d[int]):
+    """Launch: (faces, faces)."""
+    first, second = wp.tid()
+    corners[first, second] = wp.where(first < second, shared_corner(mesh, first, second, same), -1)
+
+
+def pair_faces(mesh: wp.Mesh) -> list[tuple[int, int, int]]:
+    """A mesh's faces as (face, second face, corner) of patches: where two make a parallelogram, the lower index first
+    and the corner (0 to 2) of the first that is not on the diagonal; else (face, face, 0). Faces that turn opposite
+    ways are not paired."""
+    count = mesh.indices.size // 3
+    found = wp.empty((count, count), dtype=int, device=mesh.device)
+    same = SAME * float(np.abs(mesh.points.numpy()[mesh.indices.numpy()]).max(initial=0.0))
+    wp.launch(_corners_kernel, found.shape, [mesh.id, same], [found], device=mesh.device)
+    corners, patches = found.numpy(), []
+    taken: set[int] = set()
+    for first in range(count):
+        if first not in taken:
+            seconds = (k for k in range(first + 1, count) if k not in taken and corners[first, k] >= 0)
+            second = next(seconds, first)
+            taken.add(second)
+            patches.append((first, second, max(int(corners[first, second]), 0)))
+    return patches
+
+
+@wp.kernel(enable_backward=False)
+def _patches_kernel(mesh: wp.uint64, patches: wp.array[wp.vec4], normals: wp.array[wp.vec4]):
     """Rows 0 to 3 from row 4 and what row 3 says of the patch. Launch: patches."""
     row = PATCH_ROWS * wp.tid()
     m = wp.mesh_get(mesh)
@@ -111,7 +132,7 @@ def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[
         pairs: Whether to look for parallelograms: not where the points will move.
     """
     faces = mesh.indices.numpy().reshape(-1, 3)
-    found = pair_faces(mesh.points.numpy(), faces) if pairs else [(face, face, 0) for face in range(len(faces))]
+    found = pair_faces(mesh) if pairs else [(face, face, 0) for face in range(len(faces))]
     slots = np.zeros(len(faces), int)
     slots[np.where(order < 0, ~order, order)] = np.arange(len(order))
     rows = np.zeros((len(found), PATCH_ROWS, 4), np.float32)
@@ -167,7 +188,7 @@ def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
     both.bits = found;
     return wp::vec4(nearest, rate_there, side, both.number);
 """)
-def nearest_patch(patches: wp.array(dtype=wp.vec4), x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
+def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
     """The nearest patch along a ray from x in the unit direction u.
 
     Returns:
@@ -186,7 +207,7 @@ def nearest_patch(patches: wp.array(dtype=wp.vec4), x: wp.vec3, u: wp.vec3, reac
     return second ? wp::vec2i(v[2], v[3]) : wp::vec2i(v[0], v[1]);
 #endif
 """)
-def patch_faces(patches: wp.array(dtype=wp.vec4), row: int, second: bool) -> wp.vec2i:
+def patch_faces(patches: wp.array[wp.vec4], row: int, second: bool) -> wp.vec2i:
     """Slot and index of the first or the second face of the patch that begins at a row."""
     ...
 
@@ -202,7 +223,7 @@ def patch_faces(patches: wp.array(dtype=wp.vec4), row: int, second: bool) -> wp.
     return wp::vec3(against * v[0], against * v[1], against * v[2]);
 #endif
 """)
-def patch_normal(patches: wp.array(dtype=wp.vec4), row: int, rate: float) -> wp.vec3:
+def patch_normal(patches: wp.array[wp.vec4], row: int, rate: float) -> wp.vec3:
     """The unit normal of the patch that begins at a row, against a ray with that rate, see `nearest_patch`."""
     ...
 
@@ -219,6 +240,6 @@ def patch_normal(patches: wp.array(dtype=wp.vec4), row: int, rate: float) -> wp.
     return normals.data[slot];
 #endif
 """)
-def normal_and_face(normals: wp.array(dtype=wp.vec4), slot: int) -> wp.vec4:
+def normal_and_face(normals: wp.array[wp.vec4], slot: int) -> wp.vec4:
     """The unit normal of the face in a slot, and bits of its index."""
     ...

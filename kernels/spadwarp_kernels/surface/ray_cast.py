@@ -12,13 +12,7 @@ from .reflectance import reflectance_at
 from .triangle import face_in, face_normal
 from .wide import walk_wide
 
-__all__ = [
-    "SurfaceHit",
-    "intersect_mesh",
-    "intersect_surfaces",
-    "offset_from_surface",
-    "truth_kernel",
-]
+__all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_surface", "truth_kernel"]
 
 
 @wp.struct
@@ -179,13 +173,13 @@ def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3
 def truth_kernel(
     camera: Camera,
     surfaces: Surfaces,
-    origins: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=wp.vec3),
+    origins: wp.array2d[wp.vec3],
+    directions: wp.array2d[wp.vec3],
     # Out, [height, width]:
-    depth: wp.array2d(dtype=float),
-    range: wp.array2d(dtype=float),
-    normal: wp.array2d(dtype=wp.vec3),
-    reflectance: wp.array2d(dtype=float),
+    depth: wp.array2d[float],
+    range: wp.array2d[float],
+    normal: wp.array2d[wp.vec3],
+    reflectance: wp.array2d[float],
 ):
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
     width).

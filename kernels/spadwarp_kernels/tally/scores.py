@@ -49,8 +49,8 @@ class Derivatives:
 
     value: Scores
     scale: Scores
-    waters: wp.array(dtype=int)
-    faces: wp.array(dtype=int)
+    waters: wp.array[int]
+    faces: wp.array[int]
     blocks: Blocks
 
 
@@ -115,8 +115,8 @@ def make_deposit(count: int, kinds: int = 0, split_accumulators: bool = False) -
 
     @wp.func
     def deposit_scored(
-        gradients: wp.array(dtype=wp.int64),
-        ledger: wp.array(dtype=wp.int64),
+        gradients: wp.array[wp.int64],
+        ledger: wp.array[wp.int64],
         thread: int,
         index: int,
         units: float,
@@ -132,10 +132,10 @@ def make_deposit(count: int, kinds: int = 0, split_accumulators: bool = False) -
 
     @wp.func
     def deposit_derived(
-        tally: wp.array(dtype=wp.int64),
-        low: wp.array(dtype=wp.uint32),
-        gradients: wp.array(dtype=wp.int64),
-        ledger: wp.array(dtype=wp.int64),
+        tally: wp.array[wp.int64],
+        low: wp.array[wp.uint32],
+        gradients: wp.array[wp.int64],
+        ledger: wp.array[wp.int64],
         pending: wp.vec2l,
         thread: int,
         scale: float,

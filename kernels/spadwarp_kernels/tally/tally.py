@@ -10,7 +10,7 @@ from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
 
 from .ledger import AFTER_GATE, BEFORE_GATE, BELOW_UNIT, CLIPPED, INVALID, OUTSIDE_SHIFT, add_to_ledger
 
-__all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates", "to_fixed_point"]
+__all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates"]
 
 # What a history's events make of its light: the first axis of the tally.
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
@@ -56,7 +56,7 @@ DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
     return wp::vec2l(index, value);
 #endif
 """)
-def add_pending(tally: wp.array(dtype=wp.int64), pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
+def add_pending(tally: wp.array[wp.int64], pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
     """`atomic_add_int64`, on the CPU one call later: a core stands still while a voxel comes from memory, so the
     (index, value) that the call before returned is added now, and the memory of this one is requested."""
     ...
@@ -82,7 +82,7 @@ VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
 
 
 @wp.kernel(enable_backward=False)
-def find_overflow_kernel(tally: wp.array(dtype=wp.int64), least: wp.int64, found: wp.array(dtype=int)):
+def find_overflow_kernel(tally: wp.array[wp.int64], least: wp.int64, found: wp.array[int]):
     """Launch: voxels."""
     voxel = wp.tid()
     if tally[voxel] < least or tally[voxel] >= VOXEL_LIMIT:
@@ -114,7 +114,7 @@ def pieces(size: int) -> list[slice]:
 
 
 @wp.kernel(enable_backward=False)
-def add_kernel(more: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.int64)):
+def add_kernel(more: wp.array[wp.int64], total: wp.array[wp.int64]):
     """Launch: integers."""
     i = wp.tid()
     total[i] += more[i]
@@ -144,12 +144,7 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
 
 @wp.func
 def deposit(
-    tally: wp.array(dtype=wp.int64),
-    ledger: wp.array(dtype=wp.int64),
-    pending: wp.vec2l,
-    thread: int,
-    scale: float,
-    c: Contribution,
+    tally: wp.array[wp.int64], ledger: wp.array[wp.int64], pending: wp.vec2l, thread: int, scale: float, c: Contribution
 ) -> wp.vec2l:
     """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit.
 
@@ -201,15 +196,13 @@ def splitting_pays(voxels: int, photon_count: int) -> bool:
         atomicAdd(reinterpret_cast<unsigned*>(reinterpret_cast<long long*>(tally.data) + index) + 1, high);
 #endif
 """)
-def add_to_words(
-    tally: wp.array(dtype=wp.int64), split_accumulators: wp.array(dtype=wp.uint32), index: int, value: wp.int64
-):
+def add_to_words(tally: wp.array[wp.int64], split_accumulators: wp.array[wp.uint32], index: int, value: wp.int64):
     """Adds value >= 0 to a voxel whose low word is apart; on CUDA alone."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def fold_kernel(split_accumulators: wp.array(dtype=wp.uint32), tally: wp.array(dtype=wp.int64)):
+def fold_kernel(split_accumulators: wp.array[wp.uint32], tally: wp.array[wp.int64]):
     """Launch: voxels of all components. Takes the low words and adds them to the tally; other launches may add to both
     meanwhile."""
     voxel = wp.tid()
@@ -231,14 +224,14 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
     first_pixel: int,
-    tally: wp.array(dtype=wp.int64),
-    scale: wp.array(dtype=wp.float64),
+    tally: wp.array[wp.int64],
+    scale: wp.array[wp.float64],
     component: int,
     stop_component: int,
     parameters: int,
     parameter: int,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
     bins = rates.shape[1]

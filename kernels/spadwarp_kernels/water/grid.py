@@ -47,14 +47,14 @@ class Grid:
     turn: wp.mat33
     shift: wp.vec3
     size: wp.vec3i
-    extinction: wp.array(dtype=float)
-    albedo: wp.array(dtype=float)
-    anisotropy: wp.array(dtype=float)
+    extinction: wp.array[float]
+    albedo: wp.array[float]
+    anisotropy: wp.array[float]
     block_edge: int
     block_size: wp.vec3i
-    block_majorant: wp.array(dtype=float)
-    block_control: wp.array(dtype=wp.vec2)
-    residual: wp.array(dtype=float)
+    block_majorant: wp.array[float]
+    block_control: wp.array[wp.vec2]
+    residual: wp.array[float]
 
 
 @wp.struct
@@ -356,7 +356,7 @@ def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArra
 
 
 @wp.kernel(enable_backward=False)
-def voxel_values_kernel(volume: wp.uint64, voxels: wp.array(dtype=wp.vec3i), values: wp.array(dtype=float)):
+def voxel_values_kernel(volume: wp.uint64, voxels: wp.array[wp.vec3i], values: wp.array[float]):
     """Values of a `wp.Volume` of float32 at the indices of `Volume.get_voxels`. Launch: voxels."""
     i = wp.tid()
     v = voxels[i]

@@ -16,7 +16,7 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_items, check_number
 
-__all__ = ["Boundary", "Limits", "exit_distance", "fresnel_reflectance", "make_boundary", "reflection_images"]
+__all__ = ["Boundary", "Limits", "make_boundary"]
 
 
 @wp.struct
@@ -32,7 +32,7 @@ class Boundary:
 
     low: wp.vec3
     high: wp.vec3
-    images: wp.array(dtype=wp.vec3i)
+    images: wp.array[wp.vec3i]
     max_reflections: int
 
 
@@ -195,15 +195,7 @@ def make_boundary(
 
 
 # Where a history may leave, in the order of `exit_face`.
-EXIT_FACES = (
-    "lateral_limit",
-    "exit_x_low",
-    "exit_x_high",
-    "exit_y_low",
-    "exit_y_high",
-    "exit_z_low",
-    "exit_z_high",
-)
+EXIT_FACES = ("lateral_limit", "exit_x_low", "exit_x_high", "exit_y_low", "exit_y_high", "exit_z_low", "exit_z_high")
 
 
 @wp.struct

@@ -26,16 +26,7 @@ from spadwarp_kernels.base.tables import DensityTables
 
 from .grid import Grid
 
-__all__ = [
-    "Layers",
-    "Medium",
-    "free_path",
-    "layer_index",
-    "layered_extinction",
-    "layered_free_path",
-    "layered_water",
-    "make_layers",
-]
+__all__ = ["Layers", "Medium", "free_path", "make_layers"]
 
 
 @wp.struct
@@ -114,10 +105,10 @@ class Layers:
     """
 
     axis: wp.vec3
-    start: wp.array(dtype=float)
-    extinction: wp.array(dtype=float)
-    albedo: wp.array(dtype=float)
-    anisotropy: wp.array(dtype=float)
+    start: wp.array[float]
+    extinction: wp.array[float]
+    albedo: wp.array[float]
+    anisotropy: wp.array[float]
     grid: Grid
 
 

@@ -32,7 +32,6 @@ __all__ = [
     "PhaseGuide",
     "fournier_forand_density",
     "henyey_greenstein_density",
-    "henyey_greenstein_log_derivative",
     "henyey_greenstein_pdf",
     "interpolated_density",
     "make_phase_tables",

@@ -245,9 +245,9 @@ def _backscatter_kernel(
     first: int,
     lidar: Lidar,
     water: Scattering,
-    view: wp.array(dtype=wp.vec3d),
+    view: wp.array[wp.vec3d],
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Mean over each bin of the single-scatter rate times its width. Launch: pixels."""
     i = first + wp.tid()

@@ -22,7 +22,7 @@ from spadwarp_kernels.surface.reflectance import texture_at
 
 from .closed_forms import MESH, SHAPE_KINDS, ShapeHit, intersect_shape
 
-__all__ = ["Shapes", "make_shapes", "move_shapes"]
+__all__ = ["Shapes", "make_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,21 +33,21 @@ _FAR = wp.constant(1.0e10)
 class ShapeTable:
     """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place."""
 
-    kind: wp.array(dtype=int)  # index into SHAPE_KINDS, [shapes]
+    kind: wp.array[int]  # index into SHAPE_KINDS, [shapes]
     # [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone: radius and
     # half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points
-    size: wp.array(dtype=wp.vec3)
-    body: wp.array(dtype=int)  # index of the pose that carries the shape, -1 for none, [shapes]
-    local: wp.array(dtype=wp.transform)  # pose of the shape on its body, [shapes]
-    mesh: wp.array(dtype=wp.uint64)  # id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes]
-    reflectance: wp.array(dtype=float)  # Lambertian, in [0, 1], [shapes]
+    size: wp.array[wp.vec3]
+    body: wp.array[int]  # index of the pose that carries the shape, -1 for none, [shapes]
+    local: wp.array[wp.transform]  # pose of the shape on its body, [shapes]
+    mesh: wp.array[wp.uint64]  # id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes]
+    reflectance: wp.array[float]  # Lambertian, in [0, 1], [shapes]
     # where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last
-    first: wp.array(dtype=int)
-    member: wp.array(dtype=int)  # shapes in the order of their worlds
+    first: wp.array[int]
+    member: wp.array[int]  # shapes in the order of their worlds
     # of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none
-    first_face: wp.array(dtype=int)
+    first_face: wp.array[int]
     textures: Textures  # images on the faces of meshes, which multiply the reflectance; see `make_textures`
-    pose: wp.array(dtype=wp.transform)  # of each shape in its world, written by `move_shapes`, [shapes]
+    pose: wp.array[wp.transform]  # of each shape in its world, written by `move_shapes`, [shapes]
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def _plain_array(name: str, value: Any) -> np.ndarray:
 
 
 @wp.kernel(enable_backward=False)
-def _move_kernel(table: ShapeTable, body_q: wp.array(dtype=wp.transform)):
+def _move_kernel(table: ShapeTable, body_q: wp.array[wp.transform]):
     """Launch: table."""
     k = wp.tid()
     pose = table.local[k]

@@ -146,9 +146,7 @@ def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp
 
 
 @wp.kernel(enable_backward=False)
-def _from_matrix_kernel(
-    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.mat33), out: wp.array2d(dtype=wp.transform)
-):
+def _from_matrix_kernel(position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.mat33], out: wp.array2d[wp.transform]):
     """Launch: (worlds, things)."""
     w, k = wp.tid()
     out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat_from_matrix(rotation[w, k])))
@@ -156,7 +154,7 @@ def _from_matrix_kernel(
 
 @wp.kernel(enable_backward=False)
 def _from_quaternion_kernel(
-    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.quat), out: wp.array2d(dtype=wp.transform)
+    position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.quat], out: wp.array2d[wp.transform]
 ):
     """Launch: (worlds, things)."""
     w, k = wp.tid()

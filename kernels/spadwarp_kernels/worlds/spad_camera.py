@@ -37,14 +37,14 @@ _see = IN_WATER.see
 @wp.kernel(enable_backward=False)
 def _trace_kernel(
     shapes: ShapeTable,
-    camera_q: wp.array(dtype=wp.transform),
+    camera_q: wp.array[wp.transform],
     optical: wp.transform,
-    world: wp.array(dtype=int),
-    view: wp.array(dtype=wp.vec3),
+    world: wp.array[int],
+    view: wp.array[wp.vec3],
     # Out, [cameras, height, width]:
-    depth: wp.array3d(dtype=float),
-    normal: wp.array3d(dtype=wp.vec3),
-    reflectance: wp.array3d(dtype=float),
+    depth: wp.array3d[float],
+    normal: wp.array3d[wp.vec3],
+    reflectance: wp.array3d[float],
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
@@ -62,16 +62,16 @@ def _trace_kernel(
 
 @wp.kernel(enable_backward=False)
 def _depth_kernel(
-    arrival: wp.array(dtype=float),
-    view: wp.array(dtype=wp.vec3),
+    arrival: wp.array[float],
+    view: wp.array[wp.vec3],
     laser: wp.vec3,
     gate_start: float,
     bin_path: float,
-    histogram: wp.array2d(dtype=int),
+    histogram: wp.array2d[int],
     # Out:
-    depth: wp.array(dtype=float),
-    counts: wp.array(dtype=int),
-    step: wp.array(dtype=wp.int64),
+    depth: wp.array[float],
+    counts: wp.array[int],
+    step: wp.array[wp.int64],
 ):
     """Planar depth, the counts of all bins, and the next step. Launch: cameras x pixels."""
     row = wp.tid()
@@ -90,9 +90,7 @@ def _depth_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _points_kernel(
-    depth: wp.array3d(dtype=float), view: wp.array(dtype=wp.vec3), pose: wp.transform, points: wp.array3d(dtype=wp.vec3)
-):
+def _points_kernel(depth: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
     u = view[i * depth.shape[2] + j]
@@ -211,19 +209,19 @@ def _camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device:
 
 @wp.kernel(enable_backward=False)
 def _images_kernel(
-    view: wp.array(dtype=wp.vec3),
+    view: wp.array[wp.vec3],
     # In, [cameras, height, width]; those without an entry are left out:
-    depth_in: wp.array3d(dtype=float),
+    depth_in: wp.array3d[float],
     along_ray: int,
-    normal_in: wp.array3d(dtype=wp.vec3),
-    camera_q: wp.array(dtype=wp.transform),
+    normal_in: wp.array3d[wp.vec3],
+    camera_q: wp.array[wp.transform],
     optical: wp.transform,
-    reflectance_in: wp.array3d(dtype=float),
+    reflectance_in: wp.array3d[float],
     one_reflectance: float,
     # Out:
-    depth: wp.array3d(dtype=float),
-    normal: wp.array3d(dtype=wp.vec3),
-    reflectance: wp.array3d(dtype=float),
+    depth: wp.array3d[float],
+    normal: wp.array3d[wp.vec3],
+    reflectance: wp.array3d[float],
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
@@ -250,21 +248,14 @@ def _images_kernel(
 
 
 @wp.func
-def _point(view: wp.array(dtype=wp.vec3), depth: wp.array3d(dtype=float), along_ray: int, v: int, i: int, j: int):
+def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int):
     u = view[i * depth.shape[2] + j]
     return wp.where(along_ray == 1, depth[v, i, j], depth[v, i, j] / u[2]) * u
 
 
 @wp.func
 def _neighbour_step(
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array3d(dtype=float),
-    along_ray: int,
-    v: int,
-    i: int,
-    j: int,
-    di: int,
-    dj: int,
+    view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int, di: int, dj: int
 ) -> wp.vec3:
     """From a pixel to the nearer in depth of its two neighbours along one axis: not across an edge of a thing."""
     here = _point(view, depth, along_ray, v, i, j)
@@ -284,9 +275,7 @@ def _neighbour_step(
 
 
 @wp.func
-def _slope(
-    view: wp.array(dtype=wp.vec3), depth: wp.array3d(dtype=float), along_ray: int, v: int, i: int, j: int
-) -> wp.vec3:
+def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int) -> wp.vec3:
     """Normal of the surface through a pixel and its neighbours; towards the camera where it has none."""
     across = _neighbour_step(view, depth, along_ray, v, i, j, 0, 1)
     down = _neighbour_step(view, depth, along_ray, v, i, j, 1, 0)
@@ -297,13 +286,13 @@ def _slope(
 @wp.kernel(enable_backward=False)
 def _signal_kernel(
     lidar: Lidar,
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    normal: wp.array(dtype=wp.vec3),
-    reflectance: wp.array(dtype=float),
+    view: wp.array[wp.vec3],
+    depth: wp.array[float],
+    normal: wp.array[wp.vec3],
+    reflectance: wp.array[float],
     # Out:
-    signal: wp.array(dtype=float),
-    path: wp.array(dtype=float),
+    signal: wp.array[float],
+    path: wp.array[float],
 ):
     """Detections per pulse of the surface, and its path, infinite where there is none. Launch: cameras x pixels."""
     row = wp.tid()
@@ -326,15 +315,15 @@ def _below(z: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
-    signal: wp.array(dtype=float),
-    path: wp.array(dtype=float),
-    background: wp.array2d(dtype=float),
+    signal: wp.array[float],
+    path: wp.array[float],
+    background: wp.array2d[float],
     gate_start: float,
     bin_path: float,
     sigma_path: float,
     dark: float,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Expected detections per pulse: surface, backscatter up to it, dark counts. Launch: (cameras x pixels, bins)."""
     row, k = wp.tid()

@@ -88,10 +88,10 @@ def _unit_triangles(kind: int) -> tuple[np.ndarray, np.ndarray]:
 class Corners:
     """Vertices of all cameras' meshes."""
 
-    camera: wp.array(dtype=int)
-    shape: wp.array(dtype=int)
-    unit: wp.array(dtype=wp.vec4)  # x, y, z for a shape of size 1, and on which end of a capsule it is (lift)
-    source: wp.array(dtype=int)  # index in the shape's own `wp.Mesh`; -1 for other shapes
+    camera: wp.array[int]
+    shape: wp.array[int]
+    unit: wp.array[wp.vec4]  # x, y, z for a shape of size 1, and on which end of a capsule it is (lift)
+    source: wp.array[int]  # index in the shape's own `wp.Mesh`; -1 for other shapes
 
 
 @wp.func
@@ -114,11 +114,11 @@ def _corner(kind: int, size: wp.vec3, unit: wp.vec4) -> wp.vec3:
 def _place_kernel(
     corners: Corners,
     table: ShapeTable,
-    camera_q: wp.array(dtype=wp.transform),
+    camera_q: wp.array[wp.transform],
     optical: wp.transform,
     reach: float,
     # Out:
-    points: wp.array(dtype=wp.vec3),
+    points: wp.array[wp.vec3],
 ):
     """Launch: vertices."""
     i = wp.tid()
@@ -143,11 +143,11 @@ def _place_kernel(
 
 @wp.kernel(enable_backward=False)
 def _reflectance_kernel(
-    shape: wp.array(dtype=int),
+    shape: wp.array[int],
     table: ShapeTable,
     # Out:
-    reflectance: wp.array(dtype=float),
-    corner_reflectance: wp.array(dtype=wp.vec3),
+    reflectance: wp.array[float],
+    corner_reflectance: wp.array[wp.vec3],
 ):
     """Launch: faces."""
     i = wp.tid()
@@ -232,14 +232,14 @@ def _mesh_triangles(mesh_id: int, own: dict[int, wp.Mesh], device: wp.Device) ->
 
 
 @wp.kernel(enable_backward=False)
-def _mesh_size_kernel(mesh: wp.uint64, sizes: wp.array(dtype=int)):
+def _mesh_size_kernel(mesh: wp.uint64, sizes: wp.array[int]):
     m = wp.mesh_get(mesh)
     sizes[0] = m.points.shape[0]
     sizes[1] = m.indices.shape[0]
 
 
 @wp.kernel(enable_backward=False)
-def _mesh_indices_kernel(mesh: wp.uint64, indices: wp.array(dtype=int)):
+def _mesh_indices_kernel(mesh: wp.uint64, indices: wp.array[int]):
     i = wp.tid()
     indices[i] = wp.mesh_get(mesh).indices[i]
 
@@ -259,13 +259,13 @@ _Run = wp.types.vector(length=2, dtype=float)
 
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
-    tally: wp.array2d(dtype=wp.int64),
+    tally: wp.array2d[wp.int64],
     factor: wp.float64,
     dark: float,
-    taps: wp.array(dtype=float),
+    taps: wp.array[float],
     lowest: int,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Expected detections per pulse of one camera: light of the tally, blurred by the response.
 
@@ -287,7 +287,7 @@ def _rates_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _advance_kernel(offset: wp.array(dtype=wp.uint64), count: wp.uint64):
+def _advance_kernel(offset: wp.array[wp.uint64], count: wp.uint64):
     offset[0] = offset[0] + count
 
 
@@ -319,8 +319,8 @@ class SpadTracer(WorldCameras):
         use_warp_bvh: See `make_surfaces`.
 
     Attributes:
-        rates, histogram, counts, depth, true_depth, normal, reflectance, step: As of `SpadCamera`; `rates` have the noise
-            of the photons that were traced.
+        rates, histogram, counts, depth, true_depth, normal, reflectance, step: As of `SpadCamera`; `rates` have the
+            noise of the photons that were traced.
         data: Ledger of the last step, for `read_ledger`, and the tally of one of the cameras.
 
     Raises:

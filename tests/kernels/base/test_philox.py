@@ -5,14 +5,16 @@ import pytest
 import warp as wp
 
 from helpers.launch import Floats, launched, on_device
-from spadwarp_kernels.base import philox4x32, random_block, u01, u01_fine
+from spadwarp_kernels.base import random_block, u01
 from spadwarp_kernels.base.philox import (
     PREFETCHED_WORDS,
     RoundKeys,
     make_prefetch,
+    philox4x32,
     prefetched_block,
     random_block_keyed,
     round_keys,
+    u01_fine,
 )
 
 

@@ -6,7 +6,8 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import Floats, Vectors, launched
-from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
+from spadwarp_kernels import random_block
+from spadwarp_kernels.surface.reflectance import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, unshadowed
 
 pytestmark = pytest.mark.physics
 

@@ -6,11 +6,8 @@ import warp as wp
 
 from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
-from spadwarp_kernels import (
-    random_block,
-    sample_lambert,
-    u01,
-)
+from spadwarp_kernels import random_block, u01
+from spadwarp_kernels.surface.reflectance import sample_lambert
 
 pytestmark = pytest.mark.physics
 

@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
+from spadwarp_kernels.optics.visibility import near_depth_map
 from spadwarp_kernels.surface.bvh import read_tree
 
 PRIVATE_LAYOUT = (
@@ -145,7 +146,7 @@ def test_the_map_of_a_camera_follows(device):
         mesh.points.assign(points + np.array([0.5, 0.0, shift], np.float32))
         sk.update_surfaces(surfaces, mesh, camera)
         found = surfaces.near_depth.numpy()
-        assert np.array_equal(found, sk.near_depth_map(mesh, camera).numpy())
+        assert np.array_equal(found, near_depth_map(mesh, camera).numpy())
         assert found[64, 64] == pytest.approx(shift - 1.0, abs=0.25) and found[64, 0] > 1e29
     with pytest.raises(sk.ArgumentError, match="made with a camera; update_surfaces needs the same"):
         sk.update_surfaces(surfaces, mesh)
@@ -175,7 +176,7 @@ def test_nothing_hides_what_lies_before_the_map(device):
     points = wp.array(corners, dtype=wp.vec3, device=device)
     mesh = wp.Mesh(points, wp.array(faces, dtype=int, device=device))
     camera = wide_camera()
-    near = sk.near_depth_map(mesh, camera).numpy().astype(float)
+    near = near_depth_map(mesh, camera).numpy().astype(float)
     assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
     assert (near[:62] > 1.0).mean() > 0.5 and (near > 0.1).mean() > 0.9
     rng = np.random.default_rng(4)

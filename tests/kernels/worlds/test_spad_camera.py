@@ -1,19 +1,14 @@
 """SpadCamera: what it sees, the law of its counts, and a step that stays on the device."""
 
-import io
-
 import numpy as np
 import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
+from helpers.worlds import transforms
 
 CLEAR = {"absorption": 0.0, "scattering": 0.0}
 SMALL = {"width": 24, "height": 18}
-
-
-def transforms(rows, device):
-    return wp.array(np.array(rows, np.float32), dtype=wp.transform, device=device)
 
 
 def room(device, worlds=2):
@@ -185,65 +180,6 @@ def test_depth_in_clear_water_has_no_offset(method, device):
     assert abs(np.median(error)) < 1e-3 and np.median(abs(error)) < 5e-3
 
 
-def small_step(device):
-    camera = sk.SpadCamera(sk.SpadConfig(**SMALL), 2, device=device)
-    shapes = room(device)
-    poses = transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, device)
-    bodies = transforms([(-0.8, 0, 2, 0, 0, 0, 1), (0, 0.3, 2.5, 0, 0, 0, 1)], device)
-    points = wp.empty((2, 18, 24), dtype=wp.vec3, device=device)
-
-    def step():
-        camera.update(shapes, poses, bodies)
-        camera.point_cloud(points)
-
-    return camera, step, bodies
-
-
-def test_a_step_stays_on_the_device(device, monkeypatch):
-    """No allocation, and nothing read by the host."""
-    camera, step, _ = small_step(device)
-    step()
-
-    def refuse(*_, **__):
-        raise AssertionError("read by the host")
-
-    part = wp.array.__getitem__
-    monkeypatch.setattr(wp.array, "__getitem__", lambda a, key: part(a, key) if isinstance(key, slice) else refuse())
-    for name in ("numpy", "list"):
-        monkeypatch.setattr(wp.array, name, refuse)
-    for name in ("synchronize", "synchronize_device", "synchronize_stream"):
-        monkeypatch.setattr(wp, name, refuse)
-    with wp.ScopedMemoryTracker("step", print=False) as tracker:
-        step()
-        report = io.StringIO()
-        tracker.report(file=report)
-    monkeypatch.undo()
-    assert "step" not in report.getvalue().replace("Scope: step", ""), report.getvalue()
-    assert camera.step.numpy()[0] == 2
-
-
-def test_a_captured_step_is_the_step(device):
-    """Replays of a graph move bodies and draw new frames as calls do."""
-    (camera, step, bodies), (other, other_step, other_bodies) = small_step(device), small_step(device)
-    step()
-    other_step()
-    with wp.ScopedCapture(device=device) as capture:
-        step()
-    seen = []
-    for k in range(3):
-        moved = bodies.numpy()
-        moved[:, 0] += 0.1 * k
-        bodies.assign(moved)
-        other_bodies.assign(moved)
-        wp.capture_launch(capture.graph)
-        other_step()
-        for name in ("rates", "histogram", "counts", "depth", "true_depth", "step"):
-            mine, theirs = getattr(camera, name).numpy(), getattr(other, name).numpy()
-            assert np.array_equal(mine, theirs, equal_nan=mine.dtype.kind == "f"), name
-        seen.append(camera.histogram.numpy().copy())
-    assert not np.array_equal(seen[0], seen[1])
-
-
 def test_a_step_depends_on_the_seed_and_its_number(device):
     depth = wp.full((1, 18, 24), 3.0, dtype=float, device=device)
 
@@ -255,61 +191,3 @@ def test_a_step_depends_on_the_seed_and_its_number(device):
 
     assert np.array_equal(frame(1, 7), frame(1, 7))
     assert not np.array_equal(frame(1, 7), frame(1, 8)) and not np.array_equal(frame(1, 7), frame(2, 7))
-
-
-BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
-
-
-@pytest.mark.parametrize(
-    ("call", "text"),
-    [
-        (lambda: sk.SpadConfig(pde=1.5), r"config.pde = 1.5 is outside \[0, 1\]"),
-        (lambda: sk.SpadConfig(gate=(5.0, 2.0)), r"config.gate\[1\] = 2.0 is outside \(5.0, inf\)"),
-        (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
-        (lambda: sk.SpadCamera(cameras=2, world=[0], device="cpu"), "one for each of 2 cameras"),
-        (lambda: sk.make_shapes(["torus"], [(1, 1, 1)], device="cpu"), "is not a list of plane, sphere"),
-        (lambda: sk.make_shapes(["mesh"], [(1, 1, 1)], device="cpu"), r"mesh\[0\] = 0 is none"),
-        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], world=[3], device="cpu"), "world is not one of -1 to 0"),
-        (lambda: sk.make_shapes(["box"] * 2, [(1, 1, 1)], body=[1, 2, 3], device="cpu"), "body does not fit 2 shapes"),
-        (lambda: sk.make_shapes(3, [(1, 1, 1)], device="cpu"), "kind is int; a list is needed"),
-        (lambda: sk.make_shapes(["box"], [(1, np.nan, 1)], device="cpu"), "size is not finite"),
-        (
-            lambda: sk.make_shapes(["box"], [(1, 1, 1)], reflectance=1.5, device="cpu"),
-            r"reflectance holds .* outside \[0, 1\]",
-        ),
-        (lambda: sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[-1], device="cpu"), r"mesh = -1 is outside"),
-        (lambda: sk.make_shapes(["box"], [(1, 1, 1)], mesh=2, device="cpu"), "mesh is int; a list is needed"),
-        (
-            lambda: sk.make_shapes(["box"], [(1, 1, 1)], visible=[True] * 3, device="cpu"),
-            r"visible is bool of shape \(3,\)",
-        ),
-        (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
-        (lambda: sk.move_shapes(3, None), "shapes is int; a Shapes is needed"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, oversampling=2**31 - 1, device="cpu"), "oversampling = .* is outside"),
-    ],
-)
-def test_errors_name_the_argument(call, text):
-    with pytest.raises(sk.ArgumentError, match=text):
-        call()
-
-
-def test_poses_and_worlds_that_there_are_not_are_refused():
-    """Kernels would read beyond the arrays."""
-    pose = transforms([(0, 0, 0, 0, 0, 0, 1)], "cpu")
-    for body_q in (None, transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, "cpu")):
-        with pytest.raises(sk.ArgumentError, match=r"body_q has [02] poses; the shapes are on 3 bodies"):
-            sk.SpadCamera(sk.SpadConfig(**SMALL), device="cpu").update(BOX_ON_BODY_2, pose, body_q)
-    camera = sk.SpadCamera(sk.SpadConfig(**SMALL), world=[1], device="cpu")
-    with pytest.raises(sk.ArgumentError, match="world = 1 is none of the 1 worlds"):
-        camera.update(BOX_ON_BODY_2, pose, transforms([(0, 0, 0, 0, 0, 0, 1)] * 3, "cpu"))
-    with pytest.raises(sk.ArgumentError, match=r"reflectance = 'dark' is not a number"):
-        camera.update_from_images(camera.true_depth, reflectance="dark")
-    with pytest.raises(sk.ArgumentError, match="position is None"):
-        sk.write_poses(None, pose, pose)
-
-
-def test_images_of_another_size_are_refused():
-    camera = sk.SpadCamera(sk.SpadConfig(**SMALL), 2, device="cpu")
-    with pytest.raises(sk.ArgumentError, match=r"depth is a wp.array of float32, shape \(1, 18, 24\)"):
-        camera.update_from_images(wp.zeros((1, 18, 24), dtype=float, device="cpu"))
