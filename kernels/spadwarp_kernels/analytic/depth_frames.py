@@ -13,6 +13,7 @@ from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_arrays,
+    check_fields,
     check_integer,
     check_number,
     check_seed,
@@ -346,10 +347,8 @@ def _check_coding(coding: Any) -> None:
     width = check_integer("coding.width", coding.width, 1)
     if check_integer("coding.pixels", coding.pixels, 1) % width:
         raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
-    check_number("coding.depth_offset", coding.depth_offset)
-    for name in ("depth_step", "intensity_step"):
-        check_number(f"coding.{name}", getattr(coding, name), "(0, inf)")
-    check_number("coding.pulses", coding.pulses, "[0, inf)")
+    check_fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
+    check_fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
 
 
 def draw_frames(

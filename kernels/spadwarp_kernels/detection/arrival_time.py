@@ -92,8 +92,8 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
 
 
 @memoised
-def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
-    """The delay of the largest score: of the log-matched filter, whose `response` is its gain, or of the likelihood."""
+def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
+    """The score of a delay: by the log-matched filter, whose `response` is its gain, or the likelihood."""
 
     @wp.func
     def filter_score(
@@ -168,7 +168,13 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
                 value += n * wp.log(1.0 + signal * response[phase, tap] / floor)
         return value
 
-    score_of = profile_likelihood if likelihood else filter_score
+    return profile_likelihood if likelihood else filter_score
+
+
+@memoised
+def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
+    """The delay of the largest score."""
+    score_of = _make_score(dtype, likelihood)
 
     @wp.kernel(enable_backward=False, module="unique")
     def search(

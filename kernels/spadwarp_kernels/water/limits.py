@@ -253,7 +253,8 @@ def _to_sides(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
 
 
 @wp.func
-def _to_faces(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance [m] from x along u to a face of the domain; both in its own axes."""
     return wp.min(
         _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
         wp.min(
@@ -287,11 +288,6 @@ def _first_exit(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> Exit
 
 
 @wp.func
-def _first_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> int:
-    return _first_exit(limits, to_sides, x, u).face
-
-
-@wp.func
 def _outside_sides(limits: Limits, x: wp.vec3) -> bool:
     return wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
 
@@ -315,39 +311,9 @@ def is_outside_rotated(limits: Limits, x: wp.vec3) -> bool:
 
 
 @wp.func
-def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance [m] from x along u to a face of the domain; both in its own axes."""
-    return _to_faces(limits, x, u)
-
-
-@wp.func
 def next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
     """Index into EXIT_FACES of the face of `to_next_face`; 0: there is none."""
-    return _first_face(limits, 9.0e29, x, u)
-
-
-@wp.func
-def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
-    return wp.min(_to_sides(limits, x, u), _to_faces(limits, x, u))
-
-
-@wp.func
-def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """Index into EXIT_FACES of what a ray from x along u meets first: a face of the domain, else the lateral limit."""
-    return _first_face(limits, _to_sides(limits, x, u), x, u)
-
-
-@wp.func
-def exit_distance_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """As `exit_distance`, for a domain with axes of its own; the lateral limit keeps to the frame of the flight."""
-    return wp.min(_to_sides(limits, x, u), _to_faces(limits, limits.rotation * x + limits.origin, limits.rotation * u))
-
-
-@wp.func
-def exit_face_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """As `exit_face`, for a domain with axes of its own; faces are named after them."""
-    return _first_face(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)
+    return _first_exit(limits, 9.0e29, x, u).face
 
 
 @wp.func
@@ -360,3 +326,29 @@ def first_exit(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
 def first_exit_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
     """`exit_distance_rotated` and `exit_face_rotated` at once."""
     return _first_exit(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)
+
+
+@wp.func
+def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
+    return wp.min(_to_sides(limits, x, u), to_next_face(limits, x, u))
+
+
+@wp.func
+def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """Index into EXIT_FACES of what a ray from x along u meets first: a face of the domain, else the lateral limit."""
+    return first_exit(limits, x, u).face
+
+
+@wp.func
+def exit_distance_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+    """As `exit_distance`, for a domain with axes of its own; the lateral limit keeps to the frame of the flight."""
+    return wp.min(
+        _to_sides(limits, x, u), to_next_face(limits, limits.rotation * x + limits.origin, limits.rotation * u)
+    )
+
+
+@wp.func
+def exit_face_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
+    """As `exit_face`, for a domain with axes of its own; faces are named after them."""
+    return first_exit_rotated(limits, x, u).face

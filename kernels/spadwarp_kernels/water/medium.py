@@ -132,7 +132,7 @@ def boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: f
 
 
 @wp.func
-def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float) -> float:
+def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     """Free flight [m] from x along u for uniform xi in (0, 1]: where the optical depth reaches -ln(xi)."""
     along = wp.dot(layers.axis, x)
     slope = wp.dot(layers.axis, u)
@@ -153,7 +153,7 @@ def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi
 
 
 @wp.func
-def layered_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float) -> float:
+def layered_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
     """Mean extinction [1/m] between x and x + length u, so that exp(-mean length) is what passes."""
     along = wp.dot(layers.axis, x)
     slope = wp.dot(layers.axis, u)
@@ -184,18 +184,6 @@ def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     water.albedo = layers.albedo[layer]
     water.anisotropy = layers.anisotropy[layer]
     return water
-
-
-@wp.func
-def _layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
-    return layered_free_path(medium, layers, x, u, xi)
-
-
-@wp.func
-def _layered_extinction(
-    medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64
-) -> float:
-    return layered_extinction(medium, layers, x, u, length)
 
 
 @wp.func
@@ -244,7 +232,7 @@ class Water(NamedTuple):
 
 
 HOMOGENEOUS = Water(_free_path, _extinction, _water)
-LAYERED = Water(_layered_free_path, _layered_extinction, layered_water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water)
 
 
 def make_layers(

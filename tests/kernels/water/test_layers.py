@@ -28,9 +28,9 @@ def fly(
 ):
     """Free path, that of the medium alone, mean extinction along it, layer at its begin. Launch: rays."""
     i = wp.tid()
-    distance[i] = layered_free_path(medium, layers, x[i], u[i], xi[i])
+    distance[i] = layered_free_path(medium, layers, x[i], u[i], xi[i], wp.uint64(0))
     homogeneous[i] = sk.free_path(xi[i], medium.extinction)
-    mean[i] = layered_extinction(medium, layers, x[i], u[i], distance[i])
+    mean[i] = layered_extinction(medium, layers, x[i], u[i], distance[i], wp.uint64(0))
     index[i] = layer_index(layers, wp.dot(layers.axis, x[i]))
 
 
